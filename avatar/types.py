@@ -1,0 +1,113 @@
+"""The values that flow through the program, and every convention, stated once.
+
+Conventions
+-----------
+Camera      OpenCV: x right, y down, z forward; the centre of pixel (column i, row j) is at (i + 0.5, j + 0.5).
+            `T_cam_world` style names say from-to: `p_cam = R_cam_world @ p_world + t_cam_world`. Lengths in metres,
+            focal lengths and principal point in pixels of this camera's own width and height.
+World       The posed head's own space: identity global rotation, head pose is in the camera.
+Rotations   Quaternions are (w, x, y, z) and are normalised where they are used. "6D" rotations are the first two rows
+            of the matrix, flattened; the third row is their cross product (metrical-tracker's files).
+Images      float32 [H, W, 3] (masks [H, W]) in [0, 1], the values of the 8-bit file / 255, unclamped until written.
+Names       Raw and activated parameters differ in name: `log_scales` / `scales`, `opacity_logits` / `opacities`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    R_cam_world: Float[Tensor, "3 3"]
+    t_cam_world: Float[Tensor, "3"]  # metres
+    fx: float  # pixels
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def project(self, points: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+        """World points [..., 3] in metres -> (x pixel, y pixel, depth in metres)."""
+        p = points @ self.R_cam_world.to(points).T + self.t_cam_world.to(points)
+        z = p[..., 2]
+        return torch.stack((p[..., 0] / z * self.fx + self.cx, p[..., 1] / z * self.fy + self.cy, z), dim=-1)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on an image of another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+
+@dataclass(frozen=True)
+class HeadParams:
+    """What moves a FLAME-format head in one frame; identity coefficients belong to the subject, not to the frame."""
+
+    expression: Float[Tensor, "E"]  # coefficients of the expression basis
+    jaw: Float[Tensor, "6"]  # 6D rotation
+    eyes: Float[Tensor, "12"]  # two 6D rotations, left then right
+    eyelids: Float[Tensor, "2"]  # blendshape weights, left then right
+    neck: Float[Tensor, "6"]  # 6D rotation; identity in metrical-tracker's data, and not a condition of the MLP
+
+    def condition(self) -> Float[Tensor, "E+20"]:
+        """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""
+        return torch.cat((self.expression, self.jaw, self.eyes, self.eyelids))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a prepared subject, decoded."""
+
+    index: int  # position in the prepared subject, 0-based
+    name: str  # stem of the image file, for example "00001"
+    camera: Camera
+    params: HeadParams
+    image: Float[Tensor, "H W 3"]  # as in the video file, not composited
+    alpha: Float[Tensor, "H W"]  # foreground matte; ones where the subject has none
+    head_mask: Float[Tensor, "H W"]  # head and neck; ones where the subject has none
+    mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth
+
+    def composite(self, background: Float[Tensor, "3"]) -> Float[Tensor, "H W 3"]:
+        """The training target: matte over the background, then the head mask over the background again.
+
+        Source: FlashAvatar and HyperGaussians, data loading (`img*alpha + bg*(1-alpha)`, then `*mask + bg*(1-mask)`).
+        """
+        weight = (self.alpha * self.head_mask)[..., None]
+        return self.image * weight + background * (1.0 - weight)
+
+
+class Gaussians(NamedTuple):
+    """What a splatter draws; every field activated, world space."""
+
+    means: Float[Tensor, "N 3"]  # metres
+    quats: Float[Tensor, "N 4"]  # (w, x, y, z), need not be normalised
+    scales: Float[Tensor, "N 3"]  # standard deviations, metres, > 0
+    opacities: Float[Tensor, "N"]  # in [0, 1]
+    sh: Float[Tensor, "N K 3"]  # spherical-harmonics colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16
+
+
+class Offsets(NamedTuple):
+    """What the deformation adds to the Gaussians bound to the mesh, after the tanh, in FlashAvatar's order."""
+
+    position: Float[Tensor, "N 3"]  # metres, added
+    rotation: Float[Tensor, "N 4"]  # delta quaternion is (exp(r0), r1, r2, r3)
+    scale: Float[Tensor, "N 3"]  # exp(.) multiplies the log-scale
+
+
+class Rendering(NamedTuple):
+    """A splatted image. `image` holds the background already; `alpha` is 1 - transmittance."""
+
+    image: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
