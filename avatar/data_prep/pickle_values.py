@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,17 @@ import numpy as np
 
 MAX_DEPTH = 64  # nesting of containers; official FLAME pickles have 3 to 5
 _DTYPE = re.compile(r"[biufc](1|2|4|8|16)|\?|[SU]\d{1,4}")
+TORCH_STORAGE_DTYPES = {
+    "torch.DoubleStorage": "f8",
+    "torch.FloatStorage": "f4",
+    "torch.HalfStorage": "f2",
+    "torch.LongStorage": "i8",
+    "torch.IntStorage": "i4",
+    "torch.ShortStorage": "i2",
+    "torch.CharStorage": "i1",
+    "torch.ByteStorage": "u1",
+    "torch.BoolStorage": "?",
+}
 _SPARSE = re.compile(r"scipy\.sparse(\.(csc|csr|coo))?\.(csc|csr|coo)_(matrix|array)")
 
 
@@ -107,6 +119,34 @@ def make_array(shape: Any, dtype: Any, fortran: Any, raw: Any, budget: Budget) -
     return array.astype(dtype.dtype.newbyteorder("="), order="C", copy=True)
 
 
+def storage_array(identity: Any, read_member: Callable[[str], bytes], budget: Budget) -> np.ndarray:
+    """A torch storage as a vector; `identity` is torch's ("storage", type, key, device, element count)."""
+    if not (isinstance(identity, tuple) and len(identity) == 5 and identity[0] == "storage"):
+        raise Refused("it refers to outside data that is not a torch storage")
+    _, kind, key, _, count = identity
+    code = TORCH_STORAGE_DTYPES.get(kind.name) if isinstance(kind, Global) else None
+    if code is None or not (isinstance(key, str) and key.isascii() and key.isdigit()) or not isinstance(count, int):
+        raise Refused("it refers to a torch storage of an unknown type")
+    return make_array((count,), make_dtype(code), False, read_member(key), budget)
+
+
+def tensor_array(storage: Any, offset: Any, size: Any, stride: Any, budget: Budget) -> np.ndarray:
+    """The part of a storage that torch's (offset, size, stride), counted in elements, describes."""
+    sizes_and_strides = (size, stride)
+    if (
+        not isinstance(storage, np.ndarray)
+        or not isinstance(offset, int)
+        or not all(isinstance(t, tuple) and all(isinstance(n, int) and n >= 0 for n in t) for t in sizes_and_strides)
+        or len(size) != len(stride)
+        or offset < 0
+        or (math.prod(size) and offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) >= len(storage))
+    ):
+        raise Refused("it holds a torch tensor that reaches outside its storage")
+    budget.take(math.prod(size) * storage.itemsize)
+    strides = [s * storage.itemsize for s in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, strides).copy()
+
+
 def resolve(value: Any, budget: Budget) -> Any:
     """Plain containers and arrays for everything that `value` holds; raises Refused for what has no such form."""
     return _resolve(value, budget, done={}, open_ids=set())
@@ -148,7 +188,7 @@ def _resolve(value: Any, budget: Budget, done: dict[int, Any], open_ids: set[int
 
 
 def _chumpy_array(cls: Global, state: dict[Any, Any]) -> np.ndarray:
-    """A `chumpy.ch.Ch` keeps its value in attribute `x`; other chumpy classes are expressions without a stored value."""
+    """A `chumpy.ch.Ch` keeps its value in attribute `x`; other chumpy classes are formulas without a value."""
     if cls.name != "chumpy.ch.Ch" or not isinstance(state.get("x"), np.ndarray):
         raise Refused(f"it holds a {cls.name} whose value is not stored; save the model as numpy arrays (.npz)")
     return state["x"]
@@ -188,10 +228,7 @@ def _sparse_array(cls: Global, state: dict[Any, Any], budget: Budget) -> np.ndar
 
 def _vector(cls: Global, state: dict[Any, Any], name: str) -> np.ndarray:
     value = state.get(name)
-    if (
-        not isinstance(value, np.ndarray)
-        or value.ndim != 1
-        or value.dtype.kind not in ("iu" if name != "data" else "biufc")
-    ):
+    kinds = "biufc" if name == "data" else "iu"
+    if not isinstance(value, np.ndarray) or value.ndim != 1 or value.dtype.kind not in kinds:
         raise Refused(f"it holds a {cls.name} whose {name} is not a vector of numbers")
     return value
