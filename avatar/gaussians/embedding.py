@@ -1,0 +1,43 @@
+"""Gaussians bound to the mesh: one per covered texel of the UV map, at a fixed place of its triangle."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avatar.gaussians.uv import UVTexels
+from avatar.head.assets import HeadAssets
+
+
+class Embedding:
+    """Maps the vertices of a posed mesh [V, 3] to one point per texel [N, 3]."""
+
+    def __init__(self, assets: HeadAssets, texels: UVTexels) -> None:
+        self.texels = texels
+        self.corners: Int[Tensor, "N 3"] = assets.faces[texels.face]
+        self.barycentric: Float[Tensor, "N 3"] = texels.barycentric
+        self._flat_corners = self.corners.reshape(-1)
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
+        corners = vertices.index_select(0, self._flat_corners).reshape(-1, 3, 3)
+        return (corners * self.barycentric.to(vertices.dtype)[:, :, None]).sum(dim=1)
+
+
+def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, "N"]:
+    """Root mean squared distance of each point to its nearest neighbours, in metres; never below 1e-4 m.
+
+    Source: 3D Gaussian Splatting's initial scales, as FlashAvatar uses them. The floor keeps coincident points finite.
+    """
+    cloud = points.detach().cpu().numpy().astype(np.float64)
+    k = min(neighbours, len(cloud) - 1)
+    if k < 1:
+        return torch.full((len(cloud),), 1e-2, dtype=points.dtype)
+    distances = cKDTree(cloud).query(cloud, k=k + 1)[0][:, 1:]
+    rms = np.sqrt(np.mean(np.square(distances), axis=1))
+    return torch.from_numpy(np.maximum(rms, 1e-4)).to(points.dtype)

@@ -1,0 +1,218 @@
+"""FLAME-format head models on disk: the model file, its UV layout, eyelids and region masks.
+
+A model file (`generic_model.pkl`, `flame2023.pkl`, ... or the same keys in an .npz) holds v_template (V, 3), f (F, 3),
+shapedirs (V, 3, 300 identity + E expression), posedirs (V, 3, 36), J_regressor (5, V), weights (V, 5) and
+kintree_table (2, 5). Beside it lie an OBJ of the same topology with UVs, `l_eyelid.npy` / `r_eyelid.npy` (V, 3) and
+region masks (`FLAME_masks.pkl` or `masks.npz`). Nothing that these files hold can execute code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avatar.data_prep.safe_pickle import load_npz, load_pickle
+from avatar.errors import UserError
+from avatar.head.uv_obj import read_uv_obj
+
+IDENTITY_COEFFICIENTS = 300  # FLAME's shapedirs: 300 identity directions, then the expression directions
+JOINT_NAMES = ("root", "neck", "jaw", "left eye", "right eye")
+REQUIRED_KEYS = ("v_template", "f", "shapedirs", "J_regressor", "weights", "kintree_table")
+
+
+@dataclass(frozen=True)
+class HeadAssets:
+    """Everything that a head model consists of, as float32 tensors in metres; V vertices, F faces, J joints."""
+
+    template: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    shape_dirs: Float[Tensor, "V 3 300"]
+    expression_dirs: Float[Tensor, "V 3 E"]
+    pose_dirs: Float[Tensor, "V 3 9*(J-1)"]
+    joint_regressor: Float[Tensor, "J V"]
+    weights: Float[Tensor, "V J"]
+    parents: tuple[int, ...]  # -1 for the root; joints in the order of JOINT_NAMES
+    eyelid_dirs: Float[Tensor, "2 V 3"]  # left, right; zeros where the model has none
+    uvs: Float[Tensor, "T 2"]  # OBJ convention: origin at the lower left
+    uv_faces: Int[Tensor, "F 3"]  # rows of `uvs` for the corners of `faces`
+    regions: Mapping[str, Int[Tensor, "_"]]  # name -> vertex indices
+    fingerprint: str  # SHA-256 over all of the above
+
+    @property
+    def num_vertices(self) -> int:
+        return self.template.shape[0]
+
+    @property
+    def num_expressions(self) -> int:
+        return self.expression_dirs.shape[2]
+
+
+def load_head_assets(path: Path) -> HeadAssets:
+    """Read a head model from its file, or from the folder that holds it.
+
+    Raises UserError with the file and the reason when something is missing, unreadable or does not fit together.
+    """
+    path = Path(path)
+    model_file = find_model_file(path)
+    folder = model_file.parent
+    raw = _read_arrays(model_file)
+    missing = [key for key in REQUIRED_KEYS if key not in raw]
+    if missing:
+        raise UserError(
+            f"{model_file} is not a FLAME-format head model: it lacks {', '.join(missing)} "
+            f"(it holds {', '.join(sorted(raw)[:12]) or 'nothing'})"
+        )
+
+    template = _array(raw, "v_template", model_file, (None, 3))
+    V = len(template)
+    faces = _array(raw, "f", model_file, (None, 3), integer=True)
+    if faces.size == 0 or faces.min() < 0 or faces.max() >= V:
+        raise UserError(f"{model_file}: the faces f name vertices outside the {V} of v_template")
+    directions = _array(raw, "shapedirs", model_file, (V, 3, None))
+    if directions.shape[2] <= IDENTITY_COEFFICIENTS:
+        raise UserError(
+            f"{model_file}: shapedirs has {directions.shape[2]} directions; {IDENTITY_COEFFICIENTS} identity "
+            "directions followed by expression directions are needed (FLAME has 300 + 100)"
+        )
+    J = len(JOINT_NAMES)
+    kintree = _array(raw, "kintree_table", model_file, (2, J), integer=True)
+    parents = tuple(int(p) if 0 <= p < J else -1 for p in kintree[0])
+    if parents[0] != -1 or any(not 0 <= p < child for child, p in enumerate(parents[1:], start=1)):
+        raise UserError(
+            f"{model_file}: kintree_table must list every joint after its parent, root first; its parents are "
+            f"{list(parents)}"
+        )
+    weights = _array(raw, "weights", model_file, (V, J))
+    if np.abs(weights.sum(1) - 1).max() > 1e-3:
+        row = int(np.abs(weights.sum(1) - 1).argmax())
+        raise UserError(f"{model_file}: the skinning weights of vertex {row} sum to {weights[row].sum():.4f}, not 1")
+    pose_dirs = (
+        _array(raw, "posedirs", model_file, (V, 3, 9 * (J - 1)))
+        if "posedirs" in raw
+        else np.zeros((V, 3, 9 * (J - 1)), np.float32)
+    )
+    uvs, uv_faces = read_uv_obj(find_uv_obj(folder), faces, V)
+    tensors: dict[str, Tensor] = {
+        "template": torch.from_numpy(template),
+        "faces": torch.from_numpy(faces),
+        "shape_dirs": torch.from_numpy(directions[:, :, :IDENTITY_COEFFICIENTS].copy()),
+        "expression_dirs": torch.from_numpy(directions[:, :, IDENTITY_COEFFICIENTS:].copy()),
+        "pose_dirs": torch.from_numpy(pose_dirs),
+        "joint_regressor": torch.from_numpy(_array(raw, "J_regressor", model_file, (J, V))),
+        "weights": torch.from_numpy(weights),
+        "eyelid_dirs": torch.from_numpy(_read_eyelids(folder, V)),
+        "uvs": torch.from_numpy(uvs),
+        "uv_faces": torch.from_numpy(uv_faces),
+    }
+    regions = _read_regions(folder, V)
+    return HeadAssets(
+        **tensors, parents=parents, regions=regions, fingerprint=_fingerprint(tensors, parents, regions)
+    )
+
+
+def find_model_file(path: Path) -> Path:
+    """The model file itself, or the one file of a folder that is a head model."""
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise UserError(
+            f"the head model {path} does not exist; give --head the model file or its folder "
+            "(FLAME 2023 Open can be had from https://flame.is.tue.mpg.de)"
+        )
+    named = [path / name for name in ("generic_model.pkl", "generic_model.npz") if (path / name).is_file()]
+    if named:
+        return named[0]
+    candidates = sorted(p for p in path.iterdir() if p.suffix in (".pkl", ".npz") and "mask" not in p.name.lower())
+    candidates = [p for p in candidates if "embedding" not in p.name.lower()]
+    if len(candidates) == 1:
+        return candidates[0]
+    if not candidates:
+        raise UserError(f"the folder {path} holds no head model (generic_model.pkl, or another .pkl or .npz)")
+    raise UserError(
+        f"the folder {path} holds several files that could be the head model "
+        f"({', '.join(p.name for p in candidates)}); give --head one of them"
+    )
+
+
+def find_uv_obj(folder: Path) -> Path:
+    """The OBJ with the UV layout that lies beside the model file."""
+    named = folder / "head_template.obj"
+    if named.is_file():
+        return named
+    candidates = sorted(folder.glob("*.obj"))
+    if len(candidates) == 1:
+        return candidates[0]
+    if not candidates:
+        raise UserError(
+            f"no OBJ with the UV layout lies in {folder}; put head_template.obj (same topology as the model, with "
+            "vt lines; FLAME's comes with its texture space) beside the model file"
+        )
+    raise UserError(f"{folder} holds several OBJ files and none is called head_template.obj; rename the right one to it")
+
+
+def _read_arrays(file: Path) -> Mapping[str, object]:
+    loaded = load_npz(file) if file.suffix == ".npz" else load_pickle(file)
+    if not isinstance(loaded, dict):
+        raise UserError(f"{file} holds a {type(loaded).__name__}, not a dictionary of arrays")
+    return loaded
+
+
+def _array(
+    raw: Mapping[str, object], key: str, file: Path, shape: tuple[int | None, ...], *, integer: bool = False
+) -> np.ndarray:
+    try:
+        array = np.asarray(raw[key])
+        converted = np.ascontiguousarray(array, dtype=np.int64 if integer else np.float32)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{file}: {key} is not an array of numbers ({error})") from None
+    expected = ", ".join("any" if n is None else str(n) for n in shape)
+    if converted.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, converted.shape, strict=True)):
+        raise UserError(f"{file}: {key} has shape {list(converted.shape)}, expected [{expected}]")
+    if not integer and not np.isfinite(converted).all():
+        raise UserError(f"{file}: {key} holds values that are not finite")
+    return converted
+
+
+def _read_eyelids(folder: Path, V: int) -> np.ndarray:
+    eyelids = np.zeros((2, V, 3), np.float32)
+    for side, name in enumerate(("l_eyelid.npy", "r_eyelid.npy")):
+        file = folder / name
+        if not file.is_file():
+            continue
+        try:
+            loaded = np.load(file, allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise UserError(f"{file} is not a readable .npy file ({error})") from None
+        eyelids[side] = _array({name: loaded.squeeze()}, name, file, (V, 3))
+    return eyelids
+
+
+def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
+    for name in ("FLAME_masks.pkl", "masks.npz"):
+        file = folder / name
+        if not file.is_file():
+            continue
+        regions = {}
+        for region, indices in _read_arrays(file).items():
+            index = np.unique(_array({region: indices}, region, file, (None,), integer=True))
+            if index.size and (index[0] < 0 or index[-1] >= V):
+                raise UserError(f"{file}: the region {region} names vertex {index[-1]}, but the model has {V} vertices")
+            regions[str(region)] = torch.from_numpy(index)
+        return regions
+    return {}
+
+
+def _fingerprint(tensors: Mapping[str, Tensor], parents: tuple[int, ...], regions: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256(repr(parents).encode())
+    update: Callable[[bytes], None] = digest.update
+    for name, tensor in sorted({**tensors, **{f"region {k}": v for k, v in regions.items()}}.items()):
+        update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        update(tensor.numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,112 @@
+"""Linear blend skinning of a FLAME-format head.
+
+Source: Li, Bolkart, Black, Li, Romero, "Learning a model of facial shape and expression from 4D scans" (2017), eq. 2-5;
+eyelid blendshapes after skinning as in metrical-tracker.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avatar.check import check_shapes
+from avatar.head.assets import HeadAssets
+from avatar.types import HeadParams
+
+ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
+
+
+def matrix_from_6d(rotation: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
+    """6D rotation (the first two rows of the matrix) -> matrix, made orthonormal by Gram-Schmidt.
+
+    Source: Zhou et al., "On the continuity of rotation representations in neural networks" (2019), in rows.
+    """
+    first = torch.nn.functional.normalize(rotation[..., :3], dim=-1)
+    second = rotation[..., 3:] - (first * rotation[..., 3:]).sum(-1, keepdim=True) * first
+    second = torch.nn.functional.normalize(second, dim=-1)
+    return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-2)
+
+
+class HeadModel:
+    """A head of one identity: expression and joint rotations in, vertices out.
+
+    `identity` [up to 300] holds the identity coefficients; missing ones are zero. The arithmetic runs in `dtype`.
+    """
+
+    def __init__(self, assets: HeadAssets, identity: Float[Tensor, "S"], dtype: torch.dtype = torch.float32) -> None:
+        if identity.ndim != 1 or len(identity) > assets.shape_dirs.shape[2]:
+            raise ValueError(
+                f"identity must have shape [at most {assets.shape_dirs.shape[2]}], got {list(identity.shape)}"
+            )
+        self.assets = assets
+        self.faces: Int[Tensor, "F 3"] = assets.faces
+        V, E = assets.num_vertices, assets.num_expressions
+        shape_dirs = assets.shape_dirs[:, :, : len(identity)].to(dtype)
+        self._identity_shape = assets.template.to(dtype) + shape_dirs @ identity.to(dtype)
+        self._expression_dirs = assets.expression_dirs.to(dtype).reshape(V * 3, E)
+        regressor = assets.joint_regressor.to(dtype)
+        self._identity_joints = regressor @ self._identity_shape
+        # Joints follow the expression too; their regressor is folded into the basis once.
+        folded = torch.einsum("jv,vce->jce", regressor, assets.expression_dirs.to(dtype))
+        self._expression_joints = folded.reshape(-1, E)
+        self._pose_dirs = assets.pose_dirs.to(dtype).reshape(V * 3, -1)
+        self._weights = assets.weights.to(dtype)
+        self._eyelid_dirs = assets.eyelid_dirs.to(dtype)
+        self._parents = assets.parents
+
+    def neutral_vertices(self) -> Float[Tensor, "V 3"]:
+        """The identity without expression, joints at rest, in metres."""
+        return self._identity_shape.clone()
+
+    def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
+        """The posed head in metres, world space (the root at identity; the head's pose is in the camera).
+
+        Raises ValueError when the parameters' shapes are wrong; fewer expression coefficients than the basis has stand
+        for zeros in the rest.
+        """
+        check_shapes(
+            jaw=(params.jaw, "6"),
+            eyes=(params.eyes, "12"),
+            eyelids=(params.eyelids, "2"),
+            neck=(params.neck, "6"),
+            expression=(params.expression, "E"),
+        )
+        E = len(params.expression)
+        if E > self._expression_dirs.shape[1]:
+            raise ValueError(
+                f"expression has {E} coefficients, but the head model has {self._expression_dirs.shape[1]} directions"
+            )
+        dtype = self._identity_shape.dtype
+        expression = params.expression.to(dtype)
+        shape = self._identity_shape + (self._expression_dirs[:, :E] @ expression).reshape(-1, 3)
+        joints = self._identity_joints + (self._expression_joints[:, :E] @ expression).reshape(-1, 3)
+
+        identity = torch.eye(3, dtype=dtype)
+        rotations = torch.stack(
+            (
+                identity,
+                matrix_from_6d(params.neck.to(dtype)),
+                matrix_from_6d(params.jaw.to(dtype)),
+                *matrix_from_6d(params.eyes.to(dtype).reshape(2, 6)),
+            )
+        )
+        correctives = self._pose_dirs @ (rotations[1:] - identity).reshape(-1)
+        shape = shape + correctives.reshape(-1, 3)
+        R, t = self._joint_transforms(rotations, joints)
+        # Blend the transforms, then apply: sum_j w_j (R_j v + t_j).
+        blended_R = (self._weights @ R.reshape(-1, 9)).reshape(-1, 3, 3)
+        posed = (blended_R @ shape[:, :, None]).squeeze(-1) + self._weights @ t
+        return posed + torch.einsum("s,svc->vc", params.eyelids.to(dtype), self._eyelid_dirs)
+
+    def _joint_transforms(
+        self, rotations: Float[Tensor, "J 3 3"], joints: Float[Tensor, "J 3"]
+    ) -> tuple[Float[Tensor, "J 3 3"], Float[Tensor, "J 3"]]:
+        """Rest space -> posed space for every joint, along the kinematic tree: p -> R p + t."""
+        R, t = [rotations[ROOT]], [joints[ROOT] - rotations[ROOT] @ joints[ROOT]]
+        for joint in range(1, len(self._parents)):
+            parent = self._parents[joint]
+            R.append(R[parent] @ rotations[joint])
+            # The joint itself moves with its parent; rotate about it.
+            t.append(R[parent] @ joints[joint] + t[parent] - R[joint] @ joints[joint])
+        return torch.stack(R), torch.stack(t)
