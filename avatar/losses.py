@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.check import check_shapes
-from avatar.metrics import SSIM_RADIUS, ssim_map
+from avatar.metrics import SSIM_RADIUS, bounding_box, ssim_map
 
 HUBER_DELTA = 0.1
 MOUTH_WEIGHT = 40.0
@@ -107,12 +107,3 @@ def masked_lpips(lpips: Callable[[Tensor, Tensor], Tensor]) -> Perceptual:
         return lpips(image * weight, target * weight)
 
     return distance
-
-
-def bounding_box(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
-    """Rows and columns that hold every non-zero value of `mask`; None when there is none."""
-    rows = mask.any(dim=1).nonzero()
-    if len(rows) == 0:
-        return None
-    columns = mask.any(dim=0).nonzero()
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -22,6 +22,7 @@ from avatar.check import check_shapes
 
 SSIM_WINDOW = 11
 SSIM_RADIUS = SSIM_WINDOW // 2
+_INSIDE = slice(SSIM_RADIUS, -SSIM_RADIUS)
 
 
 def psnr(
@@ -44,10 +45,14 @@ def ssim(
     Raises ValueError for sizes that disagree or are under 11 pixels.
     """
     check_shapes(image=(image, "H W 3"), target=(target, "H W 3"), **({} if mask is None else {"mask": (mask, "H W")}))
+    if mask is not None:  # windows centred on the mask's bounding box, with a radius on either side
+        box = bounding_box(mask)
+        if box is None:
+            return torch.tensor(torch.nan, dtype=torch.float64)
+        crop = tuple(slice(max(side.start - 2 * SSIM_RADIUS, 0), side.stop + 2 * SSIM_RADIUS) for side in box)
+        image, target, mask = image[crop], target[crop], mask[crop][_INSIDE, _INSIDE]
     # float64: the variance is a difference of two nearly equal numbers, and a figure has to agree with other programs
-    similarity = ssim_map(image.double(), target.double()).mean(dim=-1)
-    inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
-    return _mean(similarity, None if mask is None else mask[inside, inside])
+    return _mean(ssim_map(image.double(), target.double()).mean(dim=-1), mask)
 
 
 def ssim_map(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H-10 W-10 3"]:
@@ -62,6 +67,15 @@ def ssim_map(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> F
         )
     first, second = (tensor.permute(2, 0, 1).unsqueeze(0) for tensor in (image, target))
     return kornia_ssim(first, second, SSIM_WINDOW, eps=0.0, padding="valid")[0].permute(1, 2, 0)
+
+
+def bounding_box(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
+    """Rows and columns that hold every non-zero value of `mask`; None when there is none."""
+    rows = mask.any(dim=1).nonzero()
+    if len(rows) == 0:
+        return None
+    columns = mask.any(dim=0).nonzero()
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _mean(values: Float[Tensor, "H W"], mask: Float[Tensor, "H W"] | None) -> Float[Tensor, ""]:

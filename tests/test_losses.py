@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
-from avatar.losses import bounding_box, dssim, masked_huber, masked_lpips, photometric_loss
+from avatar.losses import dssim, masked_huber, masked_lpips, photometric_loss
 from avatar.metrics import ssim
 
 
@@ -80,20 +78,6 @@ def test_a_hidden_mouth_gives_a_zero_gradient() -> None:
     loss.backward()
     assert loss.item() == 0.0
     assert image.grad is not None and not image.grad.any()
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 6)), max_size=4))
-def test_bounding_box_is_the_tightest(pixels: list[tuple[int, int]]) -> None:
-    mask = torch.zeros(9, 7)
-    for row, column in pixels:
-        mask[row, column] = 0.01
-    box = bounding_box(mask)
-    if not pixels:
-        assert box is None
-        return
-    rows, columns = zip(*pixels, strict=True)
-    assert box == (slice(min(rows), max(rows) + 1), slice(min(columns), max(columns) + 1))
 
 
 def test_sizes_that_disagree_are_named() -> None:

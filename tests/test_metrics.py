@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from avatar.metrics import psnr, ssim, ssim_map
+from avatar.metrics import bounding_box, psnr, ssim, ssim_map
 
 SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}
 
@@ -33,9 +35,20 @@ def test_agrees_with_scikit_image(height: int, width: int, noise: float) -> None
     assert ssim(image, target).item() == pytest.approx(structural_similarity(a, b, **SKIMAGE), abs=1e-9)
 
 
-def test_masked_ssim_is_the_mean_of_scikit_images_map() -> None:
+@pytest.mark.parametrize(
+    "box",
+    [
+        (slice(0, 50), slice(0, 71)),
+        (slice(20, 31), slice(30, 44)),
+        (slice(0, 7), slice(60, 71)),
+        (slice(5, 45), slice(9)),
+    ],
+    ids=["everywhere", "inside", "corner", "side"],
+)
+def test_masked_ssim_is_the_mean_of_scikit_images_map(box: tuple[slice, slice]) -> None:
     image, target = pair(50, 71, 0.1)
-    mask = torch.rand(50, 71) * (torch.rand(50, 71) > 0.4)
+    mask = torch.zeros(50, 71)
+    mask[box] = (torch.rand(50, 71) * (torch.rand(50, 71) > 0.4))[box]
     _, full = structural_similarity(image.double().numpy(), target.double().numpy(), full=True, **SKIMAGE)
     inside = full.mean(axis=2)[5:-5, 5:-5]
     expected = np.average(inside, weights=mask[5:-5, 5:-5].numpy())
@@ -77,6 +90,9 @@ def test_equal_images_and_empty_masks() -> None:
         assert ssim(same, same).item() == pytest.approx(1.0, abs=1e-12)
     assert psnr(image, image, torch.zeros(30, 30)).isnan()
     assert ssim(image, image, torch.zeros(30, 30)).isnan()
+    border = torch.zeros(30, 30)
+    border[:, 27:] = 1.0  # no whole window is centred there
+    assert ssim(image, image, border).isnan()
 
 
 def test_map_is_centred_on_its_pixel_and_differentiable() -> None:
@@ -102,3 +118,17 @@ def test_sizes_that_disagree_are_named(function) -> None:
 def test_images_under_the_window_are_refused() -> None:
     with pytest.raises(ValueError, match=r"at least 11 x 11 pixels, got 12 x 10"):
         ssim(torch.zeros(10, 12, 3), torch.zeros(10, 12, 3))
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 6)), max_size=4))
+def test_bounding_box_is_the_tightest(pixels: list[tuple[int, int]]) -> None:
+    mask = torch.zeros(9, 7)
+    for row, column in pixels:
+        mask[row, column] = 0.01
+    box = bounding_box(mask)
+    if not pixels:
+        assert box is None
+        return
+    rows, columns = zip(*pixels, strict=True)
+    assert box == (slice(min(rows), max(rows) + 1), slice(min(columns), max(columns) + 1))
