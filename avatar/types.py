@@ -29,7 +29,7 @@ class Camera:
     """A pinhole camera without distortion."""
 
     R_cam_world: Float[Tensor, "3 3"]
-    t_cam_world: Float[Tensor, "3"]  # metres
+    t_cam_world: Float[Tensor, 3]  # metres
     fx: float  # pixels
     fy: float
     cx: float
@@ -55,13 +55,13 @@ class Camera:
 class HeadParams:
     """What moves a FLAME-format head in one frame; identity coefficients belong to the subject, not to the frame."""
 
-    expression: Float[Tensor, "E"]  # coefficients of the expression basis
-    jaw: Float[Tensor, "6"]  # 6D rotation
-    eyes: Float[Tensor, "12"]  # two 6D rotations, left then right
-    eyelids: Float[Tensor, "2"]  # blendshape weights, left then right
-    neck: Float[Tensor, "6"]  # 6D rotation; identity in metrical-tracker's data, and not a condition of the MLP
+    expression: Float[Tensor, E]  # coefficients of the expression basis
+    jaw: Float[Tensor, 6]  # 6D rotation
+    eyes: Float[Tensor, 12]  # two 6D rotations, left then right
+    eyelids: Float[Tensor, 2]  # blendshape weights, left then right
+    neck: Float[Tensor, 6]  # 6D rotation; identity in metrical-tracker's data, and not a condition of the MLP
 
-    def condition(self) -> Float[Tensor, "E+20"]:
+    def condition(self) -> Float[Tensor, E + 20]:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""
         return torch.cat((self.expression, self.jaw, self.eyes, self.eyelids))
 
@@ -79,7 +79,7 @@ class Frame:
     head_mask: Float[Tensor, "H W"]  # head and neck; ones where the subject has none
     mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth
 
-    def composite(self, background: Float[Tensor, "3"]) -> Float[Tensor, "H W 3"]:
+    def composite(self, background: Float[Tensor, 3]) -> Float[Tensor, "H W 3"]:
         """The training target: matte over the background, then the head mask over the background again.
 
         Source: FlashAvatar and HyperGaussians, data loading (`img*alpha + bg*(1-alpha)`, then `*mask + bg*(1-mask)`).
@@ -94,7 +94,7 @@ class Gaussians(NamedTuple):
     means: Float[Tensor, "N 3"]  # metres
     quats: Float[Tensor, "N 4"]  # (w, x, y, z), need not be normalised
     scales: Float[Tensor, "N 3"]  # standard deviations, metres, > 0
-    opacities: Float[Tensor, "N"]  # in [0, 1]
+    opacities: Float[Tensor, N]  # in [0, 1]
     sh: Float[Tensor, "N K 3"]  # spherical-harmonics colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16
 
 

@@ -42,7 +42,7 @@ class HeadAssets:
     eyelid_dirs: Float[Tensor, "2 V 3"]  # left, right; zeros where the model has none
     uvs: Float[Tensor, "T 2"]  # OBJ convention: origin at the lower left
     uv_faces: Int[Tensor, "F 3"]  # rows of `uvs` for the corners of `faces`
-    regions: Mapping[str, Int[Tensor, "_"]]  # name -> vertex indices
+    regions: Mapping[str, Int[Tensor, _]]  # name -> vertex indices
     fingerprint: str  # SHA-256 over all of the above
 
     @property
@@ -112,9 +112,7 @@ def load_head_assets(path: Path) -> HeadAssets:
         "uv_faces": torch.from_numpy(uv_faces),
     }
     regions = _read_regions(folder, V)
-    return HeadAssets(
-        **tensors, parents=parents, regions=regions, fingerprint=_fingerprint(tensors, parents, regions)
-    )
+    return HeadAssets(**tensors, parents=parents, regions=regions, fingerprint=_fingerprint(tensors, parents, regions))
 
 
 def find_model_file(path: Path) -> Path:
@@ -154,7 +152,9 @@ def find_uv_obj(folder: Path) -> Path:
             f"no OBJ with the UV layout lies in {folder}; put head_template.obj (same topology as the model, with "
             "vt lines; FLAME's comes with its texture space) beside the model file"
         )
-    raise UserError(f"{folder} holds several OBJ files and none is called head_template.obj; rename the right one to it")
+    raise UserError(
+        f"{folder} holds several OBJ files and none is called head_template.obj; rename the right one to it"
+    )
 
 
 def _read_arrays(file: Path) -> Mapping[str, object]:

@@ -21,9 +21,10 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
     uvs: list[tuple[float, float]] = []
     corners: list[list[tuple[int, int]]] = []
     positions = 0
+    number = 0
     try:
         with file.open(encoding="utf-8", errors="replace") as lines:
-            for number, line in enumerate(lines, start=1):
+            for number, line in enumerate(lines, start=1):  # noqa: B007 (the message names the line)
                 kind, _, rest = line.partition(" ")
                 if kind == "v":
                     positions += 1
@@ -37,7 +38,9 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror})") from None
     except ValueError:
-        raise UserError(f"{file}, line {number}: not a line of an OBJ file whose faces carry UVs (f v/vt ...)") from None
+        raise UserError(
+            f"{file}, line {number}: not a line of an OBJ file whose faces carry UVs (f v/vt ...)"
+        ) from None
 
     if positions != num_vertices or len(corners) != len(faces):
         raise UserError(

@@ -1,0 +1,52 @@
+# `make demo` and `make test` need nothing but Python 3.10+, make and a C++ compiler; both make the environment first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# On Linux the package index's torch is a CUDA build of several GB. A CPU-only machine can save them with
+#   make setup PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
+PIP_FLAGS ?=
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
+NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
+DEMO ?= demo
+
+.PHONY: help setup demo test check format smoke wheel clean
+help: ## show this list
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
+
+setup: $(VENV)/.installed ## make .venv with pinned packages and the compiled core
+
+demo: setup ## make a subject, train an avatar on it, evaluate it and let another subject drive it
+	$(BIN)/avatar demo $(DEMO)
+
+test: setup ## run all tests
+	$(BIN)/python -m pytest
+
+check: setup ## lint, formatting and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: setup ## put the code into its standard form
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+wheel: setup ## build dist/avatar-*.whl
+	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
+
+clean: ## remove everything that the other targets make
+	rm -rf $(VENV) build dist $(DEMO)
+
+$(VENV)/.tools: constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null \
+	  || { echo "avatar needs Python 3.10 or newer as $(PYTHON); name another one with make setup PYTHON=..."; exit 1; }
+	@command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null \
+	  || { echo "avatar needs a C++ compiler (Debian: apt install g++; macOS: xcode-select --install)"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) \
+	  || { echo "$(PYTHON) cannot make a virtual environment (Debian: apt install python3-venv)"; exit 1; }
+	$(PIP) torch setuptools wheel
+	$(PIP) scikit-build-core nanobind cmake ninja
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.tools pyproject.toml $(NATIVE)
+	$(PIP) --no-build-isolation -e '.[dev]'
+	@touch $@

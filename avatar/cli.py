@@ -1,0 +1,108 @@
+"""The command line: `avatar train | eval | reenact | prepare | demo-data | demo | doctor`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import avatar
+from avatar.errors import UserError
+
+EXIT_ERROR = 1
+EXIT_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status. A UserError is printed as its sentence, without a stack trace."""
+    parser = build_parser()
+    arguments = parser.parse_args(argv)
+    try:
+        # The commands import torch and the compiled core; --help must answer without them.
+        from avatar import commands
+
+        return getattr(commands, arguments.command.replace("-", "_"))(arguments)
+    except UserError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        print("avatar: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="avatar", description="Animatable 3D Gaussian head avatars from one tracked video, on a CPU or a GPU."
+    )
+    parser.add_argument("--version", action="version", version=f"avatar {avatar.__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    train = commands.add_parser("train", help="train an avatar on a tracked video folder")
+    add_source(train)
+    train.add_argument("--out", type=Path, metavar="RUN", help="where the run goes (default: runs/NAME)")
+    train.add_argument("--size", type=int, help="width of the training images in pixels (default: the video's)")
+    train.add_argument("--iterations", type=int, help="optimizer steps (default: 30000, the paper's)")
+    train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
+    train.add_argument("--resume", action="store_true", help="go on from RUN's newest checkpoint")
+    train.add_argument("overrides", nargs="*", metavar="key=value", help="configuration, such as model=flashavatar")
+
+    evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
+    add_run(evaluate)
+    evaluate.add_argument("--protocol", action="append", metavar="NAME", help="only this protocol; may be repeated")
+    evaluate.add_argument("--frames", action="store_true", help="write every render, truth and mask as PNG too")
+
+    reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
+    add_run(reenact)
+    reenact.add_argument("--driver", type=Path, required=True, metavar="FOLDER", help="tracked folder of the driver")
+    reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
+    reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
+    reenact.add_argument("--transfer", choices=("raw", "relative", "mean"), default="relative")
+    reenact.add_argument("--camera", choices=("driver", "target"), default="driver", help="whose head pose is shown")
+    reenact.add_argument(
+        "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
+    )
+
+    prepare = commands.add_parser("prepare", help="check and import a tracked folder; train does it by itself")
+    add_source(prepare)
+    prepare.add_argument("--out", type=Path, metavar="DIR", help="where the prepared subject goes (default: the cache)")
+
+    demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
+    demo_data.add_argument("out", type=Path, metavar="OUT")
+    demo_data.add_argument("--frames", type=int, default=600)
+    demo_data.add_argument("--size", type=int, default=256, help="width and height in pixels")
+    demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
+    demo_data.add_argument("--motion", choices=("speech", "turn"), default="speech")
+
+    demo = commands.add_parser("demo", help="make two subjects, train on one, evaluate, reenact with the other")
+    demo.add_argument("out", type=Path, metavar="OUT")
+
+    doctor = commands.add_parser("doctor", help="say what this installation can do and what is missing")
+    doctor.set_defaults()
+    return parser
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """The options that name a tracked folder and what belongs to it."""
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
+    add_head(parser)
+    parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in FOLDER")
+    parser.add_argument("--frame-offset", type=int, metavar="N", help="image number minus .frame number, if known")
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder that avatar train wrote")
+    add_head(parser)
+
+
+def add_head(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--head",
+        type=Path,
+        metavar="PATH",
+        help="FLAME-format head model, file or folder (default: head_model/ in the subject, then $AVATAR_HEAD)",
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

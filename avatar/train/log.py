@@ -1,0 +1,56 @@
+"""What a run shows while it works: a progress bar, tensorboard scalars and preview images."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from avatar.losses import PhotometricLoss
+
+SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
+
+
+class TrainingLog:
+    """Writes RUN/tensorboard and RUN/previews; a context manager, so that an interruption still closes its files."""
+
+    def __init__(self, run: Path, start: int, stop: int, every: int) -> None:
+        self._previews = run / "previews"
+        self._every = every
+        self._writer = SummaryWriter(str(run / "tensorboard"), purge_step=start)
+        self._bar = tqdm(total=stop, initial=start, unit="step", desc="train", dynamic_ncols=True)
+        self._loss = self._psnr = math.nan
+
+    def __enter__(self) -> TrainingLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+        self._writer.close()
+
+    def step(self, step: int, loss: PhotometricLoss, psnr: float) -> None:
+        """Record the values of one step; `step` counts from 1."""
+        total = float(loss.total.detach())
+        first = math.isnan(self._loss)
+        self._loss = total if first else SMOOTHING * self._loss + (1 - SMOOTHING) * total
+        self._psnr = psnr if first else SMOOTHING * self._psnr + (1 - SMOOTHING) * psnr
+        self._bar.update(1)
+        self._bar.set_postfix(loss=f"{self._loss:.5f}", psnr=f"{self._psnr:.2f}", refresh=False)
+        if step % self._every == 0:
+            for name, value in loss._asdict().items():
+                self._writer.add_scalar(f"loss/{name}", float(value.detach()), step)
+            self._writer.add_scalar("train/psnr", psnr, step)
+
+    def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
+        """The truth beside the render of one held-out frame, [H, W, 3] each."""
+        pair = torch.cat((truth, render), dim=1).detach().clamp(0, 1)
+        image = np.round(pair.numpy() * 255).astype(np.uint8)
+        self._previews.mkdir(parents=True, exist_ok=True)
+        iio.imwrite(self._previews / f"step_{step:08d}.png", image)
+        self._writer.add_image("preview", image, step, dataformats="HWC")

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from heads import grid_head, random_params
+
+from avatar.gaussians.embedding import Embedding, knn_scales
+from avatar.gaussians.uv import uv_texels
+from avatar.head.model import HeadModel
+
+
+def test_each_texel_lies_where_its_centre_lies_in_the_uv_map() -> None:
+    assets, size = grid_head(), 32
+    texels = uv_texels(assets, size)
+    corners = assets.uvs[assets.uv_faces[texels.face]]
+    uv = (corners * texels.barycentric[:, :, None]).sum(1)
+    torch.testing.assert_close(uv[:, 0] * size, texels.column + 0.5, rtol=0, atol=1e-4)
+    torch.testing.assert_close((1 - uv[:, 1]) * size, texels.row + 0.5, rtol=0, atol=1e-4)
+
+
+def test_all_texels_of_the_map_are_covered_except_the_boundarys() -> None:
+    assets, size = grid_head(rows=7, columns=9), 64
+    texels = uv_texels(assets, size)
+    # The map covers u, v in [0.05, 0.95]; the boundary is the lowest of six rows of quads.
+    centres = (np.arange(size) + 0.5) / size
+    columns = ((centres > 0.05) & (centres < 0.95)).sum()
+    rows = ((1 - centres > 0.05 + 0.9 / 6) & (1 - centres < 0.95)).sum()
+    assert len(texels.row) == rows * columns
+    assert not np.isin(assets.faces[texels.face], assets.regions["boundary"]).any()
+
+
+def test_points_follow_the_mesh() -> None:
+    assets = grid_head()
+    embedding = Embedding(assets, uv_texels(assets, 24))
+    vertices = HeadModel(assets, torch.randn(10)).vertices(random_params())
+    points = embedding.points(vertices)
+    for index in (0, len(embedding) // 2, len(embedding) - 1):
+        face = assets.faces[embedding.texels.face[index]]
+        expected = sum(embedding.barycentric[index, k] * vertices[face[k]] for k in range(3))
+        torch.testing.assert_close(points[index], expected)
+
+
+def test_initial_scales_are_the_rms_distance_to_three_neighbours() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [100, 100, 100]])
+    brute = torch.cdist(points, points).sort(dim=1).values[:, 1:4].square().mean(1).sqrt()
+    torch.testing.assert_close(knn_scales(points), brute)
+
+
+def test_coincident_and_single_points_have_a_positive_scale() -> None:
+    assert bool((knn_scales(torch.zeros(5, 3)) > 0).all())
+    assert bool((knn_scales(torch.zeros(1, 3)) > 0).all())
+
+
+def test_a_raster_without_a_texel_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one texel a side, got 0"):
+        uv_texels(grid_head(), 0)

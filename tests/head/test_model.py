@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from heads import EXPRESSIONS, grid_head, random_params, rest_params
+
+from avatar.head.assets import load_head_assets
+from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.types import IDENTITY_6D
+
+
+def oracle(assets, identity, params) -> np.ndarray:
+    """FLAME's equations written out, one vertex and one joint at a time, in float64."""
+    f64 = lambda tensor: tensor.double().numpy()  # noqa: E731
+    V, J = assets.num_vertices, 5
+    shaped = f64(assets.template).copy()
+    for v in range(V):
+        for s, value in enumerate(f64(identity)):
+            shaped[v] += f64(assets.shape_dirs)[v, :, s] * value
+        for e, value in enumerate(f64(params.expression)):
+            shaped[v] += f64(assets.expression_dirs)[v, :, e] * value
+    joints = np.zeros((J, 3))
+    for j in range(J):
+        for v in range(V):
+            joints[j] += f64(assets.joint_regressor)[j, v] * shaped[v]
+
+    def rotation(six: np.ndarray) -> np.ndarray:
+        a = six[:3] / np.linalg.norm(six[:3])
+        b = six[3:] - np.dot(a, six[3:]) * a
+        b = b / np.linalg.norm(b)
+        return np.array([a, b, np.cross(a, b)])
+
+    eyes = f64(params.eyes)
+    local = [np.eye(3), *(rotation(r) for r in (f64(params.neck), f64(params.jaw), eyes[:6], eyes[6:]))]
+    feature = np.concatenate([(R - np.eye(3)).reshape(-1) for R in local[1:]])
+    transforms: list[np.ndarray] = []
+    for j in range(J):
+        parent = assets.parents[j]
+        own = np.eye(4)
+        own[:3, :3] = local[j]
+        own[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0)
+        transforms.append(own if parent < 0 else transforms[parent] @ own)
+    result = np.zeros((V, 3))
+    for v in range(V):
+        position = shaped[v] + f64(assets.pose_dirs)[v] @ feature
+        for j in range(J):
+            offset = transforms[j][:3, 3] - transforms[j][:3, :3] @ joints[j]
+            result[v] += f64(assets.weights)[v, j] * (transforms[j][:3, :3] @ position + offset)
+        for side in range(2):
+            result[v] += f64(assets.eyelid_dirs)[side, v] * f64(params.eyelids)[side]
+    return result
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_skinning_agrees_with_the_loop_written_oracle(seed: int) -> None:
+    assets, params = grid_head(seed=seed), random_params(seed)
+    identity = torch.randn(7)
+    expected = oracle(assets, identity, params)
+    in_float64 = HeadModel(assets, identity, torch.float64).vertices(params)
+    np.testing.assert_allclose(in_float64.numpy(), expected, rtol=0, atol=1e-12)
+    in_float32 = HeadModel(assets, identity).vertices(params)
+    np.testing.assert_allclose(in_float32.numpy(), expected, rtol=0, atol=2e-6)
+
+
+def test_at_rest_the_head_is_the_neutral_identity() -> None:
+    head = HeadModel(grid_head(), torch.randn(300))
+    torch.testing.assert_close(head.vertices(rest_params()), head.neutral_vertices(), rtol=0, atol=1e-6)
+
+
+def test_missing_expression_coefficients_are_zeros() -> None:
+    head = HeadModel(grid_head(), torch.zeros(0))
+    full = random_params()
+    full = replace(full, expression=torch.cat((full.expression[:2], torch.zeros(EXPRESSIONS - 2))))
+    short = replace(full, expression=full.expression[:2])
+    torch.testing.assert_close(head.vertices(short), head.vertices(full))
+
+
+def test_a_rotation_in_6d_is_orthonormal_and_its_first_rows_are_the_input() -> None:
+    six = torch.randn(20, 6, dtype=torch.float64)
+    R = matrix_from_6d(six)
+    torch.testing.assert_close(R @ R.transpose(1, 2), torch.eye(3).double().expand(20, 3, 3), rtol=0, atol=1e-12)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(20).double())
+    torch.testing.assert_close(matrix_from_6d(R[:, :2].reshape(20, 6)), R, rtol=0, atol=1e-12)
+    assert torch.equal(matrix_from_6d(torch.tensor(IDENTITY_6D)), torch.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"jaw": torch.zeros(3)}, r"jaw must have shape \[6\], got \[3\]"),
+        ({"eyelids": torch.zeros(1)}, r"eyelids must have shape \[2\], got \[1\]"),
+        ({"expression": torch.zeros(9)}, "9 coefficients, but the head model has 5 directions"),
+    ],
+)
+def test_wrong_shapes_are_named(change: dict, message: str) -> None:
+    head = HeadModel(grid_head(), torch.zeros(0))
+    with pytest.raises(ValueError, match=message):
+        head.vertices(replace(rest_params(), **change))
+
+
+@pytest.mark.shared
+def test_the_development_head_model_loads_with_its_regions(shared_dir) -> None:
+    assets = load_head_assets(shared_dir / "subjects" / "head_model")
+    assert (assets.num_vertices, len(assets.faces), assets.num_expressions) == (5060, 9891, 100)
+    assert {"boundary", "lips", "face", "left_eyeball", "right_eyeball"} <= set(assets.regions)
+    assert (
+        load_head_assets(shared_dir / "subjects" / "head_model" / "generic_model.pkl").fingerprint == assets.fingerprint
+    )

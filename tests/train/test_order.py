@@ -1,0 +1,21 @@
+from __future__ import annotations
+
+from collections import Counter
+
+from avatar.train.order import frame_order
+
+
+def test_every_pass_sees_every_frame_once_in_a_new_order() -> None:
+    frames = [3, 5, 8, 13, 21]
+    order = list(frame_order(frames, seed=1, start=0, stop=15))
+    passes = [order[i : i + 5] for i in (0, 5, 10)]
+    assert all(sorted(p) == frames for p in passes)
+    assert len({tuple(p) for p in passes}) > 1
+
+
+def test_a_resumed_run_sees_what_the_uninterrupted_one_does() -> None:
+    frames = list(range(7))
+    whole = list(frame_order(frames, seed=4, start=0, stop=40))
+    assert list(frame_order(frames, seed=4, start=0, stop=23)) + list(frame_order(frames, 4, 23, 40)) == whole
+    assert list(frame_order(frames, seed=5, start=0, stop=40)) != whole
+    assert max(Counter(whole).values()) - min(Counter(whole).values()) <= 1
