@@ -1,0 +1,132 @@
+"""Drawing of Gaussians: one function with one meaning on every backend."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.check import check_finite, check_shapes
+from avatar.splat.cpu import splat_cpu
+from avatar.splat.reference import splat_reference
+from avatar.splat.sh import sh_degree_of
+from avatar.types import Camera, Gaussians, Rendering
+
+__all__ = ["splat"]
+
+MAX_SIDE = 1 << 15  # pixels
+
+
+def splat(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Float[Tensor, "3"],
+    *,
+    backend: Literal["cpu", "reference"] = "cpu",
+    sh_degree: int | None = None,
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.999,
+    t_min: float = 1e-4,
+    blur: float = 0.3,
+    near: float = 0.01,
+    antialiased: bool = False,
+) -> Rendering:
+    """Draw 3D Gaussians over a background; differentiable in all five fields of `gaussians` and in `background`.
+
+    backend      "cpu": C++, float32, multithreaded (torch.get_num_threads(), or the variable AVATAR_THREADS);
+                 "reference": plain torch in float64 whatever the dtype, any device, slow, the definition of the result
+    sh_degree    colour from the first (sh_degree + 1)^2 coefficients only; None: all. The others get zero gradient
+    alpha_min    a splat is skipped at pixels where its alpha is below this, and everywhere if its opacity is; in [0, 1)
+    alpha_max    alpha is clamped to this, with zero gradient where it is; in (0, 0.9999]
+    t_min        the splat that would bring the transmittance of a pixel below this is not drawn, nor any after it; [0, 1)
+    blur         pixels^2 added to both variances of a projected splat (D and G of the field: 0.3)
+    near         splats whose centre is nearer than this along the optical axis are left out; metres, > 0
+    antialiased  multiply the opacity by sqrt(det / det with blur), so that the blur adds no light (Mip-Splatting)
+
+    Splats are drawn by depth of the centre and, at equal depth, by index; pixel centres are at + 0.5; every pixel in
+    which a splat reaches alpha_min is drawn. Colour is max(SH + 0.5, 0) along the direction from the camera to the mean.
+    The Jacobian of the projection is taken at a slope clamped to 0.3 tan(fov / 2) outside the image, as in gsplat. A
+    zero quaternion is the identity, with zero gradient. The sign of a scale has no effect.
+
+    The image and alpha of the "cpu" backend are the same to the last bit for any number of threads.
+    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device, for non-finite values
+    (with count and first index), for colours that overflow, and for scenes beyond the kernel's stated limits.
+    """
+    sizes = check_shapes(
+        means=(gaussians.means, "N 3"),
+        quats=(gaussians.quats, "N 4"),
+        scales=(gaussians.scales, "N 3"),
+        opacities=(gaussians.opacities, "N"),
+        sh=(gaussians.sh, "N K 3"),
+        background=(background, "3"),
+        R_cam_world=(camera.R_cam_world, "3 3"),
+        t_cam_world=(camera.t_cam_world, "3"),
+    )
+    _check_dtype_and_device(gaussians, background, backend)
+    _check_camera(camera)
+    stored_degree = sh_degree_of(sizes["K"])
+    if sh_degree is None:
+        sh_degree = stored_degree
+    elif not 0 <= sh_degree <= stored_degree:
+        raise ValueError(f"sh_degree must be 0 to {stored_degree}, the degree that sh holds, got {sh_degree}")
+    if not 0 <= alpha_min < 1:
+        raise ValueError(f"alpha_min must be in [0, 1), got {alpha_min}")
+    if not 0 < alpha_max <= 0.9999:
+        raise ValueError(f"alpha_max must be in (0, 0.9999], got {alpha_max}")
+    if not 0 <= t_min < 1:
+        raise ValueError(f"t_min must be in [0, 1), got {t_min}")
+    if not (blur >= 0 and math.isfinite(blur)):
+        raise ValueError(f"blur must be finite and not negative, got {blur}")
+    if not (near > 0 and math.isfinite(near)):
+        raise ValueError(f"near must be finite and above 0, got {near}")
+
+    # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
+    alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, t_min], dtype=torch.float32).tolist()
+    if backend == "reference":
+        check_finite(**gaussians._asdict(), background=background)
+        draw = splat_reference
+    else:
+        draw = splat_cpu
+    return draw(
+        gaussians,
+        camera,
+        background,
+        sh_degree=sh_degree,
+        alpha_min=alpha_min,
+        alpha_max=alpha_max,
+        t_min=t_min,
+        blur=blur,
+        near=near,
+        antialiased=antialiased,
+    )
+
+
+def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: str) -> None:
+    if backend not in ("cpu", "reference"):
+        raise ValueError(f'backend must be "cpu" or "reference", got {backend!r}')
+    allowed = (torch.float32,) if backend == "cpu" else (torch.float32, torch.float64)
+    device = torch.device("cpu") if backend == "cpu" else gaussians.means.device
+    for name, tensor in (*gaussians._asdict().items(), ("background", background)):
+        if tensor.dtype not in allowed:
+            wanted = " or ".join(str(dtype).removeprefix("torch.") for dtype in allowed)
+            raise TypeError(f'{name} must be {wanted} for backend "{backend}", got {tensor.dtype}')
+        if tensor.device != device:
+            raise ValueError(f'{name} must be on {device} for backend "{backend}", got {tensor.device}')
+
+
+def _check_camera(camera: Camera) -> None:
+    check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)
+    for name in ("fx", "fy"):
+        value = getattr(camera, name)
+        if not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"camera.{name} must be finite and above 0 pixels, got {value}")
+    for name in ("cx", "cy"):
+        if not math.isfinite(getattr(camera, name)):
+            raise ValueError(f"camera.{name} must be finite, got {getattr(camera, name)}")
+    for name in ("width", "height"):
+        value = getattr(camera, name)
+        if not 1 <= value <= MAX_SIDE:
+            raise ValueError(f"camera.{name} must be 1 to {MAX_SIDE} pixels, got {value}")

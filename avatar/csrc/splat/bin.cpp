@@ -1,0 +1,158 @@
+#include "splat/bin.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <stdexcept>
+#include <string>
+
+#include "splat/thread_pool.h"
+
+namespace avatar::splat {
+namespace {
+
+// The first and last pixel whose centre lies in [low, high], within [0, size); first > last where there is none.
+struct PixelRange {
+    int first, last;
+};
+
+PixelRange pixels_between(double low, double high, int size) {
+    const double first = std::ceil(low - 0.5), last = std::floor(high - 0.5);
+    return {first > 0.0 ? int(std::min(first, double(size))) : 0,
+            last < size - 1.0 ? int(std::max(last, -1.0)) : size - 1};
+}
+
+// Calls visit(tile_y, first tile_x, last tile_x) for the rows of tiles that the splat's ellipse meets.
+template <typename Visit>
+void for_each_tile_row(const Splat& s, int width, int height, const Visit& visit) {
+    const double reach = s.reach;
+    if (!std::isfinite(reach)) {
+        for (int ty = 0; ty <= (height - 1) / kTileHeight; ++ty) visit(ty, 0, (width - 1) / kTileWidth);
+        return;
+    }
+    const double radius = std::sqrt(reach), skew = s.b / s.c;  // in whitened coordinates, u = a d_x + skew v
+    const PixelRange rows = pixels_between(s.y - radius / s.c, s.y + radius / s.c, height);
+    if (rows.first > rows.last) return;
+    // The ellipse's rightmost point has v = -extreme, its leftmost v = +extreme.
+    const double extreme = skew * radius / std::sqrt(1.0 + skew * skew);
+    for (int ty = rows.first / kTileHeight; ty <= rows.last / kTileHeight; ++ty) {
+        const int top = std::max(rows.first, ty * kTileHeight);
+        const int bottom = std::min(rows.last, ty * kTileHeight + kTileHeight - 1);
+        const double v0 = std::clamp(s.c * (top + 0.5 - s.y), -radius, radius);
+        const double v1 = std::clamp(s.c * (bottom + 0.5 - s.y), -radius, radius);
+        const double v_left = std::clamp(extreme, v0, v1), v_right = std::clamp(-extreme, v0, v1);
+        const double half_left = std::sqrt(std::max(reach - v_left * v_left, 0.0));
+        const double half_right = std::sqrt(std::max(reach - v_right * v_right, 0.0));
+        const PixelRange columns = pixels_between(s.x - (skew * v_left + half_left) / s.a,
+                                                  s.x - (skew * v_right - half_right) / s.a, width);
+        if (columns.first <= columns.last) visit(ty, columns.first / kTileWidth, columns.last / kTileWidth);
+    }
+}
+
+}  // namespace
+
+std::vector<std::uint32_t> depth_order(const std::vector<double>& depths) {
+    // Radix sort by the float above 0 nearest to the depth, whose bits order as integers do; then the few runs of equal
+    // floats by the double.
+    struct Key {
+        std::uint32_t depth, index;
+    };
+    constexpr int kBits = 11, kBuckets = 1 << kBits;
+    const std::size_t count = depths.size();
+    std::vector<Key> keys(count), other(count);
+    std::array<std::array<std::uint32_t, kBuckets>, 3> starts{};
+    for (std::size_t i = 0; i < count; ++i) {
+        const float depth = static_cast<float>(depths[i]);
+        std::uint32_t bits;
+        std::memcpy(&bits, &depth, sizeof bits);
+        keys[i] = {bits, static_cast<std::uint32_t>(i)};
+        for (int pass = 0; pass < 3; ++pass) ++starts[pass][bits >> (kBits * pass) & (kBuckets - 1)];
+    }
+    for (int pass = 0; pass < 3; ++pass) {
+        std::uint32_t sum = 0;
+        for (std::uint32_t& start : starts[pass]) {
+            const std::uint32_t size = start;
+            start = sum;
+            sum += size;
+        }
+        for (const Key& key : keys) other[starts[pass][key.depth >> (kBits * pass) & (kBuckets - 1)]++] = key;
+        keys.swap(other);
+    }
+    std::vector<std::uint32_t> order(count);
+    for (std::size_t begin = 0, end; begin < count; begin = end) {
+        for (end = begin; end < count && keys[end].depth == keys[begin].depth; ++end) order[end] = keys[end].index;
+        if (end - begin > 1)
+            std::stable_sort(order.begin() + begin, order.begin() + end,
+                             [&](std::uint32_t i, std::uint32_t j) { return depths[i] < depths[j]; });
+    }
+    return order;
+}
+
+TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, int height, std::int64_t max_pairs,
+                           int threads) {
+    TileLists lists;
+    lists.tiles_x = (width + kTileWidth - 1) / kTileWidth;
+    lists.tiles_y = (height + kTileHeight - 1) / kTileHeight;
+    const std::int64_t tiles = std::int64_t{lists.tiles_x} * lists.tiles_y;
+
+    // A stable counting sort by tile. The splats are cut into one chunk a thread; each chunk counts its pairs for every
+    // tile, and then knows where its own begin. The result does not depend on the number of chunks.
+    lists.slot_begin.assign(count + 1, 0);
+    parallel_for(threads, count, 2048, [&](std::int64_t begin, std::int64_t end) {
+        for (std::int64_t i = begin; i < end; ++i) {
+            std::int64_t pairs = 0;
+            for_each_tile_row(splats[i], width, height, [&](int, int first, int last) { pairs += last - first + 1; });
+            lists.slot_begin[i + 1] = pairs;
+        }
+    });
+    for (std::int64_t i = 0; i < count; ++i) lists.slot_begin[i + 1] += lists.slot_begin[i];
+    lists.pair_count = lists.slot_begin[count];
+    if (lists.pair_count > max_pairs)
+        throw std::length_error("drawing needs " + std::to_string(lists.pair_count) + " pairs of a tile of " +
+                                std::to_string(kTileWidth) + "x" + std::to_string(kTileHeight) +
+                                " pixels and a splat, the limit is " + std::to_string(max_pairs) +
+                                "; are the scales too large for this camera?");
+
+    const std::int64_t chunks = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, count / 2048));
+    const std::int64_t chunk_size = (count + chunks - 1) / chunks;
+    std::vector<std::uint32_t> next(chunks * tiles, 0);
+    const auto splats_of = [&](std::int64_t chunk) {
+        return std::pair(std::min(chunk * chunk_size, count), std::min((chunk + 1) * chunk_size, count));
+    };
+    parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
+        std::uint32_t* counts = next.data() + chunk * tiles;
+        const auto [begin, end] = splats_of(chunk);
+        for (std::int64_t i = begin; i < end; ++i)
+            for_each_tile_row(splats[i], width, height, [&](int ty, int first, int last) {
+                for (int tx = first; tx <= last; ++tx) ++counts[std::int64_t{ty} * lists.tiles_x + tx];
+            });
+    });
+    lists.tile_begin.resize(tiles + 1);
+    std::int64_t sum = 0;
+    for (std::int64_t tile = 0; tile < tiles; ++tile) {
+        lists.tile_begin[tile] = sum;
+        for (std::int64_t chunk = 0; chunk < chunks; ++chunk) {
+            const std::uint32_t size = next[chunk * tiles + tile];
+            next[chunk * tiles + tile] = static_cast<std::uint32_t>(sum);
+            sum += size;
+        }
+    }
+    lists.tile_begin[tiles] = sum;
+    lists.pairs.reset(new Pair[lists.pair_count]);  // not initialised: every element is written below
+    parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
+        std::uint32_t* position = next.data() + chunk * tiles;
+        const auto [begin, end] = splats_of(chunk);
+        for (std::int64_t i = begin; i < end; ++i) {
+            std::uint32_t slot = static_cast<std::uint32_t>(lists.slot_begin[i]);
+            for_each_tile_row(splats[i], width, height, [&](int ty, int first, int last) {
+                for (int tx = first; tx <= last; ++tx)
+                    lists.pairs[position[std::int64_t{ty} * lists.tiles_x + tx]++] = {static_cast<std::uint32_t>(i),
+                                                                                    slot++};
+            });
+        }
+    });
+    return lists;
+}
+
+}  // namespace avatar::splat

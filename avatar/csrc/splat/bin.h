@@ -1,0 +1,27 @@
+#pragma once
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "splat/scene.h"
+
+// Depth order and tile lists.
+namespace avatar::splat {
+
+struct TileLists {
+    int tiles_x = 0, tiles_y = 0;
+    std::vector<std::int64_t> tile_begin;   // [tiles + 1] into `pairs`; a tile's pairs are front to back
+    std::vector<std::int64_t> slot_begin;   // [splats + 1]: the slots of a splat
+    std::unique_ptr<Pair[]> pairs;
+    std::int64_t pair_count = 0;
+};
+
+// Indices 0 .. depths.size() - 1 by increasing depth (> 0), equal depths by index.
+std::vector<std::uint32_t> depth_order(const std::vector<double>& depths);
+
+// The tiles in which each of the sorted splats has a pixel centre that its ellipse of alpha >= alpha_min may contain.
+// Throws std::length_error, naming the number and the limit, for more than `max_pairs` pairs.
+TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, int height, std::int64_t max_pairs,
+                           int threads);
+
+}  // namespace avatar::splat

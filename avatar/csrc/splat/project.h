@@ -1,0 +1,29 @@
+#pragma once
+#include "splat/scene.h"
+
+// Gaussian -> Splat and its derivative: pinhole projection of mean and covariance (Zwicker et al. 2002), colour from
+// spherical harmonics. The geometry is in double: scales of 1e-12 and of 1e6 in one scene must give neither zeros nor NaN.
+namespace avatar::splat {
+
+// What is the same for all Gaussians of one call.
+struct View {
+    View(const Camera& camera, const Settings& settings);
+
+    Camera camera;
+    Settings settings;
+    double centre[3];                           // of the camera, world
+    double slope_x[2], slope_y[2];              // range to which x / z and y / z are clamped in the Jacobian
+};
+
+// Why a Gaussian is not drawn, or that it is.
+enum class Visibility { kVisible, kHidden, kColourOverflow };
+
+// Fills `splat` (all but `index`) and the depth of the centre. Hidden: nearer than `near`, opacity below alpha_min, no
+// pixel of the image where alpha can reach alpha_min, or no area on the image plane.
+Visibility project(const View& view, const Gaussians& gaussians, std::int64_t i, Splat& splat, double& depth);
+
+// Writes (does not add) the gradients of Gaussian i, from the moments of its splat summed over all tiles.
+void project_backward(const View& view, const Gaussians& gaussians, std::int64_t i, const double moments[kMoments],
+                      const GaussianGradients& gradients);
+
+}  // namespace avatar::splat

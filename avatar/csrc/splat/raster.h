@@ -1,0 +1,51 @@
+#pragma once
+#include <cstdint>
+
+#include "splat/scene.h"
+
+// Compositing of the tiles, forward and backward. The kernels are compiled for several instruction sets and chosen when
+// the program runs.
+namespace avatar::splat {
+
+// What both directions read.
+struct Raster {
+    const Splat* splats;
+    const Pair* pairs;
+    const std::int64_t* tile_begin;
+    int tiles_x;
+    int width, height;
+    float alpha_min, alpha_max, t_min;
+    float background[3];
+};
+
+struct ForwardTarget {
+    float* image;              // [height * width * 3]
+    float* alpha;              // [height * width]
+    float* transmittance;      // [height * width]
+    std::uint32_t* processed;  // [tiles], pairs that were looked at before all pixels of the tile had stopped
+};
+
+struct BackwardSource {
+    const float* image;
+    const float* transmittance;
+    const std::uint32_t* processed;
+    const float* grad_image;  // may be null
+    const float* grad_alpha;  // may be null
+};
+
+struct BackwardTarget {
+    float* moments;           // [pairs * kMoments], by slot
+    double* grad_background;  // [tiles * 3]
+};
+
+struct Kernels {
+    const char* name;
+    void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
+    void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
+};
+
+// "baseline", "avx2" or "avx512"; "" is the best that this processor has. Throws std::invalid_argument for a name that
+// is unknown or that this processor or build does not support.
+const Kernels& select_kernels(const char* name);
+
+}  // namespace avatar::splat

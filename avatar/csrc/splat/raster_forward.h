@@ -1,0 +1,55 @@
+#pragma once
+#include "splat/raster_tile.h"
+
+namespace avatar::splat {
+namespace {
+
+void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& target) {
+    const TileArea area(r, tile);
+    alignas(64) float transmittance[kTilePixels], red[kTilePixels] = {}, green[kTilePixels] = {},
+                                                  blue[kTilePixels] = {};
+    unsigned alive[kStrips];
+    clear_transmittance(area, transmittance, alive);
+
+    const Floats alpha_min = broadcast(r.alpha_min), alpha_max = broadcast(r.alpha_max), t_min = broadcast(r.t_min);
+    const std::int64_t begin = r.tile_begin[tile], end = r.tile_begin[tile + 1];
+    std::int64_t at = begin;
+    for (; at < end && any_alive(alive); ++at) {
+        const Splat& s = r.splats[r.pairs[at].splat];
+        const SplatInTile splat(s, area);
+        const Floats s_red = broadcast(s.red), s_green = broadcast(s.green), s_blue = broadcast(s.blue);
+        for (int strip = 0; strip < kStrips; ++strip) {
+            for (unsigned rows = splat.rows[strip] & alive[strip]; rows != 0; rows &= rows - 1) {
+                const int row = static_cast<int>(first_bit(rows)), i = vector_at(row, strip);
+                const Floats u = broadcast(splat.u_row[row]) + splat.u_lane[strip];
+                const Floats alpha = min(splat.opacity * splat.falloff(row, u), alpha_max);
+                const Floats before = load(transmittance + i);
+                const Step step(before, alpha, alpha_min, t_min);
+                const Floats weight = (Floats)((Ints)(before * alpha) & step.drawn);
+                store(red + i, fma(weight, s_red, load(red + i)));
+                store(green + i, fma(weight, s_green, load(green + i)));
+                store(blue + i, fma(weight, s_blue, load(blue + i)));
+                store(transmittance + i, step.after);
+                if (signs((Ints)step.after) == kAllLanes) alive[strip] &= ~(1u << row);
+            }
+        }
+    }
+    target.processed[tile] = static_cast<std::uint32_t>(at - begin);
+
+    for (int row = 0; row < area.rows; ++row) {
+        const std::int64_t first = std::int64_t{area.top + row} * r.width + area.left;
+        for (int column = 0; column < area.columns; ++column) {
+            const int i = row * kTileWidth + column;
+            const float t = __builtin_fabsf(transmittance[i]);
+            float* pixel = target.image + 3 * (first + column);
+            pixel[0] = red[i] + t * r.background[0];
+            pixel[1] = green[i] + t * r.background[1];
+            pixel[2] = blue[i] + t * r.background[2];
+            target.alpha[first + column] = 1.0f - t;
+            target.transmittance[first + column] = t;
+        }
+    }
+}
+
+}  // namespace
+}  // namespace avatar::splat

@@ -1,0 +1,69 @@
+#pragma once
+#include <cstdint>
+
+// The plain data that the stages of the splatter hand to each other. All matrices are row-major.
+namespace avatar::splat {
+
+// N Gaussians as the caller gives them; `coefficients` is K, the stored spherical-harmonics coefficients a channel.
+struct Gaussians {
+    const float* means;      // [N * 3]
+    const float* quats;      // [N * 4], (w, x, y, z), any length
+    const float* scales;     // [N * 3]
+    const float* opacities;  // [N]
+    const float* sh;         // [N * K * 3]
+    std::int64_t count;
+    int coefficients;
+};
+
+struct GaussianGradients {
+    float* means;
+    float* quats;
+    float* scales;
+    float* opacities;
+    float* sh;
+};
+
+struct Camera {
+    double rotation[9];     // R_cam_world
+    double translation[3];  // t_cam_world, metres
+    double fx, fy, cx, cy;  // pixels
+    int width, height;
+};
+
+struct Settings {
+    int sh_degree;
+    float alpha_min, alpha_max, t_min;
+    double blur;  // pixels^2
+    double near;  // metres
+    bool antialiased;
+};
+
+// A visible Gaussian on the image plane; one cache line.
+//
+// With d = pixel - (x, y), u = a d_x + b d_y and v = c d_y, the splat's alpha is opacity * 2^-(u^2 + v^2): (a, b; 0, c)
+// is the Cholesky-type factor of the inverse covariance, times sqrt(log2(e) / 2). Squares of whitened coordinates do not
+// cancel, while the usual quadratic form of the conic loses all digits for long thin splats seen at an angle. The factor
+// is kept in double because (x, y) may lie far outside the image.
+struct Splat {
+    double x, y;
+    double a, b, c;
+    float opacity;
+    float reach;  // alpha can reach alpha_min only where u^2 + v^2 <= reach; rounded up, infinite for alpha_min = 0
+    float red, green, blue;
+    std::uint32_t index;  // of the Gaussian
+};
+static_assert(sizeof(Splat) == 64);
+
+// One splat in one tile. `slot` counts the pairs splat by splat, front to back, so that all pairs of a splat are
+// adjacent there: where the backward pass leaves what it finds, to be summed in a fixed order.
+struct Pair {
+    std::uint32_t splat, slot;
+};
+
+// What the rasteriser's backward pass finds for one splat in one tile, and the sum of that over tiles.
+// `weight` = dL/dalpha * alpha / opacity, summed over pixels; the others are its moments in (u, v).
+enum Moment { kWeight, kU, kUU, kV, kUV, kVV, kRed, kGreen, kBlue, kMoments };
+
+constexpr int kTileWidth = 16, kTileHeight = 16;
+
+}  // namespace avatar::splat

@@ -1,0 +1,109 @@
+#pragma once
+// Vectors of floats as wide as the target of this compilation, through the vector extensions of GCC and Clang. Included
+// only by the kernels, which are compiled once for each instruction set: everything here has internal linkage, and no
+// standard-library template may be used beside it, or code for one set could be linked into another.
+#if defined(__SSE2__)
+#include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
+#endif
+
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int kLanes = 16;
+#elif defined(__AVX2__)
+constexpr int kLanes = 8;
+#else
+constexpr int kLanes = 4;
+#endif
+
+typedef float Floats __attribute__((vector_size(kLanes * sizeof(float))));
+typedef int Ints __attribute__((vector_size(kLanes * sizeof(int))));
+
+inline Floats load(const float* p) { return *reinterpret_cast<const Floats*>(p); }  // p aligned
+inline void store(float* p, Floats v) { *reinterpret_cast<Floats*>(p) = v; }        // p aligned
+inline Floats broadcast(float x) { return x - Floats{}; }
+inline Floats iota() {
+    Floats v{};
+    for (int i = 0; i < kLanes; ++i) v[i] = float(i);
+    return v;
+}
+
+// a * b + c. Explicit, with contraction off in the kernels, so that forward and backward round alike.
+inline Floats fma(Floats a, Floats b, Floats c) {
+#if defined(__AVX512F__)
+    return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+#elif defined(__FMA__)
+    return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+#elif defined(__aarch64__)
+    return (Floats)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
+#else
+    return a * b + c;
+#endif
+}
+
+inline Floats min(Floats a, Floats b) {
+#if defined(__AVX512F__)
+    return (Floats)_mm512_min_ps((__m512)a, (__m512)b);
+#elif defined(__AVX2__)
+    return (Floats)_mm256_min_ps((__m256)a, (__m256)b);
+#elif defined(__SSE2__)
+    return (Floats)_mm_min_ps((__m128)a, (__m128)b);
+#else
+    return a < b ? a : b;
+#endif
+}
+
+inline Floats max(Floats a, Floats b) {
+#if defined(__AVX512F__)
+    return (Floats)_mm512_max_ps((__m512)a, (__m512)b);
+#elif defined(__AVX2__)
+    return (Floats)_mm256_max_ps((__m256)a, (__m256)b);
+#elif defined(__SSE2__)
+    return (Floats)_mm_max_ps((__m128)a, (__m128)b);
+#else
+    return a > b ? a : b;
+#endif
+}
+
+// Bit i is the sign bit of lane i.
+inline unsigned signs(Ints v) {
+#if defined(__AVX512F__)
+    return _mm512_movepi32_mask((__m512i)v);
+#elif defined(__AVX2__)
+    return static_cast<unsigned>(_mm256_movemask_ps((__m256)v));
+#elif defined(__SSE2__)
+    return static_cast<unsigned>(_mm_movemask_ps((__m128)v));
+#else
+    unsigned bits = 0;
+    for (int i = 0; i < kLanes; ++i) bits |= (static_cast<unsigned>(v[i]) >> 31) << i;
+    return bits;
+#endif
+}
+
+constexpr unsigned kAllLanes = (1u << kLanes) - 1;
+
+inline float sum(Floats v) {
+    for (int half = kLanes / 2; half >= 1; half /= 2)
+        for (int i = 0; i < half; ++i) v[i] += v[i + half];
+    return v[0];
+}
+
+// 2^x for x in [-126, 0] (below, 2^-126): relative error below 1.6e-7, and exactly 1 at 0. The polynomial has the least
+// largest relative error to 2^f on [-1/2, 1/2] (9.2e-8, before rounding) among those of degree 5 with constant term 1.
+inline Floats exp2_negative(Floats x) {
+    const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to the nearest integer
+    x = max(x, broadcast(-126.0f));
+    const Floats shifted = x + magic;
+    const Floats f = x - (shifted - magic);
+    Floats p = broadcast(1.326470869e-3f);
+    p = fma(p, f, broadcast(9.671511129e-3f));
+    p = fma(p, f, broadcast(5.550733954e-2f));
+    p = fma(p, f, broadcast(2.402224243e-1f));
+    p = fma(p, f, broadcast(6.931470037e-1f));
+    p = fma(p, f, broadcast(1.0f));
+    return (Floats)((Ints)p + ((Ints)shifted << 23));
+}
+
+}  // namespace

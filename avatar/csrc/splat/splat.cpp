@@ -1,0 +1,145 @@
+#include "splat/splat.h"
+
+#include <algorithm>
+#include <atomic>
+#include <cstring>
+#include <stdexcept>
+#include <string>
+
+#include "splat/thread_pool.h"
+
+namespace avatar::splat {
+namespace {
+
+// 8 bytes a pair in the forward pass and 36 more in the backward pass: 3 GB at most.
+constexpr std::int64_t kMaxPairs = std::int64_t{1} << 26;
+constexpr std::int64_t kGrain = 256;  // Gaussians handed to a thread at a time
+
+bool all_finite(const float* values, std::int64_t count) {
+    // On the bits, so that it is vectorised and cannot be optimised away.
+    std::uint32_t bad = 0;
+    for (std::int64_t i = 0; i < count; ++i) {
+        std::uint32_t bits;
+        std::memcpy(&bits, values + i, sizeof bits);
+        bad |= (bits & 0x7f800000u) == 0x7f800000u ? 1u : 0u;
+    }
+    return bad == 0;
+}
+
+bool all_finite(const Gaussians& g, std::int64_t begin, std::int64_t end) {
+    const std::int64_t count = end - begin, sh = 3 * static_cast<std::int64_t>(g.coefficients);
+    return all_finite(g.means + 3 * begin, 3 * count) && all_finite(g.quats + 4 * begin, 4 * count) &&
+           all_finite(g.scales + 3 * begin, 3 * count) && all_finite(g.opacities + begin, count) &&
+           all_finite(g.sh + sh * begin, sh * count);
+}
+
+Raster raster_of(const Drawing& d) {
+    const Camera& camera = d.view.camera;
+    const Settings& settings = d.view.settings;
+    return {d.splats.data(), d.lists.pairs.get(), d.lists.tile_begin.data(), d.lists.tiles_x,
+            camera.width,    camera.height,       settings.alpha_min,        settings.alpha_max,
+            settings.t_min,  {d.background[0], d.background[1], d.background[2]}};
+}
+
+// Projects all Gaussians and keeps the visible ones in depth order. False when an input is not finite.
+bool project_all(const Gaussians& gaussians, Drawing& drawing) {
+    const std::int64_t count = gaussians.count;
+    const std::unique_ptr<Splat[]> projected(new Splat[count]);
+    std::vector<double> depths(count);
+    std::vector<Visibility> visibility(count);
+    std::atomic<bool> finite{all_finite(drawing.background, 3)};
+    parallel_for(drawing.threads, count, kGrain, [&](std::int64_t begin, std::int64_t end) {
+        if (!all_finite(gaussians, begin, end)) {
+            finite = false;
+            return;
+        }
+        for (std::int64_t i = begin; i < end; ++i) {
+            visibility[i] = project(drawing.view, gaussians, i, projected[i], depths[i]);
+            projected[i].index = static_cast<std::uint32_t>(i);
+        }
+    });
+    if (!finite) return false;
+
+    std::vector<double> visible_depths;
+    std::vector<std::uint32_t> visible;
+    visible.reserve(count);
+    visible_depths.reserve(count);
+    for (std::int64_t i = 0; i < count; ++i) {
+        if (visibility[i] == Visibility::kColourOverflow)
+            throw std::invalid_argument("sh gives splat " + std::to_string(i) + " a colour beyond the range of float32");
+        if (visibility[i] != Visibility::kVisible) continue;
+        visible.push_back(static_cast<std::uint32_t>(i));
+        visible_depths.push_back(depths[i]);
+    }
+    const std::vector<std::uint32_t> order = depth_order(visible_depths);
+    drawing.splats.resize(order.size());
+    drawing.rank_of.assign(count, -1);
+    for (std::size_t rank = 0; rank < order.size(); ++rank) {
+        drawing.splats[rank] = projected[visible[order[rank]]];
+        drawing.rank_of[visible[order[rank]]] = static_cast<std::int32_t>(rank);
+    }
+    return true;
+}
+
+}  // namespace
+
+std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camera, const Settings& settings,
+                                 const float background[3], const Kernels& kernels, int threads, float* image,
+                                 float* alpha) {
+    std::unique_ptr<Drawing> drawing(new Drawing{
+        View(camera, settings), {background[0], background[1], background[2]}, &kernels, threads, {}, {}, {}, {}, {}});
+    if (!project_all(gaussians, *drawing)) return nullptr;
+    const auto visible = static_cast<std::int64_t>(drawing->splats.size());
+    drawing->lists =
+        build_tile_lists(drawing->splats.data(), visible, camera.width, camera.height, kMaxPairs, threads);
+
+    const std::int64_t tiles = std::int64_t{drawing->lists.tiles_x} * drawing->lists.tiles_y;
+    drawing->processed.resize(tiles);
+    drawing->transmittance.resize(std::int64_t{camera.width} * camera.height);
+    const Raster raster = raster_of(*drawing);
+    const ForwardTarget target{image, alpha, drawing->transmittance.data(), drawing->processed.data()};
+    parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
+        for (std::int64_t tile = begin; tile < end; ++tile) kernels.forward_tile(raster, tile, target);
+    });
+    return drawing;
+}
+
+void backward(const Drawing& drawing, const Gaussians& gaussians, const float* image, const float* grad_image,
+              const float* grad_alpha, const GaussianGradients& gradients, float grad_background[3]) {
+    const TileLists& lists = drawing.lists;
+    const std::int64_t tiles = std::int64_t{lists.tiles_x} * lists.tiles_y;
+    const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
+    std::vector<double> tile_backgrounds(3 * tiles);
+    const Raster raster = raster_of(drawing);
+    const BackwardSource source{image, drawing.transmittance.data(), drawing.processed.data(), grad_image, grad_alpha};
+    const BackwardTarget target{moments.get(), tile_backgrounds.data()};
+    parallel_for(drawing.threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
+        for (std::int64_t tile = begin; tile < end; ++tile)
+            drawing.kernels->backward_tile(raster, tile, source, target);
+    });
+    double total[3] = {};
+    for (std::int64_t tile = 0; tile < tiles; ++tile)
+        for (int c = 0; c < 3; ++c) total[c] += tile_backgrounds[3 * tile + c];
+    for (int c = 0; c < 3; ++c) grad_background[c] = static_cast<float>(total[c]);
+
+    const int sh = 3 * gaussians.coefficients;
+    parallel_for(drawing.threads, gaussians.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
+        for (std::int64_t i = begin; i < end; ++i) {
+            const std::int32_t rank = drawing.rank_of[i];
+            if (rank < 0) {
+                std::fill_n(gradients.means + 3 * i, 3, 0.0f);
+                std::fill_n(gradients.quats + 4 * i, 4, 0.0f);
+                std::fill_n(gradients.scales + 3 * i, 3, 0.0f);
+                gradients.opacities[i] = 0.0f;
+                std::fill_n(gradients.sh + sh * i, sh, 0.0f);
+                continue;
+            }
+            double sums[kMoments] = {};
+            for (std::int64_t slot = lists.slot_begin[rank]; slot < lists.slot_begin[rank + 1]; ++slot)
+                for (int k = 0; k < kMoments; ++k) sums[k] += moments[slot * kMoments + k];
+            project_backward(drawing.view, gaussians, i, sums, gradients);
+        }
+    });
+}
+
+}  // namespace avatar::splat

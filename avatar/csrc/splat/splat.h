@@ -1,0 +1,36 @@
+#pragma once
+#include <memory>
+#include <vector>
+
+#include "splat/bin.h"
+#include "splat/project.h"
+#include "splat/raster.h"
+#include "splat/scene.h"
+
+// The whole splatter without Python: what avatar/splat/__init__.py documents, in two calls.
+namespace avatar::splat {
+
+// What the backward pass needs of a forward pass. Not changed after that, so it may be used from several threads.
+struct Drawing {
+    View view;
+    float background[3];
+    const Kernels* kernels;
+    int threads;
+    std::vector<Splat> splats;             // visible, front to back
+    std::vector<std::int32_t> rank_of;     // [N] position of each Gaussian in `splats`, -1: hidden
+    TileLists lists;
+    std::vector<std::uint32_t> processed;  // [tiles], see ForwardTarget
+    std::vector<float> transmittance;      // [height * width]
+};
+
+// Draws into image [height * width * 3] and alpha [height * width]. Null when an input is not finite. Throws
+// std::invalid_argument for a colour that overflows, std::length_error for too many pairs of tile and splat.
+std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camera, const Settings& settings,
+                                 const float background[3], const Kernels& kernels, int threads, float* image,
+                                 float* alpha);
+
+// Writes all gradients. grad_image or grad_alpha may be null; `image` is what forward drew.
+void backward(const Drawing& drawing, const Gaussians& gaussians, const float* image, const float* grad_image,
+              const float* grad_alpha, const GaussianGradients& gradients, float grad_background[3]);
+
+}  // namespace avatar::splat
