@@ -34,11 +34,16 @@ _MALFORMED = (
 )  # what reading nonsense as a pickle runs into
 
 
+class UnsafeFileError(UserError):
+    """The file asks for something that is not data, so it was not merely damaged."""
+
+
 def load_pickle(source: Path | str | bytes, name: str | None = None) -> Any:
     """The data in a pickle file (any protocol; Python 2 text is read as latin-1).
 
     `source` is a path, or the bytes themselves with `name` for messages. Returns dicts, lists, tuples, numbers, text
-    and numpy arrays. Raises UserError, naming the file, when it is damaged or holds anything else.
+    and numpy arrays. Raises UserError, naming the file, when it is damaged, and UnsafeFileError (a
+    UserError) when it holds anything else.
     """
     data, name = _read(source, name)
     return _unpickle_all(data, name, count=1, persistent=None)[0]
@@ -114,6 +119,6 @@ def _unpickle_all(data: bytes, name: str, count: int, persistent: PersistentLoad
     try:
         return [resolve(PickleMachine(stream, budget, persistent).run(), budget) for _ in range(count)]
     except Refused as error:
-        raise UserError(f"{name} was not read: {error}") from error
+        raise UnsafeFileError(f"{name} was not read: {error}") from error
     except _MALFORMED as error:
         raise UserError(f"{name} is damaged, cut short or not a pickle ({error})") from error

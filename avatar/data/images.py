@@ -1,0 +1,62 @@
+"""Decoding of image and mask files, with truncation found: decoders fill what is missing with grey and say nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from avatar.errors import UserError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_TAIL = 4096  # some writers pad after the end marker
+
+
+def read_image(path: Path) -> np.ndarray:
+    """uint8 [H, W, 3], red first. Raises UserError naming the file when it is missing, truncated or not an image."""
+    return cv2.cvtColor(_decode(read_bytes(path), path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """uint8 [H, W]; colour files become their luminance. Raises UserError as `read_image` does."""
+    return _decode(read_bytes(path), path, cv2.IMREAD_GRAYSCALE)
+
+
+def decode_image(data: bytes, path: Path) -> np.ndarray:
+    """`read_image` of bytes that were read already; `path` is for the message."""
+    return cv2.cvtColor(_decode(data, path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def decode_mask(data: bytes, path: Path) -> np.ndarray:
+    """`read_mask` of bytes that were read already; `path` is for the message."""
+    return _decode(data, path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from None
+
+
+def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
+    if not data:
+        raise UserError(f"{path} is empty; write or copy it again")
+    if data.startswith(_JPEG_START):
+        complete = _JPEG_END in data[-_TAIL:]
+    elif data.startswith(_PNG_START):
+        complete = _PNG_END in data[-_TAIL:]
+    else:
+        raise UserError(f"{path} is neither a JPEG nor a PNG file, whatever its name says")
+    if not complete:
+        raise UserError(f"{path} is cut short; write or copy it again")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:  # absurd dimensions in the header
+        raise UserError(f"{path} cannot be decoded ({error.err})") from None
+    if image is None:
+        raise UserError(f"{path} is damaged and cannot be decoded; write or copy it again")
+    return image

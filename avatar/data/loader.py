@@ -1,0 +1,115 @@
+"""Frames in a given order, decoded ahead of time in the background, with bounded memory."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+
+from avatar.data.subject import FramePixels, Subject
+from avatar.types import Frame
+
+DEFAULT_CACHE_BYTES = 2**30
+_BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
+_AHEAD_PER_WORKER = 3
+
+
+def cache_estimate(subject: Subject, size: int | None = None, count: int | None = None) -> int:
+    """Bytes that `count` decoded frames (all of them by default) take in the cache."""
+    width, height = subject.image_size(size)
+    return width * height * _BYTES_PER_PIXEL * (len(subject) if count is None else count)
+
+
+class FrameLoader:
+    """Decoded frames of a subject. Keeps the most recently used ones as uint8, at most `cache_bytes` of them.
+
+    Use it as a context manager, or call `close`; the frames do not depend on the cache or on the number of workers.
+    """
+
+    def __init__(
+        self,
+        subject: Subject,
+        size: int | None = None,
+        cache_bytes: int = DEFAULT_CACHE_BYTES,
+        workers: int = 2,
+    ) -> None:
+        if workers < 1:
+            raise ValueError(f"workers must be at least 1, got {workers}")
+        if cache_bytes < 0:
+            raise ValueError(f"cache_bytes must not be negative, got {cache_bytes}")
+        self.subject = subject
+        self.size = size
+        self.cache_bytes = cache_bytes
+        self.cached_bytes = 0
+        self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
+        self._ahead = workers * _AHEAD_PER_WORKER
+        self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="frames")
+        self._closed = False
+
+    def __enter__(self) -> FrameLoader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the background threads and forget the cache; running decodes finish first."""
+        self._closed = True
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._cache.clear()
+        self.cached_bytes = 0
+
+    def frame(self, index: int) -> Frame:
+        """One frame, decoded now if the cache does not hold it."""
+        return next(self.frames((index,)))
+
+    def frames(self, indices: Iterable[int]) -> Iterator[Frame]:
+        """The frames of `indices`, which may be endless, in that order; a few of them are decoded ahead.
+
+        A frame that cannot be decoded raises its UserError when its turn comes.
+        """
+        if self._closed:
+            raise RuntimeError("the frame loader is closed")
+        order = iter(indices)
+        queue: deque[tuple[int, Future[FramePixels] | None]] = deque()
+        pending: dict[int, Future[FramePixels]] = {}
+        try:
+            while True:
+                while len(queue) < self._ahead:
+                    index = next(order, None)
+                    if index is None:
+                        break
+                    if index not in self._cache and index not in pending:
+                        pending[index] = self._pool.submit(self.subject.pixels, index, self.size)
+                    queue.append((index, pending.get(index)))
+                if not queue:
+                    return
+                index, future = queue.popleft()
+                pixels = self._take(index, future)
+                if not any(waiting == index for waiting, _ in queue):
+                    pending.pop(index, None)
+                yield self.subject.assemble(index, pixels, self.size)
+        finally:
+            for future in pending.values():
+                future.cancel()
+
+    def _take(self, index: int, future: Future[FramePixels] | None) -> FramePixels:
+        if index in self._cache:
+            self._cache.move_to_end(index)
+            return self._cache[index]
+        # Evicted between being queued and its turn: decode now.
+        pixels = future.result() if future is not None else self.subject.pixels(index, self.size)
+        self._remember(index, pixels)
+        return pixels
+
+    def _remember(self, index: int, pixels: FramePixels) -> None:
+        if pixels.nbytes > self.cache_bytes:
+            return
+        self._cache[index] = pixels
+        self.cached_bytes += pixels.nbytes
+        while self.cached_bytes > self.cache_bytes:
+            _, oldest = self._cache.popitem(last=False)
+            self.cached_bytes -= oldest.nbytes

@@ -1,0 +1,171 @@
+"""The prepared subject on disk: a folder with `manifest.json` and `tracks.safetensors`.
+
+The manifest refers to the images of the tracked folder and copies none of them; masks that were derived lie in the
+prepared folder. `MANIFEST_VERSION` grows with every change of meaning; other versions are prepared again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from avatar.errors import UserError
+
+MANIFEST_VERSION = 1
+MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
+_MAX_BYTES = 2**28
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One usable frame: its files, relative to the source folder (or to the prepared one, see `mouth_masks`)."""
+
+    name: str  # stem of the image
+    image: str
+    tracking: int  # number of the tracking frame
+    alpha: str | None
+    head_mask: str | None
+    mouth_mask: str | None
+
+
+@dataclass(frozen=True)
+class Manifest:
+    name: str
+    source: str  # absolute path of the tracked folder
+    tracking: str  # absolute path of the folder of tracking files
+    width: int  # pixels
+    height: int
+    fps: float
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
+    frame_offset: int  # image number - tracking number
+    offset_evidence: str  # how the offset was found, one sentence
+    frames: tuple[FrameRecord, ...]
+    train: tuple[int, ...]  # indices into frames
+    test: tuple[int, ...]
+    left_out: dict[str, str]  # image name -> reason
+    notes: tuple[str, ...]  # what was assumed or found, one sentence each
+    mouth_masks: str  # "source", "derived" (in the prepared folder) or "none"
+    head_path: str  # absolute path of the head model
+    head_fingerprint: str
+    input_hash: str  # of names, sizes and times of the inputs, and the options: decides whether to prepare again
+    data_hash: str  # of the contents: the same data gives the same hash on every machine
+
+    def to_json(self) -> str:
+        return json.dumps({"version": MANIFEST_VERSION, **asdict(self)}, indent=1)
+
+
+def read_manifest(prepared: Path) -> Manifest:
+    """Read and check `prepared/manifest.json`. Raises UserError with the file and what is wrong with it."""
+    file = Path(prepared) / MANIFEST_FILE
+    try:
+        if file.stat().st_size > _MAX_BYTES:
+            raise UserError(f"{file} is larger than a manifest can be; prepare the subject again")
+        raw = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{prepared} is not a prepared subject: it has no {MANIFEST_FILE}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{file} cannot be read ({error}); prepare the subject again") from None
+    if not isinstance(raw, dict) or raw.get("version") != MANIFEST_VERSION:
+        version = raw.get("version") if isinstance(raw, dict) else None
+        raise UserError(
+            f"{file} has manifest version {version!r}, and this program reads {MANIFEST_VERSION}; prepare it again"
+        )
+    try:
+        return _parse(raw)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise UserError(f"{file} is damaged ({reason}); prepare the subject again") from None
+
+
+def _parse(raw: dict[str, Any]) -> Manifest:
+    frames = tuple(_parse_frame(entry) for entry in _of(raw, "frames", list))
+    count = len(frames)
+    manifest = Manifest(
+        name=_of(raw, "name", str),
+        source=_of(raw, "source", str),
+        tracking=_of(raw, "tracking", str),
+        width=_of(raw, "width", int),
+        height=_of(raw, "height", int),
+        fps=_number(raw["fps"], "fps"),
+        intrinsics=_four(_of(raw, "intrinsics", list)),
+        frame_offset=_of(raw, "frame_offset", int),
+        offset_evidence=_of(raw, "offset_evidence", str),
+        frames=frames,
+        train=_indices(raw, "train", count),
+        test=_indices(raw, "test", count),
+        left_out={str(k): str(v) for k, v in _of(raw, "left_out", dict).items()},
+        notes=tuple(str(note) for note in _of(raw, "notes", list)),
+        mouth_masks=_of(raw, "mouth_masks", str),
+        head_path=_of(raw, "head_path", str),
+        head_fingerprint=_of(raw, "head_fingerprint", str),
+        input_hash=_of(raw, "input_hash", str),
+        data_hash=_of(raw, "data_hash", str),
+    )
+    if not 1 <= manifest.width < 2**16 or not 1 <= manifest.height < 2**16:
+        raise ValueError(f"an image size of {manifest.width}x{manifest.height} is impossible")
+    if manifest.fps <= 0 or min(manifest.intrinsics[:2]) <= 0:
+        raise ValueError("fps and focal lengths must be positive")
+    if manifest.mouth_masks not in ("source", "derived", "none"):
+        raise ValueError(f"mouth_masks is {manifest.mouth_masks!r}")
+    if set(manifest.train) & set(manifest.test):
+        raise ValueError("a frame is in both train and test")
+    return manifest
+
+
+def _parse_frame(entry: Any) -> FrameRecord:
+    if not isinstance(entry, dict):
+        raise TypeError("an entry of frames is not an object")
+    return FrameRecord(
+        name=_of(entry, "name", str),
+        image=_relative(_of(entry, "image", str)),
+        tracking=_of(entry, "tracking", int),
+        alpha=_relative_or_none(entry["alpha"]),
+        head_mask=_relative_or_none(entry["head_mask"]),
+        mouth_mask=_relative_or_none(entry["mouth_mask"]),
+    )
+
+
+def _of(raw: dict[str, Any], key: str, kind: type) -> Any:
+    value = raw[key]
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise TypeError(f"{key} is a {type(value).__name__}, not a {kind.__name__}")
+    return value
+
+
+def _number(value: Any, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"{name} is not a finite number")
+    return float(value)
+
+
+def _four(values: list[Any]) -> tuple[float, float, float, float]:
+    if len(values) != 4:
+        raise ValueError(f"intrinsics has {len(values)} values, not 4")
+    fx, fy, cx, cy = (_number(v, "intrinsics") for v in values)
+    return fx, fy, cx, cy
+
+
+def _indices(raw: dict[str, Any], key: str, count: int) -> tuple[int, ...]:
+    values = _of(raw, key, list)
+    if not values or not all(isinstance(v, int) and not isinstance(v, bool) and 0 <= v < count for v in values):
+        raise ValueError(f"{key} is empty or names frames outside the {count} of the subject")
+    return tuple(values)
+
+
+def _relative_or_none(value: Any) -> str | None:
+    if value is None:
+        return None
+    if not isinstance(value, str):
+        raise TypeError(f"a path is a {type(value).__name__}, not a str")
+    return _relative(value)
+
+
+def _relative(value: str) -> str:
+    """Frame files must stay inside the folder that the manifest names."""
+    escapes = any(p.is_absolute() or p.drive or ".." in p.parts for p in (PurePosixPath(value), PureWindowsPath(value)))
+    if not value or escapes or "\0" in value:
+        raise ValueError(f"the path {value!r} leaves the subject's folder")
+    return value

@@ -1,0 +1,53 @@
+"""Which frames are trained on and which are held out."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from avatar.errors import UserError
+
+TEST_FRAMES, TRAIN_FRAMES = 500, 2000  # FlashAvatar's protocol for clips that are long enough for it
+SHORT_CLIP_TRAIN_FRACTION = 0.8
+
+
+class Split(NamedTuple):
+    train: tuple[int, ...]  # indices into the prepared subject, increasing
+    test: tuple[int, ...]
+
+
+class SplitSizes(NamedTuple):
+    """What the user asks for; None means the rule of `split_frames`."""
+
+    train: int | None = None
+    test: int | None = None
+
+
+DEFAULT_SIZES = SplitSizes()
+
+
+def split_frames(count: int, sizes: SplitSizes = DEFAULT_SIZES) -> Split:
+    """The last frames test, those right before them train.
+
+    With 2,500 frames or more: the last 500 test, up to 2,000 before them train (FlashAvatar, HyperGaussians). Shorter
+    clips: the first 80% train, the rest test. Raises UserError when either part would be empty.
+    """
+    if count < 2:
+        raise UserError(f"the subject has {count} usable frame(s); at least 2 are needed, one to train and one to test")
+    wanted_train, wanted_test = sizes
+    is_long = count >= TEST_FRAMES + TRAIN_FRAMES
+    if wanted_test is not None:
+        test = wanted_test
+    elif is_long:
+        test = TEST_FRAMES
+    else:
+        test = min(max(count - int(count * SHORT_CLIP_TRAIN_FRACTION), 1), count - 1)
+    if not 1 <= test < count:
+        raise UserError(f"{test} test frames cannot be held out of {count}: choose from 1 to {count - 1}")
+    available = count - test
+    rule = min(available, TRAIN_FRAMES) if is_long else available
+    train = rule if wanted_train is None else wanted_train
+    if not 1 <= train <= available:
+        raise UserError(
+            f"{train} training frames cannot be taken from {count} with {test} held out: choose from 1 to {available}"
+        )
+    return Split(tuple(range(available - train, available)), tuple(range(available, count)))

@@ -1,0 +1,197 @@
+"""A prepared subject -> frames, decoded when they are asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from avatar.check import check_finite, check_shapes
+from avatar.data.images import read_image, read_mask
+from avatar.data.manifest import TRACKS_FILE, FrameRecord, Manifest, read_manifest
+from avatar.data.split import Split
+from avatar.errors import UserError
+from avatar.types import Camera, Frame, HeadParams
+
+_TRACK_SHAPES = {
+    "expression": "N E",
+    "jaw": "N 6",
+    "eyes": "N 12",
+    "eyelids": "N 2",
+    "neck": "N 6",
+    "R": "N 3 3",
+    "t": "N 3",
+    "shape": "S",
+}
+
+
+class FramePixels(NamedTuple):
+    """A frame's images as they come from the files: uint8, at the size that was asked for."""
+
+    image: np.ndarray  # [H, W, 3], red first
+    alpha: np.ndarray  # [H, W]
+    head_mask: np.ndarray
+    mouth_mask: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        return sum(pixels.nbytes for pixels in self)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One person's prepared video. Indices are positions among the usable frames, 0-based."""
+
+    folder: Path  # the prepared subject
+    manifest: Manifest
+    tracks: dict[str, Tensor]
+
+    @classmethod
+    def open(cls, prepared: Path | str) -> Subject:
+        """Read manifest and tracks, no images. Raises UserError when something is missing, damaged or too old."""
+        prepared = Path(prepared)
+        manifest = read_manifest(prepared)
+        return cls(prepared, manifest, _read_tracks(prepared / TRACKS_FILE, len(manifest.frames)))
+
+    def __len__(self) -> int:
+        return len(self.manifest.frames)
+
+    @property
+    def name(self) -> str:
+        return self.manifest.name
+
+    @property
+    def fps(self) -> float:
+        return self.manifest.fps
+
+    @property
+    def width(self) -> int:
+        return self.manifest.width
+
+    @property
+    def height(self) -> int:
+        return self.manifest.height
+
+    @property
+    def split(self) -> Split:
+        return Split(self.manifest.train, self.manifest.test)
+
+    @property
+    def identity(self) -> Float[Tensor, 300]:
+        """Identity coefficients of the head model."""
+        return self.tracks["shape"]
+
+    @property
+    def data_hash(self) -> str:
+        return self.manifest.data_hash
+
+    @property
+    def head_fingerprint(self) -> str:
+        return self.manifest.head_fingerprint
+
+    def image_size(self, size: int | None = None) -> tuple[int, int]:
+        """(width, height) of the frames when the width is resized to `size` pixels; None keeps the files' size."""
+        if size is None:
+            return self.width, self.height
+        if size < 1:
+            raise ValueError(f"size must be at least 1 pixel, got {size}")
+        return size, max(1, round(size * self.height / self.width))
+
+    def camera(self, index: int, size: int | None = None) -> Camera:
+        """The camera of a frame; it holds the head's pose."""
+        index = self._checked(index)
+        fx, fy, cx, cy = self.manifest.intrinsics
+        camera = Camera(self.tracks["R"][index], self.tracks["t"][index], fx, fy, cx, cy, self.width, self.height)
+        return camera if size is None else camera.resized(*self.image_size(size))
+
+    def params(self, index: int) -> HeadParams:
+        index = self._checked(index)
+        return HeadParams(**{name: self.tracks[name][index] for name in HeadParams.__dataclass_fields__})
+
+    def frame(self, index: int, size: int | None = None) -> Frame:
+        """Decode one frame; its width is resized to `size` pixels, the height and the camera follow.
+
+        Raises UserError naming the file when an image is gone or damaged, IndexError for a wrong index.
+        """
+        return self.assemble(index, self.pixels(index, size), size)
+
+    def pixels(self, index: int, size: int | None = None) -> FramePixels:
+        """The frame's images, uint8; what a cache holds. Raises as `frame` does."""
+        record = self.manifest.frames[self._checked(index)]
+        source = Path(self.manifest.source)
+        shape = (self.height, self.width)
+        if not source.is_dir():
+            raise UserError(f"the subject's frames are gone: {source} does not exist; prepare the subject again")
+        image = self._same_size(read_image(source / record.image), source / record.image)
+        alpha = self._mask(source, record.alpha, shape, default=255)
+        head_mask = alpha if record.head_mask is None else self._mask(source, record.head_mask, shape, default=255)
+        mouth_mask = self._mask(self._mouth_root(source), record.mouth_mask, shape, default=0)
+        pixels = FramePixels(image, alpha, head_mask, mouth_mask)
+        if size is None or size == self.width:
+            return pixels
+        return FramePixels(*(cv2.resize(p, self.image_size(size), interpolation=cv2.INTER_AREA) for p in pixels))
+
+    def assemble(self, index: int, pixels: FramePixels, size: int | None = None) -> Frame:
+        """The frame of pixels that were decoded at `size`."""
+        record: FrameRecord = self.manifest.frames[self._checked(index)]
+        image, alpha, head_mask, mouth_mask = (torch.from_numpy(p).float() / 255.0 for p in pixels)
+        return Frame(
+            index=index,
+            name=record.name,
+            camera=self.camera(index, size),
+            params=self.params(index),
+            image=image,
+            alpha=alpha,
+            head_mask=head_mask,
+            mouth_mask=mouth_mask,
+        )
+
+    def _checked(self, index: int) -> int:
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of subject {self.name}, which has frames 0 to {len(self) - 1}")
+        return index
+
+    def _mouth_root(self, source: Path) -> Path:
+        return self.folder if self.manifest.mouth_masks == "derived" else source
+
+    def _mask(self, root: Path, path: str | None, shape: tuple[int, int], default: int) -> np.ndarray:
+        if path is None:
+            return np.full(shape, default, np.uint8)
+        return self._same_size(read_mask(root / path), root / path)
+
+    def _same_size(self, pixels: np.ndarray, path: Path) -> np.ndarray:
+        height, width = pixels.shape[:2]
+        if (width, height) != (self.width, self.height):
+            raise UserError(
+                f"{path} is {width}x{height} pixels, but the subject was prepared at {self.width}x{self.height}; "
+                "prepare it again"
+            )
+        return pixels
+
+
+def _read_tracks(file: Path, count: int) -> dict[str, Tensor]:
+    try:
+        tracks = load_file(file)
+    except FileNotFoundError:
+        raise UserError(f"{file} is missing; prepare the subject again") from None
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None
+    missing = _TRACK_SHAPES.keys() - tracks.keys()
+    if missing:
+        raise UserError(f"{file} lacks {', '.join(sorted(missing))}; prepare the subject again")
+    try:
+        sizes = check_shapes(**{name: (tracks[name], shape) for name, shape in _TRACK_SHAPES.items()})
+        check_finite(**{name: tracks[name] for name in _TRACK_SHAPES})
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None
+    if sizes["N"] != count:
+        raise UserError(f"{file} has {sizes['N']} frames but the manifest has {count}; prepare the subject again")
+    return {name: tracks[name].float() for name in _TRACK_SHAPES}

@@ -1,0 +1,114 @@
+"""Which files a tracked folder holds for which frame number."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from avatar.data.images import IMAGE_SUFFIXES
+from avatar.errors import UserError
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """Files of a tracked folder by frame number; an empty dictionary where the folder has none of a kind."""
+
+    folder: Path
+    images: dict[int, Path]
+    alphas: dict[int, Path]
+    head_masks: dict[int, Path]
+    mouth_masks: dict[int, Path]
+    tracking: dict[int, Path]
+
+    def of_kind(self) -> dict[str, dict[int, Path]]:
+        """By the name that a person knows each kind by."""
+        return {
+            "imgs": self.images,
+            "alpha": self.alphas,
+            "parsing *_neckhead": self.head_masks,
+            "parsing *_mouth": self.mouth_masks,
+            "checkpoint": self.tracking,
+        }
+
+
+def find_frame_files(folder: Path, tracking: Path | None = None) -> FrameFiles:
+    """List `folder` (imgs/, alpha/, parsing/, checkpoint/) and the tracking folder, if that is another one.
+
+    Raises UserError when images or tracking are missing, a file has no number or two have the same one.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        raise UserError(f"{folder} is a file; give the folder that holds imgs/ (the frames of the video)")
+    if not folder.is_dir():
+        raise UserError(f"the folder {folder} does not exist")
+    images = _numbered(folder / "imgs", IMAGE_SUFFIXES)
+    if not images:
+        raise UserError(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
+    return FrameFiles(
+        folder=folder,
+        images=images,
+        alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES),
+        head_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, "_neckhead"),
+        mouth_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, "_mouth"),
+        tracking=_find_tracking(folder, tracking),
+    )
+
+
+def _find_tracking(folder: Path, given: Path | None) -> dict[int, Path]:
+    if given is None:
+        found = _numbered(folder / "checkpoint", (".frame",))
+        if not found:
+            raise UserError(
+                f"{folder / 'checkpoint'} holds no .frame files of metrical-tracker; give --tracking their folder"
+            )
+        return found
+    if not Path(given).is_dir():
+        raise UserError(f"the tracking folder {given} does not exist")
+    found = _numbered(Path(given) / "checkpoint", (".frame",)) or _numbered(Path(given), (".frame",))
+    if not found:
+        raise UserError(f"neither {given} nor {Path(given) / 'checkpoint'} holds .frame files of metrical-tracker")
+    return found
+
+
+def _numbered(folder: Path, suffixes: tuple[str, ...], tag: str = "") -> dict[int, Path]:
+    """Files `<anything><number><tag><suffix>` (any case) by number, in the order of the numbers."""
+    if not folder.is_dir():
+        return {}
+    found: dict[int, Path] = {}
+    with os.scandir(folder) as entries:
+        for entry in sorted(entries, key=lambda e: e.name):
+            stem, suffix = Path(entry.name).stem, Path(entry.name).suffix
+            if entry.name.startswith(".") or suffix.lower() not in suffixes or not entry.is_file():
+                continue
+            if not stem.lower().endswith(tag):
+                continue
+            digits = re.search(r"([0-9]+)$", stem[: len(stem) - len(tag)])
+            if digits is None:
+                raise UserError(f"{entry.path} has no frame number at the end of its name; rename or remove it")
+            number = int(digits[1])
+            if number in found:
+                raise UserError(f"{found[number]} and {entry.path} are both frame {number}; remove one of them")
+            found[number] = Path(entry.path)
+    return dict(sorted(found.items()))
+
+
+def describe_numbers(numbers: list[int], limit: int = 12) -> str:
+    """`00003-00005, 00009` for messages; runs are joined, and a long list is cut."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    shown = [f"{a:05d}" if a == b else f"{a:05d}-{b:05d}" for a, b in runs[:limit]]
+    return ", ".join(shown) + (f" and {len(runs) - limit} more" if len(runs) > limit else "")
+
+
+def gaps(numbers: dict[int, Path]) -> list[int]:
+    """Numbers that are missing between the first and the last (at most 10,000 of them)."""
+    if not numbers:
+        return []
+    first, last = min(numbers), max(numbers)
+    return [n for n in range(first, min(last, first + 10_000 + len(numbers))) if n not in numbers][:10_000]
