@@ -23,7 +23,7 @@ MAX_SIDE = 1 << 15  # pixels
 def splat(
     gaussians: Gaussians,
     camera: Camera,
-    background: Float[Tensor, "3"],
+    background: Float[Tensor, " 3"],
     *,
     backend: Literal["cpu", "reference"] = "cpu",
     sh_degree: int | None = None,

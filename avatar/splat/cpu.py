@@ -18,7 +18,7 @@ from avatar.types import Camera, Gaussians, Rendering
 def splat_cpu(
     gaussians: Gaussians,
     camera: Camera,
-    background: Float[Tensor, "3"],
+    background: Float[Tensor, " 3"],
     *,
     sh_degree: int,
     alpha_min: float,
@@ -29,18 +29,18 @@ def splat_cpu(
     antialiased: bool,
 ) -> Rendering:
     """`avatar.splat.splat` without its checks of shape and type; float32 tensors on the CPU."""
-    settings = (
-        camera.R_cam_world.flatten().tolist(),
-        camera.t_cam_world.tolist(),
-        (camera.fx, camera.fy, camera.cx, camera.cy),
-        sh_degree,
-        (alpha_min, alpha_max, t_min),
-        blur,
-        near,
-        antialiased,
-        os.environ.get("AVATAR_SIMD", ""),
-        thread_count(),
-    )
+    settings = {
+        "rotation": camera.R_cam_world.flatten().tolist(),
+        "translation": camera.t_cam_world.tolist(),
+        "intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy),
+        "sh_degree": sh_degree,
+        "cutoffs": (alpha_min, alpha_max, t_min),
+        "blur": blur,
+        "near": near,
+        "antialiased": antialiased,
+        "simd": os.environ.get("AVATAR_SIMD", ""),
+        "threads": thread_count(),
+    }
     image, alpha = _Splat.apply(*gaussians, background, (camera.height, camera.width), settings)  # pyright: ignore
     return Rendering(image, alpha)
 
@@ -58,15 +58,17 @@ def thread_count() -> int:
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *inputs, size, settings = arguments
-        inputs = [tensor.detach().contiguous() for tensor in inputs]
-        image = torch.empty((*size, 3), dtype=torch.float32)
-        alpha = torch.empty(size, dtype=torch.float32)
-        drawing = _core.splat_forward(*inputs, *settings, image, alpha)
+        *inputs, (height, width), settings = arguments
+        gaussians, background = Gaussians(*(t.detach().contiguous() for t in inputs[:-1])), inputs[-1].detach()
+        image = torch.empty((height, width, 3), dtype=torch.float32)
+        alpha = torch.empty((height, width), dtype=torch.float32)
+        drawing = _core.splat_forward(
+            **gaussians._asdict(), background=background.contiguous(), **settings, image=image, alpha=alpha
+        )
         if drawing is None:
-            check_finite(**dict(zip((*Gaussians._fields, "background"), inputs, strict=True)))
+            check_finite(**gaussians._asdict(), background=background)
         ctx.drawing = drawing
-        ctx.save_for_backward(*inputs[:-1], image)
+        ctx.save_for_backward(*gaussians, image)
         ctx.set_materialize_grads(False)
         return image, alpha
 
@@ -74,8 +76,16 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, image = ctx.saved_tensors
-        gradients = [torch.empty_like(tensor) for tensor in inputs]
+        gaussians = Gaussians(*inputs)
+        gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
         grad_background = torch.empty(3, dtype=torch.float32)
-        cotangents = [None if grad is None else grad.contiguous() for grad in (grad_image, grad_alpha)]
-        _core.splat_backward(ctx.drawing, *inputs, image, *cotangents, *gradients, grad_background)
+        _core.splat_backward(
+            ctx.drawing,
+            **gaussians._asdict(),
+            image=image,
+            grad_image=None if grad_image is None else grad_image.contiguous(),
+            grad_alpha=None if grad_alpha is None else grad_alpha.contiguous(),
+            **{f"grad_{name}": gradient for name, gradient in gradients._asdict().items()},
+            grad_background=grad_background,
+        )
         return *gradients, grad_background, None, None

@@ -30,7 +30,7 @@ class Projected(NamedTuple):
 
     means: Float[Tensor, "M 2"]  # pixels
     whitening: Float[Tensor, "M 3"]  # 1 / pixels
-    opacities: Float[Tensor, "M"]
+    opacities: Float[Tensor, " M"]
     colours: Float[Tensor, "M 3"]
     half_extents: Float[Tensor, "M 2"]  # pixels; of the box around the ellipse where alpha reaches alpha_min
 
@@ -38,7 +38,7 @@ class Projected(NamedTuple):
 def splat_reference(
     gaussians: Gaussians,
     camera: Camera,
-    background: Float[Tensor, "3"],
+    background: Float[Tensor, " 3"],
     *,
     sh_degree: int,
     alpha_min: float,
@@ -145,7 +145,7 @@ def project(
     )
 
 
-def _row_times(row: Float[Tensor, "3"], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+def _row_times(row: Float[Tensor, " 3"], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     return row[0] * points[:, 0] + row[1] * points[:, 1] + row[2] * points[:, 2]
 
 
@@ -172,7 +172,7 @@ def _pixel_centres(left: int, top: int, right: int, bottom: int, like: Tensor) -
     return torch.stack((xs.flatten(), ys.flatten()), -1)
 
 
-def _reaches(splats: Projected, left: int, top: int, right: int, bottom: int) -> Int[Tensor, "m"]:
+def _reaches(splats: Projected, left: int, top: int, right: int, bottom: int) -> Int[Tensor, " m"]:
     """Indices of the splats whose support meets the block, generously rounded."""
     low = splats.means.detach() - splats.half_extents * (1 + 1e-9) - 1e-6
     high = splats.means.detach() + splats.half_extents * (1 + 1e-9) + 1e-6
@@ -184,17 +184,17 @@ def _composite(
     pixels: Float[Tensor, "P 2"],
     means: Float[Tensor, "m 2"],
     whitening: Float[Tensor, "m 3"],
-    opacities: Float[Tensor, "m"],
+    opacities: Float[Tensor, " m"],
     colours: Float[Tensor, "m 3"],
-    background: Float[Tensor, "3"],
+    background: Float[Tensor, " 3"],
     alpha_min: float,
     alpha_max: float,
     t_min: float,
-) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P"]]:
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, " P"]]:
     """Front-to-back compositing of m sorted splats at P pixel centres: colour over the background, transmittance."""
     image = pixels.new_zeros(len(pixels), 3)
     transmittance = pixels.new_ones(len(pixels))
-    stopped: Bool[Tensor, "P"] = torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)
+    stopped: Bool[Tensor, " P"] = torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)
     step = max(1, MAX_EVALUATIONS // len(pixels))
     for start in range(0, len(means), step):
         part = slice(start, start + step)

@@ -1,0 +1,51 @@
+"""The compiled module. Private: avatar.head.rasterize and avatar.splat check the arguments and document the functions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from torch import Tensor
+
+def rasterize_mesh(
+    screen: np.ndarray, faces: np.ndarray, face_id: np.ndarray, barycentric: np.ndarray, depth: np.ndarray
+) -> None: ...
+
+class Drawing:
+    """What the backward pass needs of a forward pass."""
+
+def splat_forward(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    background: Tensor,
+    rotation: Sequence[float],
+    translation: Sequence[float],
+    intrinsics: Sequence[float],  # fx, fy, cx, cy
+    sh_degree: int,
+    cutoffs: Sequence[float],  # alpha_min, alpha_max, t_min
+    blur: float,
+    near: float,
+    antialiased: bool,
+    simd: str,
+    threads: int,
+    image: Tensor,
+    alpha: Tensor,
+) -> Drawing | None: ...
+def splat_backward(
+    drawing: Drawing,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    image: Tensor,
+    grad_image: Tensor | None,
+    grad_alpha: Tensor | None,
+    grad_means: Tensor,
+    grad_quats: Tensor,
+    grad_scales: Tensor,
+    grad_opacities: Tensor,
+    grad_sh: Tensor,
+    grad_background: Tensor,
+) -> None: ...
