@@ -1,0 +1,253 @@
+"""Evaluation of a run, end to end on a small subject: every figure can be recomputed from the files that it writes."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, FrameRecord, Manifest
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.evaluate import COLUMNS, evaluate
+from avatar.lpips import lpips_folder, save_lpips
+from avatar.lpips_network import Lpips
+from avatar.protocols import PROTOCOLS
+from avatar.types import Gaussians, HeadParams
+
+SIZE, COUNT, TEST = 72, 10, (7, 8, 9)
+SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255, "channel_axis": 2}
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("AVATAR_LPIPS", raising=False)
+
+
+@pytest.fixture
+def subject(tmp_path: Path) -> Subject:
+    """A disc that changes colour: images, a matte, a head mask with a soft rim, a mouth that is hidden in frame 8."""
+    source, prepared = tmp_path / "source", tmp_path / "prepared"
+    source.mkdir()
+    prepared.mkdir()
+    y, x = np.mgrid[0:SIZE, 0:SIZE]
+    radius = np.hypot(x - SIZE / 2, y - SIZE / 2)
+    records = []
+    for index in range(COUNT):
+        stem = f"{index + 1:05d}"
+        pixels = np.stack((100 + 10 * index + x, 200 - y, 40 + radius), axis=-1).clip(0, 255).astype(np.uint8)
+        head = ((26 - radius) * 80).clip(0, 255).astype(np.uint8)
+        mouth = np.where((abs(y - 48) < 5) & (abs(x - 36) < 9) & (index != 8), 255, 0).astype(np.uint8)
+        alpha = ((30 - radius) * 60).clip(0, 255).astype(np.uint8)
+        for kind, picture in (("image", pixels), ("alpha", alpha), ("head", head), ("mouth", mouth)):
+            assert cv2.imwrite(str(source / f"{stem}_{kind}.png"), picture)
+        names = [f"{stem}_{kind}.png" for kind in ("image", "alpha", "head", "mouth")]
+        records.append(FrameRecord(stem, names[0], index, *names[1:]))
+    manifest = Manifest(
+        name="disc",
+        source=str(source),
+        tracking=str(source),
+        head_path=str(source),
+        width=SIZE,
+        height=SIZE,
+        fps=20.0,
+        intrinsics=(SIZE, SIZE, SIZE / 2, SIZE / 2),
+        frame_offset=1,
+        offset_evidence="written by a test",
+        frames=tuple(records),
+        train=tuple(range(TEST[0])),
+        test=TEST,
+        left_out={},
+        notes=(),
+        mouth_masks="source",
+        head_fingerprint="ab" * 32,
+        input_hash="cd" * 32,
+        data_hash="ef" * 32,
+    )
+    (prepared / MANIFEST_FILE).write_text(manifest.to_json())
+    tracks = {
+        "expression": torch.linspace(0, 1, COUNT)[:, None].repeat(1, 3),
+        "jaw": torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(COUNT, 1),
+        "eyes": torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(COUNT, 2),
+        "eyelids": torch.zeros(COUNT, 2),
+        "neck": torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(COUNT, 1),
+        "R": torch.eye(3).repeat(COUNT, 1, 1),
+        "t": torch.tensor([0.0, 0.0, 1.0]).repeat(COUNT, 1),
+        "shape": torch.zeros(2),
+    }
+    save_file(tracks, prepared / TRACKS_FILE)
+    return Subject.open(prepared)
+
+
+class Blob:
+    """Stands in for a trained avatar: Gaussians on a disc whose colour follows the first expression coefficient."""
+
+    head = SimpleNamespace(assets=SimpleNamespace(fingerprint="ab" * 32))
+
+    def __init__(self) -> None:
+        self.seen: list[float] = []
+        generator = torch.Generator().manual_seed(1)
+        self.means = torch.cat((torch.rand(400, 2, generator=generator) * 0.6 - 0.3, torch.zeros(400, 1)), dim=1)
+
+    def __call__(self, params: HeadParams) -> Gaussians:
+        assert not torch.is_grad_enabled()
+        self.seen.append(float(params.expression[0]))
+        return Gaussians(
+            means=self.means,
+            quats=torch.tensor([1.0, 0, 0, 0]).repeat(400, 1),
+            scales=torch.full((400, 3), 0.03),
+            opacities=torch.full((400,), 0.9),
+            sh=torch.full((400, 1, 3), float(params.expression[0])),
+        )
+
+
+def make_run(path: Path, subject: Subject) -> Any:
+    data = SimpleNamespace(size=None, cache_mb=16, workers=1)
+    config = SimpleNamespace(data=data, to_dict=lambda: {"data": {"size": None}})
+    return SimpleNamespace(path=path, config=config, avatar=Blob(), subject=subject, step=1500)
+
+
+def read_png(path: Path) -> np.ndarray:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def test_every_figure_can_be_recomputed_from_the_pictures(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    said: list[str] = []
+    results = json.loads(evaluate(run, write_frames=True, say=said.append).read_text())
+    assert run.avatar.seen == pytest.approx([7 / 9, 8 / 9, 1.0])  # the held-out frames, each once
+    for name, protocol in PROTOCOLS.items():
+        folder = run.path / "eval" / name
+        rows = list(csv.DictReader((folder / "frames.csv").open()))
+        assert [(row["frame"], row["name"]) for row in rows] == [("7", "00008"), ("8", "00009"), ("9", "00010")]
+        for row in rows:
+            file = f"{int(row['frame']):05d}.png"
+            render, truth, head, mouth = (
+                read_png(folder / kind / file).astype(float) for kind in ("renders", "gt", "masks", "mouth_masks")
+            )
+            weight = head[..., None] / 255.0 if protocol.multiply else 1.0
+            a, b = render * weight, truth * weight
+            assert float(row["psnr"]) == pytest.approx(peak_signal_noise_ratio(b, a, data_range=255), abs=1e-6)
+            assert float(row["ssim"]) == pytest.approx(structural_similarity(a, b, **SKIMAGE), abs=1e-6)
+            error = ((render - truth) ** 2).mean(axis=2) / 255.0**2
+            assert float(row["psnr_masked"]) == pytest.approx(-10 * np.log10(np.average(error, weights=head)), abs=1e-6)
+            if row["name"] == "00009":
+                assert row["psnr_mouth"] == "nan" and not mouth.any()
+            else:
+                expected = -10 * np.log10(np.average(error, weights=mouth))
+                assert float(row["psnr_mouth"]) == pytest.approx(expected, abs=1e-6)
+        means = results["protocols"][name]["means"]
+        assert means["psnr"] == pytest.approx(np.mean([float(row["psnr"]) for row in rows]), abs=1e-6)
+        mouth_rows = [float(row["ssim_mouth"]) for row in rows if row["ssim_mouth"] != "nan"]
+        assert means["ssim_mouth"] == pytest.approx(np.mean(mouth_rows), abs=1e-6) and len(mouth_rows) == 2
+
+
+def test_truth_is_the_composite_of_the_data_over_the_background_of_the_protocol(
+    tmp_path: Path, subject: Subject
+) -> None:
+    run = make_run(tmp_path / "run", subject)
+    evaluate(run, ["hypergaussians", "flashavatar"], write_frames=True, say=lambda _: None)
+    for name, background in (("hypergaussians", (255, 255, 255)), ("flashavatar", (0, 255, 0))):
+        kinds = ("gt", "renders", "masks", "mouth_masks")
+        truth, render, head, mouth = (read_png(run.path / "eval" / name / kind / "00009.png") for kind in kinds)
+        source = Path(subject.manifest.source)
+        image, alpha, mask = (
+            read_png(source / f"00010_{kind}.png").astype(float) for kind in ("image", "alpha", "head")
+        )
+        weight = (alpha * mask)[..., None] / 255.0**2
+        expected = image * weight + np.array(background) * (1 - weight)
+        assert np.abs(truth - expected).max() <= 0.5 + 1e-3  # rounding to 8 bits, nothing else
+        assert (truth[0, 0] == background).all() and (render[0, 0] == background).all()
+        assert (head == mask).all() and (mouth == read_png(source / "00010_mouth.png")).all()
+
+
+def test_results_name_every_choice(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    said: list[str] = []
+    results = json.loads(evaluate(run, say=said.append).read_text())
+    assert results["data_hash"] == "ef" * 32 and results["head_fingerprint"] == "ab" * 32 and results["step"] == 1500
+    assert results["config"] == {"data": {"size": None}}
+    assert results["versions"]["torch"] == torch.__version__
+    assert set(results["shared_choices"]) >= {"truth", "render", "masks", "psnr", "ssim", "lpips", "means"}
+    for name, protocol in PROTOCOLS.items():
+        entry = results["protocols"][name]
+        assert set(entry["choices"]) >= {f.name for f in dataclasses.fields(protocol)} - {
+            "name",
+            "last",
+            "multiply",
+            "lpips_net",
+        }
+        assert entry["frames"] == ["00008", "00009", "00010"]
+        assert entry["frames_with_a_figure"]["psnr_mouth"] == 2
+        assert set(entry["means"]) == set(COLUMNS)
+        # no weights on this machine: said, and no figure made up
+        assert entry["means"]["lpips"] is None and entry["lpips"]["network"] is None
+        assert "not measured (no LPIPS weights for 'vgg'" in entry["lpips"]["note"]
+        assert not (run.path / "eval" / name / "renders").exists()
+    table, places = said
+    assert str(run.path / "eval" / "results.json") in places and "truth_render_error.mp4" in places
+    assert table.count("not measured") == 1
+    for name in PROTOCOLS:
+        assert f"\n{name}" in table and f"{results['protocols'][name]['means']['psnr']:.2f}" in table
+
+
+def test_lpips_of_another_network_is_labelled(tmp_path: Path, subject: Subject) -> None:
+    lpips_folder().mkdir(parents=True)
+    lpips = Lpips("squeeze")
+    save_lpips(lpips, lpips_folder() / "lpips_squeeze.safetensors")
+    run = make_run(tmp_path / "run", subject)
+    results = json.loads(evaluate(run, ["hypergaussians"], write_frames=True, say=lambda _: None).read_text())
+    entry = results["protocols"]["hypergaussians"]
+    assert entry["lpips"]["network"] == "squeeze" and entry["lpips"]["weights_sha256"] == lpips.fingerprint()
+    assert entry["lpips"]["note"].startswith("squeeze, not to be compared with figures of vgg: no LPIPS weights for")
+    figures = []
+    for index in TEST:
+        kinds = ("renders", "gt", "masks")
+        a, b, mask = (
+            torch.from_numpy(read_png(run.path / "eval" / "hypergaussians" / kind / f"{index:05d}.png")) / 255.0
+            for kind in kinds
+        )
+        figures.append(lpips(a.flip(-1) * mask[..., None], b.flip(-1) * mask[..., None]).item())
+    assert entry["means"]["lpips"] == pytest.approx(np.mean(figures), rel=1e-5)
+
+
+def test_video_shows_every_frame(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    evaluate(run, ["hypergaussians"], say=lambda _: None)
+    reader = imageio.get_reader(run.path / "eval" / "truth_render_error.mp4")
+    assert reader.get_meta_data()["fps"] == 20.0
+    frames = [np.asarray(frame) for frame in reader]
+    assert len(frames) == len(TEST) and frames[0].shape[1] == 3 * SIZE
+
+
+def test_pictures_of_an_earlier_evaluation_do_not_stay(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    stale = run.path / "eval" / "insta350" / "renders" / "00001.png"
+    stale.parent.mkdir(parents=True)
+    stale.write_bytes(b"old")
+    evaluate(run, ["insta350"], write_frames=True, say=lambda _: None)
+    assert sorted(path.name for path in stale.parent.iterdir()) == ["00007.png", "00008.png", "00009.png"]
+
+
+def test_a_failure_on_the_way_keeps_the_old_results(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    path = evaluate(run, ["insta350"], say=lambda _: None)
+    before = path.read_bytes()
+    (Path(subject.manifest.source) / "00009_image.png").write_bytes(b"not a picture")
+    with pytest.raises(UserError, match=r"00009_image\.png"):
+        evaluate(run, ["insta350"], say=lambda _: None)
+    assert path.read_bytes() == before
+    with pytest.raises(UserError, match="there is no protocol 'mine'"):
+        evaluate(run, ["mine"], say=lambda _: None)
