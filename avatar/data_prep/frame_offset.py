@@ -26,11 +26,12 @@ RADIUS = 4  # offsets tried on each side; the outermost ones only serve to see t
 SAMPLED_FRAMES = 120
 RASTER_WIDTH = 256  # pixels; the features are sub-pixel, more resolution does not help
 MIN_COMMON_FRAMES = 6
-MIN_T = 4.0  # paired differences, best against every other offset
+MIN_T = 3.0  # paired differences, best against every other offset
 MIN_OVERLAP = 0.3  # below, the tracking is not of this video or not of this head model
 _RIDGE = 4.0  # pseudo-frames that say "no pose-dependent misfit"
 _CLIP = 9.0  # squared, in units of the best offset's own misfit: one bad mask must not decide
 _MASK_ON = 127
+_CERTAIN = 100.0  # standard errors; noise-free data would print astronomical ones
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,7 @@ def _decide(misfit: Mapping[int, Mapping[int, float]]) -> tuple[int, int, float]
         t = _standard_errors(np.array([misfit[offset][n] - misfit[best][n] for n in common]))
         if t < smallest:
             runner_up, smallest = offset, t
-    return best, runner_up, smallest if np.isfinite(smallest) else 0.0
+    return best, runner_up, min(smallest, _CERTAIN) if np.isfinite(smallest) else 0.0
 
 
 def _standard_errors(gain: np.ndarray) -> float:
