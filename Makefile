@@ -33,6 +33,9 @@ format: setup ## put the code into its standard form
 wheel: setup ## build dist/avatar-*.whl
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
 
+smoke: setup ## install a wheel into an empty environment and run the whole program from there
+	PYTHON=$(PYTHON) PIP_FLAGS="$(PIP_FLAGS)" scripts/smoke_wheel.sh
+
 clean: ## remove everything that the other targets make
 	rm -rf $(VENV) build dist $(DEMO)
 

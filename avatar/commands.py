@@ -1,0 +1,189 @@
+"""What each command does, on top of the library; `avatar.cli` parses, this acts and talks."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from pathlib import Path
+
+import torch
+
+from avatar.checkpoint import Checkpoint, newest_checkpoint, read_run_info
+from avatar.config import Config, load_config
+from avatar.data.subject import Subject
+from avatar.data_prep.prepare import prepare as prepare_folder
+from avatar.demo import make_subject
+from avatar.doctor import report
+from avatar.errors import UserError
+from avatar.evaluate import evaluate
+from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.model import Avatar
+from avatar.reenact import reenact as drive
+from avatar.run import Run, Source, check_same, find_head, load_run, open_subject, read_source, start_run
+from avatar.train.trainer import train as run_training
+
+OK, INTERRUPTED = 0, 130
+
+
+def train(arguments: Namespace) -> int:
+    run = arguments.out or Path("runs") / arguments.folder.resolve().name
+    overrides = config_overrides(arguments)
+    if arguments.resume:
+        return resume_training(run, arguments, overrides)
+    source = Source(
+        arguments.folder, find_head(arguments.folder, arguments.head), arguments.tracking, arguments.frame_offset
+    )
+    return train_new(source, load_config(overrides), run)
+
+
+def train_new(source: Source, config: Config, run: Path) -> int:
+    subject, assets = open_subject(source, config, print)
+    torch.manual_seed(config.trainer.seed)
+    avatar = Avatar(assets, subject.identity, config.model)
+    start_run(run, source, config, subject)
+    return finish_training(avatar, subject, config, run)
+
+
+def resume_training(run: Path, arguments: Namespace, overrides: list[str]) -> int:
+    """Go on from the newest checkpoint, with the configuration and the data that the run began with."""
+    checkpoint = newest_checkpoint(run)
+    config, source = read_source(run, read_run_info(run), arguments.head)
+    if source.folder != arguments.folder.resolve():
+        raise UserError(f"{run} was trained on {source.folder}, not on {arguments.folder}; choose another --out")
+    if overrides:
+        refuse_changes(run, config, overrides)
+    subject, assets = open_subject(source, config, print)
+    check_same(run, checkpoint, subject, assets)
+    if checkpoint.meta.get("threads") != torch.get_num_threads():
+        print(
+            f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
+            f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
+        )
+    print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
+    avatar = Avatar(assets, subject.identity, config.model)
+    return finish_training(avatar, subject, config, run, checkpoint)
+
+
+def finish_training(
+    avatar: Avatar, subject: Subject, config: Config, run: Path, checkpoint: Checkpoint | None = None
+) -> int:
+    split = subject.split
+    print(
+        f"Training {len(avatar):,} Gaussians ({config.model.name}) on {len(split.train)} frames of {subject.name}, "
+        f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
+    )
+    begin = time.monotonic()
+    done = run_training(avatar, subject, config, run, resume=checkpoint)
+    first = checkpoint.step if checkpoint else 0
+    seconds = time.monotonic() - begin
+    rate = f"{seconds / max(done - first, 1):.3f} s per step"
+    if done < config.trainer.iterations:
+        print(f"\nInterrupted at step {done} ({rate}); everything up to there is saved in {run}.")
+        print("Add --resume to the same command to go on.")
+        return INTERRUPTED
+    print(f"Trained in {seconds:.0f} s ({rate}).")
+    print(f"Checkpoints  {run / 'checkpoints'}")
+    print(f"Previews     {run / 'previews'}")
+    print(f"Curves       tensorboard --logdir {run / 'tensorboard'}")
+    print(f"Next         avatar eval {run}")
+    return OK
+
+
+def config_overrides(arguments: Namespace) -> list[str]:
+    """The options that are short forms of configuration keys, before the overrides, so that those win."""
+    short = {"data.size": arguments.size, "trainer.iterations": arguments.iterations, "trainer.seed": arguments.seed}
+    groups = [o for o in arguments.overrides if "." not in o.partition("=")[0]]
+    keys = [o for o in arguments.overrides if o not in groups]
+    return [*groups, *(f"{key}={value}" for key, value in short.items() if value is not None), *keys]
+
+
+def refuse_changes(run: Path, config: Config, overrides: list[str]) -> None:
+    """A resumed run keeps its configuration; naming another value for a key is an error, not a silent choice."""
+    recorded, asked = flat(config.to_dict()), flat(load_config(overrides).to_dict())
+    named = {o.partition("=")[0] for o in overrides}
+    for key, value in asked.items():
+        mentioned = key in named or key.partition(".")[0] in named or "experiment" in named
+        if mentioned and recorded[key] != value:
+            raise UserError(
+                f"{run} began with {key}={recorded[key]}, not {value}: leave the override out to resume, or start a new run"
+            )
+
+
+def flat(values: dict, prefix: str = "") -> dict:
+    pairs: dict = {}
+    for key, value in values.items():
+        pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return pairs
+
+
+def eval(arguments: Namespace) -> int:
+    run = load_run(arguments.run, arguments.head)
+    evaluate(run, arguments.protocol, write_frames=arguments.frames)
+    return OK
+
+
+def reenact(arguments: Namespace) -> int:
+    run = load_run(arguments.run, arguments.head)
+    driver = open_driver(arguments.driver, run, arguments.head, arguments.driver_tracking, arguments.frame_offset)
+    drive(run, driver, transfer=arguments.transfer, camera=arguments.camera, out=arguments.out)
+    return OK
+
+
+def open_driver(folder: Path, run: Run, head: Path | None, tracking: Path | None, offset: int | None) -> Subject:
+    """The driver with its own head model where it has one, else with the avatar's."""
+    own = folder / "head_model"
+    path = own if own.is_dir() and head is None else run.source.head
+    known: HeadAssets | None = run.avatar.head.assets if path == run.source.head else None
+    driver, _ = open_subject(Source(folder, path, tracking, offset), None, print, known)
+    return driver
+
+
+def prepare(arguments: Namespace) -> int:
+    head = find_head(arguments.folder, arguments.head)
+    prepared = prepare_folder(
+        arguments.folder,
+        load_head_assets(head),
+        head,
+        tracking=arguments.tracking,
+        frame_offset=arguments.frame_offset,
+        out=arguments.out,
+    )
+    subject = Subject.open(prepared)
+    print(
+        f"{subject.name}: {len(subject)} frames of {subject.width}x{subject.height}, "
+        f"{len(subject.split.train)} to train, {len(subject.split.test)} to test"
+    )
+    print(f"Prepared in {prepared}")
+    return OK
+
+
+def demo_data(arguments: Namespace) -> int:
+    make_subject(arguments.out, arguments.frames, arguments.size, arguments.seed, arguments.motion)
+    print(f"Next   avatar train {arguments.out}")
+    return OK
+
+
+def demo(arguments: Namespace) -> int:
+    """The whole program on subjects of its own making."""
+    out: Path = arguments.out
+    actor, driver, run = out / "actor", out / "driver", out / "run"
+    if not actor.is_dir():
+        make_subject(actor, 500, 192, 1, "speech")
+    if not driver.is_dir():
+        make_subject(driver, 100, 192, 2, "turn")
+    if not (run / "run.json").is_file():
+        status = train_new(Source(actor, actor / "head_model"), load_config(["experiment=demo"]), run)
+        if status != OK:
+            return status
+    trained = load_run(run)
+    results = evaluate(trained, None, write_frames=False)
+    video = drive(trained, open_driver(driver, trained, None, None, None))
+    print("\nThe demo is done. Look at")
+    print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
+    print(f"  {video}   another person's motion on the avatar")
+    print(f"  {run / 'previews'}   how it got better during training")
+    return OK
+
+
+def doctor(arguments: Namespace) -> int:
+    return report()

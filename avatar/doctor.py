@@ -1,0 +1,77 @@
+"""What this installation can do, what is missing, and how to get it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+import avatar
+from avatar.config import config_dir
+from avatar.errors import UserError
+from avatar.head.assets import load_head_assets
+from avatar.lpips import load_lpips
+from avatar.run import HEAD_VARIABLE
+from avatar.splat import splat
+from avatar.types import Camera, Gaussians
+
+
+def report(say: Callable[[str], None] = print) -> int:
+    """Print one line per finding. Returns 1 when something that every command needs does not work, else 0."""
+    say(f"avatar {avatar.__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
+    say(f"torch {torch.__version__}, {torch.get_num_threads()} threads, {os.cpu_count()} processors")
+    works = [check("compiled core", draw_one_splat, say), check("configuration", lambda: str(config_dir()), say)]
+    check("video encoder", find_encoder, say)
+    check("head model", find_default_head, say)
+    for net in ("vgg", "alex", "squeeze"):
+        check(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
+    has_gpu = torch.cuda.is_available()
+    say(f"  {'CUDA':16} {torch.cuda.get_device_name() if has_gpu else 'no device; everything runs on the CPU'}")
+    for package, purpose in (("gsplat", "GPU splatting"), ("viser", "live viewer"), ("mediapipe", "landmarks")):
+        found = importlib.util.find_spec(package) is not None
+        say(f"  {package:16} {'installed' if found else f'not installed (optional: {purpose})'}")
+    return 0 if all(works) else 1
+
+
+def check(name: str, finding: Callable[[], str], say: Callable[[str], None]) -> bool:
+    """Say what `finding` returns or why it failed; every failure is a line, never a stack trace."""
+    try:
+        say(f"  {name:16} {finding()}")
+        return True
+    except (UserError, OSError, ImportError, RuntimeError, ValueError) as error:
+        say(f"  {name:16} {error}")
+        return False
+
+
+def draw_one_splat() -> str:
+    camera = Camera(torch.eye(3), torch.zeros(3), 8.0, 8.0, 4.0, 4.0, 8, 8)
+    one = Gaussians(
+        torch.tensor([[0.0, 0.0, 1.0]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.full((1, 3), 0.2),
+        torch.tensor([0.9]),
+        torch.zeros(1, 1, 3),
+    )
+    alpha = float(splat(one, camera, torch.zeros(3)).alpha[4, 4])
+    if not 0.8 < alpha < 0.9:
+        raise RuntimeError(f"drew a splat of opacity 0.9 with alpha {alpha:.3f}; the compiled core is broken, reinstall it")
+    return f"draws ({Path(sys.modules['avatar._core'].__file__ or '').name})"
+
+
+def find_encoder() -> str:
+    import imageio_ffmpeg
+
+    return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+
+
+def find_default_head() -> str:
+    named = os.environ.get(HEAD_VARIABLE)
+    if not named:
+        return f"{HEAD_VARIABLE} is not set; give --head, or put head_model/ into the subject"
+    assets = load_head_assets(Path(named))
+    return f"{named}: {assets.num_vertices} vertices, {assets.num_expressions} expressions"

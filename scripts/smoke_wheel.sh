@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Build a wheel, install it into an empty environment outside the checkout, and run the whole program from there.
+set -euo pipefail
+checkout=$(cd "$(dirname "$0")/.." && pwd)
+python=${PYTHON:-python3}
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+"$checkout/.venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$checkout"
+"$python" -m venv "$work/env"
+# shellcheck disable=SC2086
+"$work/env/bin/pip" install --quiet --disable-pip-version-check -c "$checkout/constraints.txt" ${PIP_FLAGS:-} "$work"/dist/*.whl
+
+cd "$work"
+avatar=$work/env/bin/avatar
+set -x
+"$avatar" --version
+"$avatar" doctor
+"$avatar" demo-data actor --frames 60 --size 96 --seed 1
+"$avatar" demo-data driver --frames 20 --size 96 --seed 2 --motion turn
+"$avatar" prepare actor
+"$avatar" train actor --out run --size 64 --iterations 60 experiment=demo model.uv_size=24 trainer.checkpoint_every=30
+"$avatar" train actor --out run --resume
+"$avatar" eval run --frames
+"$avatar" reenact run --driver driver
+for made in run/eval/results.json run/eval/hypergaussians/renders/00001.png run/reenact/driver-relative.mp4; do
+  test -s "$made"
+done
+set +x
+echo "smoke: the installed wheel trains, evaluates and reenacts"
