@@ -59,7 +59,9 @@ def draw_one_splat() -> str:
     )
     alpha = float(splat(one, camera, torch.zeros(3)).alpha[4, 4])
     if not 0.8 < alpha < 0.9:
-        raise RuntimeError(f"drew a splat of opacity 0.9 with alpha {alpha:.3f}; the compiled core is broken, reinstall it")
+        raise RuntimeError(
+            f"drew a splat of opacity 0.9 with alpha {alpha:.3f}; the compiled core is broken, reinstall it"
+        )
     return f"draws ({Path(sys.modules['avatar._core'].__file__ or '').name})"
 
 

@@ -63,12 +63,12 @@ def reenact(
 
 
 @torch.no_grad()
-def pairs(
-    run: Run, loader: FrameLoader, motion: list[HeadParams], cameras: list[Camera]
-) -> Iterator[np.ndarray]:
+def pairs(run: Run, loader: FrameLoader, motion: list[HeadParams], cameras: list[Camera]) -> Iterator[np.ndarray]:
     """The driver's picture beside the avatar's render, frame by frame, uint8."""
     background = torch.tensor(run.config.data.background)
-    frames = tqdm(loader.frames(range(len(motion))), total=len(motion), desc="reenact", unit="frame", dynamic_ncols=True)
+    frames = tqdm(
+        loader.frames(range(len(motion))), total=len(motion), desc="reenact", unit="frame", dynamic_ncols=True
+    )
     for frame, params, camera in zip(frames, motion, cameras, strict=True):
         render = splat(run.avatar(params), camera, background).image
         yield side_by_side([frame.image, render], ["driver", run.subject.name])

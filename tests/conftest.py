@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from tracked_folder import write_tracked_folder
 
 
 @pytest.fixture(autouse=True)
@@ -20,3 +22,18 @@ def shared_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"development data folder {path.name}/ is not beside the checkout")
     return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Prepared subjects and weights of the person who runs the tests stay out of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AVATAR_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.delenv("AVATAR_HEAD", raising=False)
+        yield
+
+
+@pytest.fixture(scope="session")
+def tracked_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small tracked folder, image offset 1; do not write into it."""
+    return write_tracked_folder(tmp_path_factory.mktemp("tracked") / "someone", frames=30, size=48)

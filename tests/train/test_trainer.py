@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from small_runs import new_avatar, open_small, small_config, train_small
+
+from avatar.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
+from avatar.errors import UserError
+from avatar.train import trainer as trainer_module
+from avatar.train.trainer import choose_perceptual, interruption, train
+
+
+def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_path: Path) -> None:
+    scores: list[float] = []
+    log_step = trainer_module.TrainingLog.step
+
+    def record(self, step, loss, psnr) -> None:
+        scores.append(psnr)
+        log_step(self, step, loss, psnr)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer_module.TrainingLog, "step", record)
+        _, done = train_small(tracked_folder, tmp_path / "run", ["trainer.iterations=240"])
+    assert done == 240
+    assert sum(scores[-20:]) / 20 > sum(scores[:20]) / 20 + 3.0
+    assert [p.name for p in sorted((tmp_path / "run").iterdir())] == [
+        "checkpoints",
+        "previews",
+        "run.json",
+        "tensorboard",
+    ]
+    assert (tmp_path / "run" / "previews" / "step_00000240.png").is_file()
+    assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 3
+
+
+@pytest.mark.parametrize("model", ["hypergaussians", "flashavatar"])
+def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(tracked_folder: Path, tmp_path: Path, model: str) -> None:
+    """Across the boundaries where a spherical-harmonics degree and the perceptual term come in."""
+    train_small(tracked_folder, tmp_path / "whole", [f"model={model}"])
+    train_small(tracked_folder, tmp_path / "broken", [f"model={model}"])
+    files = list_checkpoints(tmp_path / "broken" / "checkpoints")
+    files[-1].unlink()
+    halfway = newest_checkpoint(tmp_path / "broken")
+    assert halfway.step == 8
+    train_small(tracked_folder, tmp_path / "broken", [f"model={model}"], resume=halfway)
+
+    whole, broken = newest_checkpoint(tmp_path / "whole"), newest_checkpoint(tmp_path / "broken")
+    assert whole.step == broken.step == 12
+    assert whole.tensors.keys() == broken.tensors.keys()
+    differing = [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])]
+    assert not differing
+
+
+def test_another_seed_is_another_avatar(tracked_folder: Path, tmp_path: Path) -> None:
+    a, _ = train_small(tracked_folder, tmp_path / "a", ["trainer.seed=1"])
+    b, _ = train_small(tracked_folder, tmp_path / "b", ["trainer.seed=2"])
+    assert not torch.equal(a.deformation.output.weight, b.deformation.output.weight)
+
+
+def test_an_interruption_saves_the_state_and_stops(tracked_folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    log_step = trainer_module.TrainingLog.step
+
+    def press_ctrl_c(self, step, loss, psnr) -> None:
+        log_step(self, step, loss, psnr)
+        if step == 6:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer_module.TrainingLog, "step", press_ctrl_c)
+        _, done = train_small(tracked_folder, run)
+    assert done == 6
+    assert newest_checkpoint(run).step == 6
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_interruption_acts_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt), interruption() as interrupted:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interrupted()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert not interrupted(), "the second signal was swallowed"
+
+
+def test_a_gradient_that_is_not_finite_stops_and_leaves_the_last_checkpoint(
+    tracked_folder: Path, tmp_path: Path
+) -> None:
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar = new_avatar(assets, subject, config)
+    steps = 0
+
+    def poison(gradient: torch.Tensor) -> torch.Tensor:
+        nonlocal steps
+        steps += 1
+        return gradient if steps <= 6 else gradient.index_fill(0, torch.tensor([3]), float("nan"))
+
+    avatar.opacity_logits.register_hook(poison)
+    with pytest.raises(UserError) as caught:
+        train(avatar, subject, config, tmp_path / "run", say=lambda _: None)
+    message = str(caught.value)
+    assert "stopped at step 7, frame " in message
+    assert "the gradient of opacity_logits has 1 non-finite of" in message and "the first at [3] (nan)" in message
+    files = list_checkpoints(tmp_path / "run" / "checkpoints")
+    assert [load_checkpoint(p).step for p in files] == [4]
+    assert bool(torch.isfinite(avatar.opacity_logits).all()), "the optimizer ran on the bad gradient"
+
+
+def test_lpips_by_name_without_weights_fails_before_training(tracked_folder: Path, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer_module, "load_lpips", _no_weights)
+        with pytest.raises(UserError, match="no weights"):
+            train_small(tracked_folder, tmp_path / "run", ["trainer.perceptual=lpips"])
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_without_weights_the_default_trains_with_dssim_and_says_so_once() -> None:
+    said: list[str] = []
+    term = choose_perceptual(small_config().trainer, said.append)
+    assert term.name == "dssim" and len(said) == 1 and "D-SSIM in place of LPIPS" in said[0]
+    assert choose_perceptual(small_config("trainer.perceptual=none").trainer, said.append).function is None
+    assert len(said) == 1
+
+
+def _no_weights(*_: object, **__: object) -> None:
+    raise UserError("no weights")
