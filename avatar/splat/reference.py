@@ -193,7 +193,8 @@ def _composite(
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, " P"]]:
     """Front-to-back compositing of m sorted splats at P pixel centres: colour over the background, transmittance."""
     image = pixels.new_zeros(len(pixels), 3)
-    transmittance = pixels.new_ones(len(pixels))
+    # Minus an empty sum, so that the outputs have a gradient (zero) where nothing is drawn.
+    transmittance = pixels.new_ones(len(pixels)) - opacities[:0].sum()
     stopped: Bool[Tensor, " P"] = torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)
     step = max(1, MAX_EVALUATIONS // len(pixels))
     for start in range(0, len(means), step):

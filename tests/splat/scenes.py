@@ -1,0 +1,244 @@
+"""Scenes for the tests of the splatter, and the assertions that every backend has to meet on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from avatar.splat import splat
+from avatar.types import Camera, Gaussians, Rendering
+
+SIMD = ("baseline", "avx2", "avx512")
+
+
+@dataclass(frozen=True)
+class Scene:
+    gaussians: Gaussians
+    camera: Camera
+    background: Tensor = field(default_factory=lambda: torch.tensor([0.2, 0.5, 0.9]))
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def with_options(self, **options: Any) -> Scene:
+        return replace(self, options={**self.options, **options})
+
+
+def use_simd(monkeypatch: pytest.MonkeyPatch, simd: str) -> None:
+    """Make the cpu backend use one instruction set; skip the test where the processor does not have it."""
+    monkeypatch.setenv("AVATAR_SIMD", simd)
+    try:
+        render(Scene(random_gaussians(1), camera(1, 1)))
+    except ValueError as error:
+        if "does not have" not in str(error):
+            raise
+        pytest.skip(f"this processor does not have {simd}")
+
+
+def camera(width: int, height: int, *, centre: tuple[float, float] | None = None, yaw: float = 0.3) -> Camera:
+    """A camera 1.2 m in front of the origin, turned by `yaw`; `centre` is the principal point as a part of the size."""
+    cx, cy = centre if centre is not None else (0.5, 0.5)
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    side = max(width, height)
+    return Camera(R, torch.tensor([0.03, -0.02, 1.2]), 1.3 * side, 1.4 * side, cx * width, cy * height, width, height)
+
+
+def random_gaussians(
+    count: int, *, seed: int = 0, sh_degree: int = 3, spread: float = 0.3, size: float = 0.03, anisotropy: float = 0.8
+) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=spread * torch.randn(count, 3, generator=g),
+        quats=torch.randn(count, 4, generator=g),
+        scales=size * torch.exp(anisotropy * torch.randn(count, 3, generator=g)),
+        opacities=torch.rand(count, generator=g),
+        sh=0.3 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=g),
+    )
+
+
+def head_shell(count: int = 14_876, *, seed: int = 0) -> Gaussians:
+    """Splats on a bumpy ellipsoid of the size of a head, their sizes from the spacing, as a trained avatar has them."""
+    g = torch.Generator().manual_seed(seed)
+    i = torch.arange(count, dtype=torch.float64) + 0.5
+    polar, azimuth = torch.acos(1 - 2 * i / count), math.pi * (1 + math.sqrt(5)) * i
+    unit = torch.stack((azimuth.cos() * polar.sin(), polar.cos(), azimuth.sin() * polar.sin()), -1).float()
+    radii = torch.tensor([0.075, 0.11, 0.095])
+    spacing = 0.093 * math.sqrt(4 * math.pi / count)
+    return Gaussians(
+        means=radii * unit * (1 + 0.08 * torch.sin(7 * unit[:, :1])) + 0.0015 * torch.randn(count, 3, generator=g),
+        quats=torch.randn(count, 4, generator=g),
+        scales=spacing * torch.exp(0.35 * torch.randn(count, 3, generator=g)),
+        opacities=torch.sigmoid(1.5 * torch.randn(count, generator=g) + 0.5),
+        sh=0.1 * torch.randn(count, 16, 3, generator=g),
+    )
+
+
+def head_camera(size: int) -> Camera:
+    return Camera(torch.eye(3), torch.tensor([0.0, 0.0, 0.75]), 2.2 * size, 2.2 * size, size / 2, size / 2, size, size)
+
+
+def single_splat(*, opacity: float = 0.8, scale: float = 0.02, depth: float = 1.0, colour: float = 0.3) -> Scene:
+    """One round splat on the axis of an unturned camera of 33 x 33 pixels, whose middle pixel's centre it hits."""
+    return Scene(
+        Gaussians(
+            torch.tensor([[0.0, 0.0, depth]]),
+            torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+            torch.full((1, 3), scale),
+            torch.tensor([opacity]),
+            torch.full((1, 1, 3), (colour - 0.5) / math.sqrt(1 / (4 * math.pi))),
+        ),
+        Camera(torch.eye(3), torch.zeros(3), 100.0, 100.0, 16.5, 16.5, 33, 33),
+    )
+
+
+def threshold_gaussians() -> Gaussians:
+    """Opacities at and around every cut-off: 0, 1/255, alpha_max, 1; all splats on pixel centres or near them."""
+    steps = [0.0, 1e-30, 1e-7]
+    for edge in (np.float32(1 / 255), np.float32(0.999), np.float32(1.0)):
+        steps += [float(np.nextafter(edge, np.float32(0))), float(edge), float(min(1.0, edge * np.float32(1.001)))]
+    g = random_gaussians(len(steps) * 12, seed=4, spread=0.25, size=0.02)
+    return g._replace(opacities=torch.tensor(steps).repeat(12))
+
+
+SCENES: dict[str, Scene] = {
+    "random": Scene(random_gaussians(400), camera(250, 131)),
+    "head": Scene(head_shell(), head_camera(256), torch.ones(3)),
+    "anisotropic": Scene(random_gaussians(150, seed=1, anisotropy=2.0), camera(120, 90)),
+    "off-centre": Scene(random_gaussians(200, seed=2), camera(100, 70, centre=(0.2, 0.85))),
+    "centre outside the image": Scene(random_gaussians(300, seed=3), camera(90, 90, centre=(-0.4, 1.3))),
+    "wide field of view": Scene(
+        random_gaussians(200, seed=5, spread=0.8), replace(camera(96, 64), fx=25.0, fy=22.0, cx=50.0)
+    ),
+    "1x1": Scene(random_gaussians(30, seed=6), camera(1, 1)),
+    "17x33": Scene(random_gaussians(60, seed=7), camera(17, 33)),
+    "16x16": Scene(random_gaussians(60, seed=8), camera(16, 16)),
+    "opaque": Scene(random_gaussians(150, seed=9)._replace(opacities=torch.ones(150)), camera(64, 48)),
+    "dense": Scene(random_gaussians(3000, seed=10, spread=0.08), camera(40, 40)),
+    "thresholds": Scene(threshold_gaussians(), camera(80, 60)),
+    "one": Scene(random_gaussians(1, seed=11, spread=0.01), camera(31, 29)),
+    "single on a pixel centre": single_splat(),
+    "antialiased": Scene(random_gaussians(400, seed=12, size=0.004), camera(96, 96), options={"antialiased": True}),
+    "needles": Scene(
+        random_gaussians(60, seed=13)._replace(scales=torch.tensor([[0.5, 1e-4, 1e-6]]).repeat(60, 1)), camera(128, 128)
+    ),
+    "unnormalised quaternions": Scene(
+        (g := random_gaussians(100, seed=14))._replace(quats=g.quats * torch.logspace(-18, 15, 100)[:, None]),
+        camera(64, 64),
+    ),
+    "no cut-offs": Scene(random_gaussians(60, seed=15), camera(40, 30), options={"alpha_min": 0.0, "t_min": 0.0}),
+    "other cut-offs": Scene(
+        random_gaussians(300, seed=16),
+        camera(64, 64),
+        options={"alpha_min": 0.05, "alpha_max": 0.6, "t_min": 0.2, "blur": 1.5, "near": 1.1},
+    ),
+    **{
+        f"degree {used} of {stored}": Scene(
+            random_gaussians(80, seed=17, sh_degree=stored), camera(50, 40), options={"sh_degree": used}
+        )
+        for stored in range(4)
+        for used in range(stored + 1)
+    },
+}
+
+
+def render(scene: Scene, backend: Any = "cpu") -> Rendering:
+    return splat(scene.gaussians, scene.camera, scene.background, backend=backend, **scene.options)
+
+
+def gradients(scene: Scene, backend: Any, grad_image: Tensor | None, grad_alpha: Tensor | None) -> dict[str, Tensor]:
+    """dL/d(every input) for L = grad_image . image + grad_alpha . alpha."""
+    inputs = {**scene.gaussians._asdict(), "background": scene.background}
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    leaf_scene = replace(
+        scene, gaussians=Gaussians(*(leaves[n] for n in Gaussians._fields)), background=leaves["background"]
+    )
+    rendering = render(leaf_scene, backend)
+    pairs = [(o, g) for o, g in zip(rendering, (grad_image, grad_alpha), strict=True) if g is not None]
+    outputs, cotangents = zip(*pairs, strict=True)
+    found = torch.autograd.grad(outputs, list(leaves.values()), cotangents, allow_unused=True)
+    return {n: torch.zeros_like(leaves[n]) if g is None else g for n, g in zip(leaves, found, strict=True)}
+
+
+def in_float64(scene: Scene) -> Scene:
+    return replace(
+        scene, gaussians=Gaussians(*(t.double() for t in scene.gaussians)), background=scene.background.double()
+    )
+
+
+def ambiguous_pixels(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Pixels where a cut-off is met to within float32 rounding, and by how much the image jumps there.
+
+    The cut-offs make the image a discontinuous function: where an alpha equals alpha_min, or a transmittance t_min, to
+    seven digits, a float32 kernel may rightly decide either way. Such pixels are found by moving the cut-offs by 1e-5.
+    """
+    bounds = []
+    for factor in (1 - 1e-5, 1 + 1e-5):
+        alpha_min = scene.options.get("alpha_min", 1 / 255) * factor
+        t_min = scene.options.get("t_min", 1e-4) * factor
+        with torch.no_grad():
+            bounds.append(render(in_float64(scene.with_options(alpha_min=alpha_min, t_min=t_min)), "reference"))
+    jump = (bounds[0].image - bounds[1].image).abs().amax(-1)
+    jump = torch.maximum(jump, (bounds[0].alpha - bounds[1].alpha).abs())
+    return jump > 1e-6, jump
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What the float64 reference says of a scene, and one random cotangent, zero at ambiguous pixels."""
+
+    rendering: Rendering
+    ambiguous: Tensor  # bool [H, W]
+    jump: Tensor  # [H, W]
+    grad_image: Tensor
+    grad_alpha: Tensor
+    gradients: dict[str, Tensor]
+
+
+def expected_of(scene: Scene) -> Expected:
+    ambiguous, jump = ambiguous_pixels(scene)
+    with torch.no_grad():
+        rendering = render(in_float64(scene), "reference")
+    g = torch.Generator().manual_seed(99)
+    grad_image = torch.randn(rendering.image.shape, generator=g).masked_fill(ambiguous[..., None], 0.0)
+    grad_alpha = torch.randn(rendering.alpha.shape, generator=g).masked_fill(ambiguous, 0.0)
+    wanted = gradients(in_float64(scene), "reference", grad_image.double(), grad_alpha.double())
+    return Expected(rendering, ambiguous, jump, grad_image, grad_alpha, wanted)
+
+
+@cache
+def expected_of_named(name: str) -> Expected:
+    return expected_of(SCENES[name])
+
+
+def assert_agrees(
+    scene: Scene, backend: Any = "cpu", *, expected: Expected | None = None, image_tolerance: float = 1e-5
+) -> None:
+    """Image, alpha and, for one random cotangent, every gradient agree with the float64 reference."""
+    if expected is None:
+        expected = expected_of(scene)
+    assert expected.ambiguous.float().mean() <= 0.01 or expected.ambiguous.sum() <= 2
+    with torch.no_grad():
+        found = render(scene, backend)
+    allowed = image_tolerance + torch.where(expected.ambiguous, expected.jump, 0.0)
+    assert ((found.image - expected.rendering.image).abs().amax(-1) <= allowed).all()
+    assert ((found.alpha - expected.rendering.alpha).abs() <= allowed).all()
+    assert_gradients_close(gradients(scene, backend, expected.grad_image, expected.grad_alpha), expected.gradients)
+
+
+def assert_gradients_close(found: dict[str, Tensor], wanted: dict[str, Tensor], tolerance: float = 1e-4) -> None:
+    """Each tensor as a whole to `tolerance`, each element to 10 * tolerance of itself plus `tolerance` of the RMS."""
+    for name, expected in wanted.items():
+        error = found[name].double() - expected
+        assert torch.isfinite(found[name]).all(), name
+        assert error.norm() <= tolerance * expected.norm(), f"{name}: {error.norm() / expected.norm():.1e}"
+        rms = expected.norm() / max(expected.numel(), 1) ** 0.5
+        worst = (error.abs() - 10 * tolerance * expected.abs() - tolerance * rms).max() if error.numel() else 0.0
+        assert worst <= 0, f"{name}: an element is off by {worst:.1e} more than allowed (RMS {rms:.1e})"
+
+
