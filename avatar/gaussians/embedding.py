@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from avatar.gaussians.uv import UVTexels
@@ -38,6 +38,6 @@ def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tenso
     k = min(neighbours, len(cloud) - 1)
     if k < 1:
         return torch.full((len(cloud),), 1e-2, dtype=points.dtype)
-    distances = cKDTree(cloud).query(cloud, k=k + 1)[0][:, 1:]
+    distances = KDTree(cloud).query(cloud, k=k + 1)[0][:, 1:]
     rms = np.sqrt(np.mean(np.square(distances), axis=1))
     return torch.from_numpy(np.maximum(rms, 1e-4)).to(points.dtype)
