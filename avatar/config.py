@@ -200,7 +200,11 @@ def _check_overrides(overrides: Sequence[str]) -> None:
 def _known_keys(schema: type = Config, prefix: str = "") -> list[str]:
     keys: list[str] = []
     for name, kind in get_type_hints(schema).items():
-        keys += _known_keys(kind, f"{prefix}{name}.") if dataclasses.is_dataclass(kind) else [f"{prefix}{name}"]
+        keys += (
+            _known_keys(kind, f"{prefix}{name}.")
+            if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+            else [f"{prefix}{name}"]
+        )
     return keys
 
 

@@ -35,8 +35,7 @@ def uv_texels(assets: HeadAssets, size: int) -> UVTexels:
     raster = rasterize_mesh(flat, assets.uv_faces.numpy(), size, size)
     covered = raster.face_id >= 0
     if "boundary" in assets.regions:
-        rim = np.isin(assets.faces.numpy(), assets.regions["boundary"].numpy())
-        on_rim: np.ndarray = rim.any(axis=1)
+        on_rim = np.isin(assets.faces.numpy(), assets.regions["boundary"].numpy()).max(axis=1)
         covered &= ~on_rim[raster.face_id]
     row, column = np.nonzero(covered)
     if len(row) == 0:
