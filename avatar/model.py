@@ -29,7 +29,7 @@ class Avatar(nn.Module):
 
     code: Tensor
 
-    def __init__(self, assets: HeadAssets, identity: Float[Tensor, S], config: ModelConfig) -> None:
+    def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__()
         self.config = config
         self.head = HeadModel(assets, identity)
@@ -69,7 +69,7 @@ class Avatar(nn.Module):
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
         return compose(points, self.quats, self.log_scales, self.opacity_logits, sh, split_offsets(raw))
 
-    def _condition(self, params: HeadParams) -> Float[Tensor, D]:
+    def _condition(self, params: HeadParams) -> Float[Tensor, " D"]:
         """The network's input, with expression coefficients that the frame does not carry as zeros."""
         condition = params.condition()
         missing = self.deformation.condition_size - len(condition)

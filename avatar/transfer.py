@@ -28,7 +28,7 @@ NEUTRAL_SHARE = 0.05  # of the frames that are averaged into the neutral express
 class RestPose:
     """The expression and jaw that a person's motion is measured from."""
 
-    expression: Float[Tensor, E]
+    expression: Float[Tensor, " E"]
     jaw: Float[Tensor, "3 3"]  # rotation matrix
     frame: int | None  # the frame that is most like it; None for a mean
 

@@ -55,7 +55,7 @@ class Camera:
 class HeadParams:
     """What moves a FLAME-format head in one frame; identity coefficients belong to the subject, not to the frame."""
 
-    expression: Float[Tensor, E]  # coefficients of the expression basis
+    expression: Float[Tensor, " E"]  # coefficients of the expression basis
     jaw: Float[Tensor, 6]  # 6D rotation
     eyes: Float[Tensor, 12]  # two 6D rotations, left then right
     eyelids: Float[Tensor, 2]  # blendshape weights, left then right
@@ -94,7 +94,7 @@ class Gaussians(NamedTuple):
     means: Float[Tensor, "N 3"]  # metres
     quats: Float[Tensor, "N 4"]  # (w, x, y, z), need not be normalised
     scales: Float[Tensor, "N 3"]  # standard deviations, metres, > 0
-    opacities: Float[Tensor, N]  # in [0, 1]
+    opacities: Float[Tensor, " N"]  # in [0, 1]
     sh: Float[Tensor, "N K 3"]  # spherical-harmonics colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16
 
 

@@ -38,7 +38,7 @@ def compose(
     points: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
     log_scales: Float[Tensor, "N 3"],
-    opacity_logits: Float[Tensor, N],
+    opacity_logits: Float[Tensor, " N"],
     sh: Float[Tensor, "N K 3"],
     offsets: Offsets,
 ) -> Gaussians:

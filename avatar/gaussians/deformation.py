@@ -23,7 +23,7 @@ class DeformationMLP(nn.Module):
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
         self.output = nn.Linear(width, out_size)
 
-    def forward(self, code: Float[Tensor, "N C"], condition: Float[Tensor, D]) -> Float[Tensor, "N O"]:
+    def forward(self, code: Float[Tensor, "N C"], condition: Float[Tensor, " D"]) -> Float[Tensor, "N O"]:
         for_code, for_condition = self.input.weight.split((self.code_size, self.condition_size), dim=1)
         of_frame = torch.addmv(self.input.bias, for_condition, condition)
         x = torch.relu_(torch.addmm(of_frame, code, for_code.T))

@@ -29,7 +29,7 @@ class Embedding:
         return (corners * self.barycentric.to(vertices.dtype)[:, :, None]).sum(dim=1)
 
 
-def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, N]:
+def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, " N"]:
     """Root mean squared distance of each point to its nearest neighbours, in metres; never below 1e-4 m.
 
     Source: 3D Gaussian Splatting's initial scales, as FlashAvatar uses them. The floor keeps coincident points finite.

@@ -72,7 +72,7 @@ class HyperHead(nn.Module):
         mean_a, mean_b = self.mean.split((self.attribute_size, self.latent_size), dim=-1)
         return conditional_mean(mean_a, mean_b, self.factor(), latents)
 
-    def log_det_covariance(self) -> Float[Tensor, N]:
+    def log_det_covariance(self) -> Float[Tensor, " N"]:
         """log det Cov[a | b] = -2 sum(log diag L11), which does not depend on the latent (supplement, eq. 3)."""
         return -2.0 * torch.diagonal(self.lower, dim1=-2, dim2=-1).sum(dim=-1)
 
@@ -89,6 +89,6 @@ class HyperHeads(nn.Module):
     def forward(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
         return torch.cat((self.position(latents), self.rotation(latents), self.scale(latents)), dim=-1)
 
-    def uncertainty(self) -> Float[Tensor, N]:
+    def uncertainty(self) -> Float[Tensor, " N"]:
         """The paper's uncertainty, the log-determinants of the conditional covariances summed over the heads."""
         return sum(head.log_det_covariance() for head in (self.position, self.rotation, self.scale))  # type: ignore[return-value]

@@ -16,9 +16,9 @@ from avatar.head.rasterize import rasterize_mesh
 class UVTexels(NamedTuple):
     """The covered texels of an S x S raster of the UV map, row by row from the top."""
 
-    row: Int[Tensor, N]
-    column: Int[Tensor, N]
-    face: Int[Tensor, N]
+    row: Int[Tensor, " N"]
+    column: Int[Tensor, " N"]
+    face: Int[Tensor, " N"]
     barycentric: Float[Tensor, "N 3"]
 
 

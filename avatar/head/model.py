@@ -34,7 +34,7 @@ class HeadModel:
     `identity` [up to 300] holds the identity coefficients; missing ones are zero. The arithmetic runs in `dtype`.
     """
 
-    def __init__(self, assets: HeadAssets, identity: Float[Tensor, S], dtype: torch.dtype = torch.float32) -> None:
+    def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], dtype: torch.dtype = torch.float32) -> None:
         if identity.ndim != 1 or len(identity) > assets.shape_dirs.shape[2]:
             raise ValueError(
                 f"identity must have shape [at most {assets.shape_dirs.shape[2]}], got {list(identity.shape)}"
