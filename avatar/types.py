@@ -61,7 +61,7 @@ class HeadParams:
     eyelids: Float[Tensor, 2]  # blendshape weights, left then right
     neck: Float[Tensor, 6]  # 6D rotation; identity in metrical-tracker's data, and not a condition of the MLP
 
-    def condition(self) -> Float[Tensor, E + 20]:
+    def condition(self) -> Float[Tensor, " C"]:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""
         return torch.cat((self.expression, self.jaw, self.eyes, self.eyelids))
 

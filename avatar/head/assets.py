@@ -42,7 +42,7 @@ class HeadAssets:
     eyelid_dirs: Float[Tensor, "2 V 3"]  # left, right; zeros where the model has none
     uvs: Float[Tensor, "T 2"]  # OBJ convention: origin at the lower left
     uv_faces: Int[Tensor, "F 3"]  # rows of `uvs` for the corners of `faces`
-    regions: Mapping[str, Int[Tensor, _]]  # name -> vertex indices
+    regions: Mapping[str, Int[Tensor, " R"]]  # name -> vertex indices
     fingerprint: str  # SHA-256 over all of the above
 
     @property
