@@ -1,0 +1,159 @@
+"""Make a whole tracked subject: rendered frames, masks, tracking and head model in the FlashAvatar folder layout."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from avatar.demo.head_files import write_head_model
+from avatar.demo.identity import sample_identity
+from avatar.demo.motion import MOTIONS, Motion, Performance, frame_camera, frame_params, perform
+from avatar.demo.render import RenderedFrame, Renderer
+from avatar.errors import UserError
+from avatar.types import Camera, HeadParams
+
+MAX_FRAMES, MIN_SIZE, MAX_SIZE = 100_000, 64, 1024
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 96, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
+
+def make_subject(
+    out: Path,
+    frames: int = 600,
+    size: int = 256,
+    seed: int = 0,
+    motion: Motion = "speech",
+    threads: int | None = None,
+    progress: bool = True,
+) -> Path:
+    """Render `frames` pictures of `size` x `size` pixels of the person of `seed`, and write them with their tracking.
+
+    The folder appears under its name only when it is complete. Same arguments, same files. `threads` defaults to the
+    number of cores. Returns `out`. Raises UserError for values out of range and for an `out` that is not empty.
+    """
+    out = Path(out)
+    _check_arguments(out, frames, size, seed, motion, threads)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise UserError(
+            f"cannot write to {out.parent}: {error.strerror or error}; choose another output folder"
+        ) from error
+    try:
+        _write_subject(partial, frames, size, seed, motion, threads or os.cpu_count() or 1, progress)
+        partial.chmod(0o755)
+        partial.replace(out)
+    except OSError as error:
+        raise UserError(f"writing {out} failed: {error.strerror or error}; nothing was left behind") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return out
+
+
+def _check_arguments(out: Path, frames: int, size: int, seed: int, motion: str, threads: int | None) -> None:
+    for name, value, low, high in (
+        ("frames", frames, 1, MAX_FRAMES),
+        ("size", size, MIN_SIZE, MAX_SIZE),
+        ("seed", seed, 0, 2**32 - 1),
+        ("threads", 1 if threads is None else threads, 1, 1024),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise UserError(f"{name} must be a whole number, not {value!r}")
+        if not low <= value <= high:
+            raise UserError(f"{name} must be from {low} to {high}, not {value}")
+    if motion not in MOTIONS:
+        raise UserError(f"motion must be one of {', '.join(MOTIONS)}, not {motion!r}")
+    if out.is_symlink() or (out.exists() and not out.is_dir()):
+        raise UserError(f"{out} exists and is not a folder; choose another output folder")
+    if out.is_dir() and any(out.iterdir()):
+        raise UserError(f"{out} is not empty; choose another output folder or remove it first")
+
+
+def _write_subject(
+    folder: Path, frames: int, size: int, seed: int, motion: Motion, threads: int, progress: bool
+) -> None:
+    for name in ("imgs", "alpha", "parsing", "checkpoint"):
+        (folder / name).mkdir()
+    identity = sample_identity(seed)
+    renderer = Renderer(identity)
+    write_head_model(folder / "head_model", renderer.performer.head)
+    performance = perform(seed, frames, motion)
+    threads_before = torch.get_num_threads(), cv2.getNumThreads()
+    # One thread a frame is the better use of the cores than many in one frame's short operations.
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        done = _rendered(renderer, performance, size, threads)
+        for index, (params, camera, picture) in enumerate(
+            tqdm(done, total=frames, desc="rendering", unit="frame", disable=not progress)
+        ):
+            _write_frame(folder, index, params, camera, picture, identity.shape)
+    finally:
+        torch.set_num_threads(threads_before[0])
+        cv2.setNumThreads(threads_before[1])
+
+
+def _rendered(
+    renderer: Renderer, performance: Performance, size: int, threads: int
+) -> Iterator[tuple[HeadParams, Camera, RenderedFrame]]:
+    """Frames in order, rendered a few ahead by the threads."""
+
+    def one(frame: int) -> tuple[HeadParams, Camera, RenderedFrame]:
+        params, camera = frame_params(performance, frame), frame_camera(performance, frame, size)
+        return params, camera, renderer.render(params, camera)
+
+    with ThreadPoolExecutor(threads) as pool:
+        pending: deque[Future] = deque()
+        try:
+            for frame in range(len(performance.jaw)):
+                pending.append(pool.submit(one, frame))
+                if len(pending) > 2 * threads:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _write_frame(
+    folder: Path, index: int, params: HeadParams, camera: Camera, picture: RenderedFrame, shape: np.ndarray
+) -> None:
+    """Image and masks are numbered from 1, the tracking from 0, as video extraction and metrical-tracker leave them."""
+    stem = f"{index + 1:05d}"
+    _write_image(folder / "imgs" / f"{stem}.jpg", picture.image[..., ::-1], JPEG)
+    _write_image(folder / "alpha" / f"{stem}.jpg", picture.alpha, JPEG)
+    for name, mask in (("neckhead", picture.head), ("mouth", picture.mouth)):
+        _write_image(folder / "parsing" / f"{stem}_{name}.png", np.where(mask > 127, np.uint8(255), np.uint8(0)), [])
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], np.float32)
+    tracked = {
+        "flame": {
+            "exp": params.expression.numpy()[None],
+            "shape": shape[None],
+            "tex": np.zeros((1, 140), np.float32),
+            "sh": np.zeros((1, 9, 3), np.float32),
+            "eyes": params.eyes.numpy()[None],
+            "eyelids": params.eyelids.numpy()[None],
+            "jaw": params.jaw.numpy()[None],
+        },
+        "opencv": {"R": camera.R_cam_world.numpy()[None], "t": camera.t_cam_world.numpy()[None], "K": K[None]},
+        "img_size": np.array([camera.width, camera.height]),
+        "frame_id": f"{index:05d}",
+        "global_step": 0,
+    }
+    torch.save(tracked, folder / "checkpoint" / f"{index:05d}.frame")
+
+
+def _write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
+    if not cv2.imwrite(str(path), image, options):
+        raise OSError(f"could not write {path.name}")

@@ -1,0 +1,298 @@
+"""The mesh of the demo head: one skin chart that covers the face generously, and two discs for the eyeballs.
+
+The chart is longitude and latitude about `RAY_ORIGIN`, warped so that the face takes most of it, with the cut down the
+back of the head and the crown at the top, where it narrows to leave its corners to the eyeballs. The left half is
+triangulated (feature rings, and a centroidal Voronoi arrangement of vertices between them) and mirrored.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial import Delaunay, KDTree
+
+from avatar.demo.features import Rings, ear_rings, eye_rings, mouth_rings
+from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, RAY_ORIGIN, cast, cast_front
+
+V_RIM, V_CROWN = 0.008, 0.992
+EYE_DISC_CENTRE, EYE_DISC_RADIUS = np.array([0.932, 0.932]), 0.062  # left eyeball; u is mirrored for the right
+EYEBALL_RINGS, EYEBALL_SECTORS, EYEBALL_REACH = 11, 24, np.radians(112.0)
+LLOYD_STEPS = 40
+NECK_STRETCH = 1.6
+_U_OF_DEGREES = PchipInterpolator((0, 20, 45, 70, 90, 130, 180), (0.0, 0.25, 0.53, 0.745, 0.835, 0.92, 1.0))
+_HALF_WIDTH = PchipInterpolator((0.0, 0.70, 0.80, 0.88, 1.0), (0.492, 0.492, 0.45, 0.365, 0.2))
+
+
+class SkinChart:
+    """The one-to-one map between directions from `RAY_ORIGIN` and the UV square."""
+
+    def __init__(self) -> None:
+        longitude = np.radians(np.linspace(0.0, 180.0, 37))
+        latitude = np.radians(np.linspace(-84.0, -35.0, 90))
+        grid = cast(RAY_ORIGIN, _directions(*np.meshgrid(longitude, latitude, indexing="ij")).reshape(-1, 3))
+        grid = grid.reshape(37, 90, 3)
+        above_rim = grid[..., 1] + 155.0 + 0.27 * grid[..., 2]  # the neck ends in this plane
+        lowest = np.array([np.interp(0.0, row, latitude) for row in above_rim])
+        # A few cosines: an open end without the waves of the neck's tendons.
+        order = np.arange(4)
+        self._lowest_cosines = np.linalg.lstsq(np.cos(longitude[:, None] * order), lowest, rcond=None)[0]
+        marks = cast_front(np.stack((np.zeros(6), (-88.0, -47.5, -27.0, 22.0, 42.0, 92.0)), -1)) - RAY_ORIGIN
+        height = self._height(np.zeros(6), np.arctan2(marks[:, 1], marks[:, 2]))
+        self._v_of_height = PchipInterpolator(
+            (0.0, 0.065, *height, 1.0), (V_RIM, 0.08, 0.145, 0.315, 0.42, 0.625, 0.715, 0.86, V_CROWN)
+        )
+
+    def _lowest(self, longitude: np.ndarray) -> np.ndarray:
+        return np.cos(longitude[..., None] * np.arange(4)) @ self._lowest_cosines
+
+    def _height(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+        lowest = self._lowest(longitude)
+        return (latitude - lowest) / (np.pi / 2 - lowest)
+
+    def uv(self, points: np.ndarray) -> np.ndarray:
+        """UV [..., 2] of points [..., 3] in millimetres on the smooth head surface."""
+        d = points - RAY_ORIGIN
+        longitude = np.arctan2(d[..., 0], d[..., 2])
+        v = self._v_of_height(self._height(longitude, np.arctan2(d[..., 1], np.hypot(d[..., 0], d[..., 2]))))
+        across = np.sign(longitude) * _U_OF_DEGREES(np.degrees(np.abs(longitude)))
+        return np.stack((0.5 + across * _HALF_WIDTH(v), v), -1)
+
+    def neck_share(self, uv: np.ndarray) -> np.ndarray:
+        """0 above the jaw, 1 at the open end of the neck, for UV [..., 2]."""
+        return np.clip(1.0 - uv[..., 1] / 0.12, 0.0, 1.0)
+
+    def directions(self, uv: np.ndarray) -> np.ndarray:
+        """Unit directions [..., 3] from `RAY_ORIGIN` of UV [..., 2]."""
+        table = np.linspace(0.0, 1.0, 4001)
+        height = np.interp(uv[..., 1], self._v_of_height(table), table)
+        across = np.clip((uv[..., 0] - 0.5) / _HALF_WIDTH(uv[..., 1]), -1.0, 1.0)
+        longitude = np.radians(np.interp(np.abs(across), _U_OF_DEGREES(table * 180.0), table * 180.0))
+        lowest = self._lowest(longitude)
+        return _directions(np.sign(across) * longitude, lowest + height * (np.pi / 2 - lowest))
+
+
+def _directions(longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+    return np.stack((np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)), -1)
+
+
+class HeadMesh(NamedTuple):
+    """The neutral head in metres; UV vertices have their own indices, as in an OBJ file."""
+
+    vertices: np.ndarray  # float64 [V, 3]
+    faces: np.ndarray  # int32 [F, 3], counter-clockwise from outside
+    uvs: np.ndarray  # float64 [T, 2]
+    uv_faces: np.ndarray  # int32 [F, 3]
+    mirror: np.ndarray  # int64 [V], the vertex on the other side
+    eye_rings: np.ndarray  # int64 [2, R, K] left and right, innermost first
+    mouth_rings: np.ndarray  # int64 [2, R, K] left and right halves
+    ear_rings: np.ndarray  # int64 [2, R, K]
+    eyeballs: tuple[np.ndarray, np.ndarray]  # vertex indices, left and right
+    rim: np.ndarray  # vertex indices of the neck's open end
+
+
+def _spacing(points: np.ndarray) -> np.ndarray:
+    """Wanted edge length [N] in millimetres at surface points [N, 3] of the left half."""
+    on_nose = points - np.array([0.0, 0.0, 96.0])
+    on_nose[:, 1] -= np.clip(points[:, 1], -24.0, 10.0)
+    wanted = np.full(len(points), 10.0)
+    for offset, finest, reach in (
+        (on_nose, 2.4, 14.0),
+        (points - EYE_CENTRE, 3.2, 20.0),
+        (points - np.array([0.0, -47.5, 88.0]), 3.4, 32.0),
+        (points - np.array([76.0, 4.0, -11.0]), 5.0, 34.0),
+    ):
+        distance = np.linalg.norm(offset, axis=-1)
+        wanted = np.minimum(wanted, finest + 0.11 * np.maximum(distance - reach, 0.0))
+    return wanted
+
+
+def _along(line: np.ndarray) -> np.ndarray:
+    """Parameters in [0, 1] (both ends included) that put vertices at the wanted spacing on a polyline [N, 3]."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=-1) / _spacing(0.5 * (line[1:] + line[:-1]))
+    run = np.concatenate(([0.0], np.cumsum(steps)))
+    count = max(round(float(run[-1])), 1)
+    return np.interp(np.linspace(0.0, run[-1], count + 1), run, np.linspace(0.0, 1.0, len(line)))
+
+
+def _edge(chart: SkinChart, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """UV points [N, 2] along a straight line of the `across, v` coordinates, ends included."""
+
+    def at(t: np.ndarray) -> np.ndarray:
+        line = start + t[:, None] * (end - start)
+        return np.stack((0.5 + line[:, 0] * _HALF_WIDTH(line[:, 1]), line[:, 1]), -1)
+
+    dense = cast(RAY_ORIGIN, chart.directions(at(np.linspace(0.0, 1.0, 160))))
+    return at(_along(dense))
+
+
+def _inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which points [N, 2] are inside the closed polygon [K, 2] (even-odd rule)."""
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    y = points[:, None, 1]
+    crosses = (a[:, 1] > y) != (b[:, 1] > y)
+    slope = (b[:, 0] - a[:, 0]) / np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
+    return (crosses & (points[:, None, 0] < a[:, 0] + (y - a[:, 1]) * slope)).sum(1) % 2 == 1
+
+
+def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) -> np.ndarray:
+    """Vertices [N, 2] between the fixed ones: Lloyd's algorithm on surface samples weighted by the wanted density."""
+    side = np.linspace(0.0, 1.0, 190)
+    across, v = np.meshgrid(side, V_RIM + side * (V_CROWN - V_RIM))
+    uv = np.stack((0.5 + across * _HALF_WIDTH(v), v), -1)
+    points = cast(RAY_ORIGIN, chart.directions(uv.reshape(-1, 2))).reshape(*v.shape, 3)
+    centre = points[:-1, :-1] + points[1:, 1:] + points[:-1, 1:] + points[1:, :-1]
+    area = np.linalg.norm(np.cross(points[1:, 1:] - points[:-1, :-1], points[:-1, 1:] - points[1:, :-1]), axis=-1) / 2
+    samples = centre.reshape(-1, 3) / 4.0
+    weight = area.reshape(-1) / (0.5 * np.sqrt(3.0) * _spacing(samples) ** 2)
+    sample_uv = chart.uv(samples)
+    free = ~np.any([_inside(outline, sample_uv) for outline in outlines], axis=0)
+    samples, weight, sample_uv = samples[free], weight[free], sample_uv[free]
+
+    fixed = cast(RAY_ORIGIN, chart.directions(fixed_uv))
+    count = int(weight.sum() - 0.5 * len(fixed_uv) * 0.35)
+    generator = np.random.default_rng(5)
+    sites = samples[generator.choice(len(samples), count, replace=False, p=weight / weight.sum())]
+    for _ in range(LLOYD_STEPS):
+        _, nearest = KDTree(np.concatenate((fixed, sites))).query(samples)
+        nearest = nearest - len(fixed)
+        own = nearest >= 0
+        mass = np.bincount(nearest[own], weight[own], count)
+        moved = [np.bincount(nearest[own], weight[own] * samples[own, k], count) for k in range(3)]
+        sites = np.where(mass[:, None] > 0, np.stack(moved, -1) / np.maximum(mass, 1e-12)[:, None], sites)
+    return chart.uv(sites)
+
+
+def _ring_indices(rings: Rings, start: int) -> np.ndarray:
+    return start + np.arange(rings.position[..., 0].size).reshape(rings.position.shape[:2])
+
+
+def build_head_mesh() -> HeadMesh:
+    """The whole mesh; deterministic, about three seconds."""
+    chart = SkinChart()
+    features = (eye_rings(), mouth_rings(), ear_rings())
+    eye, mouth, ear = features
+    ring_uv = [chart.uv(r.chart) for r in features]
+    mouth_top, mouth_bottom = ring_uv[1][-1, 0, 1], ring_uv[1][-1, -1, 1]
+    edges = [
+        _edge(chart, np.array([0.0, V_RIM]), np.array([0.0, mouth_bottom]))[:-1],
+        _edge(chart, np.array([0.0, mouth_top]), np.array([0.0, V_CROWN]))[1:],
+        _edge(chart, np.array([0.0, V_RIM]), np.array([1.0, V_RIM]))[1:],
+        _edge(chart, np.array([1.0, V_RIM]), np.array([1.0, V_CROWN]))[1:-1],
+    ]
+    mouth_outline = np.concatenate((ring_uv[1][-1], [[0.4, mouth_bottom], [0.4, mouth_top]]))
+    outlines = [ring_uv[0][-1], mouth_outline, ring_uv[2][-1]]
+    fixed_uv = np.concatenate((*[r[-1] for r in ring_uv], *edges))
+    free_uv = np.concatenate((*edges, _fill(chart, fixed_uv, outlines)))
+    ring_index = [_ring_indices(eye, 0)]
+    ring_index.append(_ring_indices(mouth, ring_index[0].size))
+    ring_index.append(_ring_indices(ear, ring_index[0].size + ring_index[1].size))
+    uv = np.concatenate((*[r.reshape(-1, 2) for r in ring_uv], free_uv))
+    half = np.concatenate((*[r.position.reshape(-1, 3) for r in features], cast(RAY_ORIGIN, chart.directions(free_uv))))
+    uv[np.abs(uv[:, 0] - 0.5) < 1e-9, 0] = 0.5
+    half[uv[:, 0] == 0.5, 0] = 0.0
+
+    triangles = _triangulate(chart, uv)
+    centroid = uv[triangles].mean(1)
+    slit = ring_uv[1][0]
+    hole = _inside(ring_uv[0][0], centroid) | _inside(
+        np.concatenate((slit, [[0.4, slit[-1, 1]], [0.4, slit[0, 1]]])), centroid
+    )
+    return _assemble(uv, half, triangles[~hole], ring_index)
+
+
+def _triangulate(chart: SkinChart, uv: np.ndarray) -> np.ndarray:
+    """Delaunay triangles [F, 3] of the left half on a stereographic disc, where angles are nearly those of the surface.
+
+    Seen from `RAY_ORIGIN` the neck is foreshortened; it is drawn out first, in Mercator's latitude.
+    """
+    d = chart.directions(uv)
+    latitude = np.arcsin(np.clip(d[:, 1], -1.0, 1.0))
+    mercator = np.arcsinh(np.tan(np.clip(latitude, -1.55, 1.55))) - NECK_STRETCH * chart.neck_share(uv)
+    stretched = np.where(chart.neck_share(uv) > 0, np.arctan(np.sinh(mercator)), latitude)
+    d = _directions(np.arctan2(d[:, 0], d[:, 2]), stretched)
+    triangles = Delaunay(d[:, 1:] / (1.0 + d[:, :1])).simplices
+    a, b, c = (d[triangles[:, k]] for k in range(3))
+    outwards = (np.cross(b - a, c - a) * (a + b + c)).sum(-1)
+    triangles = np.where(outwards[:, None] > 0, triangles, triangles[:, ::-1])[np.abs(outwards) > 1e-9]
+    rim = np.abs(uv[:, 1] - V_RIM) < 1e-9
+    return triangles[rim[triangles].sum(1) < 3]
+
+
+def _assemble(uv: np.ndarray, half: np.ndarray, triangles: np.ndarray, rings: list[np.ndarray]) -> HeadMesh:
+    """Mirror the left half, join it along the midline and the back seam, give the crown its UVs, add the eyeballs."""
+    n = len(half)
+    on_midline = uv[:, 0] == 0.5
+    on_seam = np.abs(uv[:, 0] - 0.5 - _HALF_WIDTH(uv[:, 1])) < 1e-9
+    half[on_seam, 0] = 0.0
+    right = np.where(on_midline | on_seam, np.arange(n), n + np.arange(n))
+    right_uv = np.where(on_midline, np.arange(n), n + np.arange(n))
+
+    # All longitudes meet in the crown: each of its triangles gets a UV vertex of its own, above its other two.
+    crown = int(np.flatnonzero(on_midline & (np.abs(uv[:, 1] - V_CROWN) < 1e-9))[0])
+    uv_triangles, extra = triangles.copy(), []
+    for f in np.flatnonzero((triangles == crown).any(1)):
+        others = uv[triangles[f][triangles[f] != crown]]
+        across = ((others[:, 0] - 0.5) / _HALF_WIDTH(others[:, 1])).mean()
+        uv_triangles[f][triangles[f] == crown] = 2 * n + len(extra)
+        extra.append((0.5 + across * float(_HALF_WIDTH(V_CROWN)), V_CROWN))
+    extra_uv = np.array(extra)
+    right_uv = np.concatenate((right_uv, np.full(n, -1), 2 * n + len(extra) + np.arange(len(extra))))
+
+    faces = np.concatenate((triangles, right[triangles][:, ::-1]))
+    uv_faces = np.concatenate((uv_triangles, right_uv[uv_triangles][:, ::-1]))
+    points = np.concatenate((half, half * np.array([-1.0, 1.0, 1.0])))
+    flipped = np.array([-1.0, 1.0])
+    uvs = np.concatenate((uv, uv * flipped + [1.0, 0.0], extra_uv, extra_uv * flipped + [1.0, 0.0]))
+    mirror = np.concatenate((right, np.arange(n)))
+
+    ball, ball_uv, ball_faces = _eyeball()
+    eyeballs = []
+    for flip in (1.0, -1.0):
+        start, uv_start = len(points), len(uvs)
+        points = np.concatenate((points, (ball + EYE_CENTRE) * np.array([flip, 1.0, 1.0])))
+        placed = EYE_DISC_CENTRE + EYE_DISC_RADIUS * ball_uv
+        uvs = np.concatenate((uvs, placed if flip > 0 else placed * flipped + [1.0, 0.0]))
+        order = ball_faces if flip > 0 else ball_faces[:, ::-1]
+        faces, uv_faces = np.concatenate((faces, order + start)), np.concatenate((uv_faces, order + uv_start))
+        eyeballs.append(np.arange(start, start + len(ball)))
+    mirror = np.concatenate((mirror, eyeballs[1], eyeballs[0]))
+
+    used, faces = np.unique(faces, return_inverse=True)
+    new = np.full(len(points), -1)
+    new[used] = np.arange(len(used))
+    used_uv, uv_faces = np.unique(uv_faces, return_inverse=True)
+    bottom = np.flatnonzero(np.abs(uv[:, 1] - V_RIM) < 1e-9)
+    eye, mouth, ear = (np.stack((new[r], new[right[r]])) for r in rings)
+    return HeadMesh(
+        vertices=points[used] * 1e-3,
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        uvs=uvs[used_uv],
+        uv_faces=uv_faces.reshape(-1, 3).astype(np.int32),
+        mirror=new[mirror[used]],
+        eye_rings=eye,
+        mouth_rings=mouth,
+        ear_rings=ear,
+        eyeballs=(new[eyeballs[0]], new[eyeballs[1]]),
+        rim=np.unique(new[np.concatenate((bottom, right[bottom]))]),
+    )
+
+
+def _eyeball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices [N, 3] in millimetres about the centre, disc UV in the unit circle and faces; the pupil is at +z."""
+    polar = EYEBALL_REACH * (np.arange(1, EYEBALL_RINGS + 1) / EYEBALL_RINGS)
+    turn = np.arange(EYEBALL_SECTORS) * (2 * np.pi / EYEBALL_SECTORS)
+    p, t = np.meshgrid(polar, turn, indexing="ij")
+    rim = np.stack((np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)), -1).reshape(-1, 3)
+    points = np.concatenate(([[0.0, 0.0, 1.0]], rim)) * EYE_RADIUS
+    disc = np.concatenate(([[0.0, 0.0]], np.stack((p * np.cos(t), p * np.sin(t)), -1).reshape(-1, 2) / EYEBALL_REACH))
+    faces = []
+    for s in range(EYEBALL_SECTORS):
+        s1 = (s + 1) % EYEBALL_SECTORS
+        faces.append((0, 1 + s, 1 + s1))
+        for r in range(EYEBALL_RINGS - 1):
+            a, b = 1 + r * EYEBALL_SECTORS + s, 1 + r * EYEBALL_SECTORS + s1
+            c, d = a + EYEBALL_SECTORS, b + EYEBALL_SECTORS
+            faces += [(a, c, d), (a, d, b)]
+    return points, disc, np.array(faces)
