@@ -16,7 +16,7 @@ import torch
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
-from avatar.types import Camera, HeadParams
+from avatar.types import IDENTITY_6D, Camera, HeadParams
 
 ROWS, COLUMNS = 24, 32  # of the latitude-longitude grid
 RADII = np.array([0.075, 0.11, 0.09])  # metres; x right, y up, z to the front, as in FLAME
@@ -123,15 +123,17 @@ def render(head: HeadModel, content: dict, width: int, height: int) -> tuple[np.
     """uint8 image [H, W, 3], head mask and mouth mask [H, W] in {0, 1} of the posed head."""
     flame, opencv = ({k: torch.from_numpy(v[0]) for k, v in content[part].items()} for part in ("flame", "opencv"))
     K = opencv["K"]
-    camera = Camera(opencv["R"], opencv["t"], *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), width, height)
-    params = HeadParams(flame["exp"], flame["jaw"], flame["eyes"], flame["eyelids"], torch.tensor([1.0, 0, 0, 0, 1, 0]))
+    fx, fy, cx, cy = K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()
+    camera = Camera(opencv["R"], opencv["t"], fx, fy, cx, cy, width, height)
+    neck = torch.tensor(IDENTITY_6D)
+    params = HeadParams(flame["exp"], flame["jaw"], flame["eyes"], flame["eyelids"], neck)
     vertices = head.vertices(params)
     faces = head.faces.numpy()
     raster = rasterize_mesh(camera.project(vertices).numpy(), faces, height, width)
     covered = raster.face_id >= 0
     lips = head.assets.regions["lips"].numpy()
     eyes = np.concatenate([head.assets.regions[f"{side}_eyeball"].numpy() for side in ("left", "right")])
-    is_lip, is_eye = (np.isin(faces, region).all(1)[raster.face_id] & covered for region in (lips, eyes))
+    is_lip, is_eye = (covered & np.all(np.isin(faces, region), 1)[raster.face_id] for region in (lips, eyes))
     corners = vertices.numpy()[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12

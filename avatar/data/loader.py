@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
@@ -66,7 +66,7 @@ class FrameLoader:
         """One frame, decoded now if the cache does not hold it."""
         return next(self.frames((index,)))
 
-    def frames(self, indices: Iterable[int]) -> Iterator[Frame]:
+    def frames(self, indices: Iterable[int]) -> Generator[Frame, None, None]:
         """The frames of `indices`, which may be endless, in that order; a few of them are decoded ahead.
 
         A frame that cannot be decoded raises its UserError when its turn comes.

@@ -36,6 +36,7 @@ _NAMES = {
     "copyreg._reconstructor",
     "builtins.object",
     "builtins.set",
+    "builtins.bytes",
     "builtins.bytearray",
     "collections.OrderedDict",
     "torch._utils._rebuild_tensor_v2",
@@ -113,7 +114,7 @@ class PickleMachine:
             if opcode.name == "STOP":
                 (value,) = self.stack
                 return value
-            if opcode.name == "STRING":  # pickletools reads ASCII only; Python 2 wrote arrays this way
+            if opcode.name == "STRING":  # pickletools takes ASCII only; Python 2 wrote arrays this way
                 argument = _read_python2_string(self.stream)
             else:
                 argument = opcode.arg.reader(self.stream) if opcode.arg is not None else None
@@ -213,6 +214,8 @@ class PickleMachine:
             return _new_instance(arguments[0], ())
         if name == "builtins.set" and len(arguments) <= 1:
             return {_checked_key(item) for item in _typed(arguments[0] if arguments else [], list)}
+        if name == "builtins.bytes" and not arguments:  # protocols below 3 write empty bytes so
+            return b""
         if name == "builtins.bytearray" and len(arguments) == 1:
             raw = _typed(arguments[0], bytes)
             self.budget.take(len(raw))
