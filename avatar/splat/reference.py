@@ -18,7 +18,7 @@ from torch.utils.checkpoint import checkpoint
 from avatar.splat.sh import sh_colours
 from avatar.types import Camera, Gaussians, Rendering
 
-MAX_EVALUATIONS = 1 << 22  # splats times pixels held at once
+MAX_EVALUATIONS = 1 << 18  # splats times pixels held at once
 
 
 class Projected(NamedTuple):
@@ -47,7 +47,7 @@ def splat_reference(
     blur: float,
     near: float,
     antialiased: bool,
-    block: int = 32,
+    block: int = 16,
 ) -> Rendering:
     """`avatar.splat.splat` without its checks, computed in float64 on the tensors' device, returned in their dtype.
 
@@ -198,6 +198,8 @@ def _composite(
     stopped: Bool[Tensor, " P"] = torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)
     step = max(1, MAX_EVALUATIONS // len(pixels))
     for start in range(0, len(means), step):
+        if stopped.all():
+            break
         part = slice(start, start + step)
         d = pixels[None] - means[part, None]  # [m, P, 2]
         a, b, c = whitening[part, None].unbind(-1)

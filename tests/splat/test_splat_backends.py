@@ -25,9 +25,7 @@ from avatar.types import Gaussians
 
 SMALL = {
     "random": Scene(random_gaussians(25), camera(17, 13)),
-    "off-centre, anisotropic": Scene(
-        random_gaussians(20, seed=1, anisotropy=1.5), camera(14, 18, centre=(-0.2, 0.9))
-    ),
+    "off-centre, anisotropic": Scene(random_gaussians(20, seed=1, anisotropy=1.5), camera(14, 18, centre=(-0.2, 0.9))),
     "opaque": Scene(random_gaussians(40, seed=2)._replace(opacities=torch.ones(40)), camera(12, 12)),
     "beyond the Jacobian's clamp": Scene(
         random_gaussians(40, seed=3, spread=1.0, size=0.2), replace(camera(16, 12), fx=6.0, fy=5.0)
