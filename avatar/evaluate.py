@@ -121,6 +121,7 @@ def evaluate(
         "config": run.config.to_dict(),
         "versions": versions(),
         "shared_choices": SHARED_CHOICES,
+        "notes": background_notes(chosen, data.background),
         "protocols": {
             protocol.name: summarise(protocol, results[protocol.name], networks[protocol.lpips_net])
             for protocol in chosen
@@ -133,6 +134,17 @@ def evaluate(
     say(table(summary))
     say(f"Results  {path}\nVideo    {video}")
     return path
+
+
+def background_notes(protocols: Sequence[Protocol], trained: Sequence[float]) -> list[str]:
+    """A warning for each protocol that shows the avatar over another background than its training did."""
+    return [
+        f"{protocol.name} draws over {protocol.background}, the avatar was trained over {tuple(trained)}: where it has "
+        "learned to let its background through, the other colour shines through and counts as error; train with "
+        f"'data.background={list(BACKGROUNDS[protocol.background])}' to compare by this protocol"
+        for protocol in protocols
+        if tuple(trained) != BACKGROUNDS[protocol.background]
+    ]
 
 
 def find_networks(protocols: Sequence[Protocol]) -> dict[Net, ChosenLpips]:

