@@ -26,20 +26,7 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[UInt8[np.ndarray,
     An odd size gets one more row or column, a copy of the last. The file appears under its name when the block ends
     without an exception. Raises UserError for no frames, another size on the way, or an encoder that fails.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    encoder = imageio.get_writer(
-        partial,
-        format="FFMPEG",  # type: ignore[arg-type]
-        mode="I",
-        fps=fps,
-        codec="libx264",
-        pixelformat="yuv420p",
-        quality=None,
-        macro_block_size=1,
-        ffmpeg_log_level="error",
-        output_params=["-crf", "17", "-movflags", "+faststart"],
-    )
     shape: tuple[int, ...] | None = None
 
     def add(frame: UInt8[np.ndarray, "H W 3"]) -> None:
@@ -51,19 +38,43 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[UInt8[np.ndarray,
             raise UserError(f"{path} cannot hold a frame of {now} pixels after frames of {was}")
         shape = frame.shape
         odd = ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0))
-        encoder.append_data(np.pad(frame, odd, mode="edge"))
+        with _failing_as_user_error(path):
+            encoder.append_data(np.pad(frame, odd, mode="edge"))
 
+    with _failing_as_user_error(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        encoder = imageio.get_writer(
+            partial,
+            format="FFMPEG",  # type: ignore[arg-type]
+            mode="I",
+            fps=fps,
+            codec="libx264",
+            pixelformat="yuv420p",
+            quality=None,
+            macro_block_size=1,
+            ffmpeg_log_level="error",
+            output_params=["-crf", "17", "-movflags", "+faststart"],
+        )
     try:
         yield add
-        encoder.close()
         if shape is None:
             raise UserError(f"there is no frame to write to {path}")
-        partial.replace(path)
-    except OSError as error:  # imageio raises it too when the encoder ends early
-        raise UserError(f"the video {path} cannot be written ({str(error).strip().splitlines()[0]})") from error
+        with _failing_as_user_error(path):
+            encoder.close()
+            partial.replace(path)
     finally:
         encoder.close()
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def _failing_as_user_error(path: Path) -> Iterator[None]:
+    """imageio raises OSError when the encoder ends early and RuntimeError when there is none."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise UserError(f"the video {path} cannot be written ({reason})") from error
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: float) -> None:

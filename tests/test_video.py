@@ -67,9 +67,24 @@ def test_an_encoder_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytest
     broken.write_text('#!/bin/sh\nif [ "$1" = -version ]; then echo ffmpeg version 7; exit 0; fi\nexit 1\n')
     broken.chmod(0o755)
     monkeypatch.setattr("imageio_ffmpeg._io.get_ffmpeg_exe", lambda: str(broken))
-    with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written"):
+    with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \("):
         write_video(path, gradients(200, 64, 64), fps=25)
     assert not path.exists()
+
+
+def test_a_folder_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \(.*(Not a directory|File exists)"):
+        write_video(tmp_path / "file" / "clip.mp4", gradients(1, 32, 32), fps=25)
+
+
+def test_errors_of_the_caller_are_not_blamed_on_the_video(tmp_path: Path) -> None:
+    def failing() -> Iterator[np.ndarray]:
+        yield from gradients(1, 32, 32)
+        raise RuntimeError("the renderer broke")
+
+    with pytest.raises(RuntimeError, match="the renderer broke"):
+        write_video(tmp_path / "clip.mp4", failing(), fps=25)
 
 
 def test_pictures_stand_side_by_side_under_captions() -> None:
