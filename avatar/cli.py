@@ -16,8 +16,7 @@ EXIT_INTERRUPTED = 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status. A UserError is printed as its sentence, without a stack trace."""
-    parser = build_parser()
-    arguments = parser.parse_args(argv)
+    arguments = parse(argv)
     try:
         # The commands import torch and the compiled core; --help must answer without them.
         from avatar import commands
@@ -29,6 +28,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("avatar: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments of one command. `key=value` overrides may stand anywhere among train's options.
+
+    Exits with status 2 and the usage, as argparse does, on anything that it does not know.
+    """
+    parser = build_parser()
+    arguments, rest = parser.parse_known_args(argv)
+    unknown = [word for word in rest if word.startswith("-") or "=" not in word]
+    if arguments.command != "train":
+        unknown = rest
+    if unknown:
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    if arguments.command == "train":
+        arguments.overrides += rest
+    return arguments
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -13,7 +13,14 @@ from typing import Any
 import torch
 
 import avatar
-from avatar.checkpoint import Checkpoint, load_module, newest_checkpoint, read_run_info, write_run_info
+from avatar.checkpoint import (
+    Checkpoint,
+    list_checkpoints,
+    load_module,
+    newest_checkpoint,
+    read_run_info,
+    write_run_info,
+)
 from avatar.config import Config, config_from_dict
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
@@ -50,6 +57,7 @@ class Run:
 
 def find_head(folder: Path, given: Path | None = None) -> Path:
     """The head model of a subject: the one given, else FOLDER/head_model, else $AVATAR_HEAD; UserError otherwise."""
+    check_folder(folder)
     if given is not None:
         return given
     if (folder / "head_model").is_dir():
@@ -62,12 +70,16 @@ def find_head(folder: Path, given: Path | None = None) -> Path:
     )
 
 
+def check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give the tracked video folder (with imgs/ and checkpoint/)")
+
+
 def open_subject(
     source: Source, config: Config | None, say: Callable[[str], None], assets: HeadAssets | None = None
 ) -> tuple[Subject, HeadAssets]:
     """Prepare the subject (from the cache when nothing changed) and open it with its head model."""
-    if not source.folder.is_dir():
-        raise UserError(f"{source.folder} is not a folder; give the tracked video folder (with imgs/ and checkpoint/)")
+    check_folder(source.folder)
     assets = assets or load_head_assets(source.head)
     sizes = SplitSizes() if config is None else SplitSizes(config.data.train_frames, config.data.test_frames)
     prepared = prepare(
@@ -83,8 +95,8 @@ def open_subject(
 
 
 def start_run(path: Path, source: Source, config: Config, subject: Subject) -> None:
-    """Write RUN/run.json. Raises UserError when the folder holds a run already: nothing is overwritten."""
-    if (path / "run.json").exists():
+    """Write RUN/run.json. Raises UserError when the folder holds a trained run already: nothing is overwritten."""
+    if list_checkpoints(path / "checkpoints"):
         raise UserError(f"{path} holds a run already: add --resume to go on with it, or choose another --out")
     write_run_info(
         path,

@@ -1,0 +1,225 @@
+"""The command line as a user meets it: judged by output, exit status and files."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+from small_runs import SMALL
+from tracked_folder import write_tracked_folder
+
+from avatar.checkpoint import list_checkpoints, newest_checkpoint
+from avatar.cli import main
+
+QUICK = [*SMALL, "trainer.iterations=16"]
+
+
+def avatar(*arguments: object, status: int = 0) -> str:
+    """Run `avatar ...` in this process; returns stdout and stderr together after checking the exit status."""
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+        try:
+            returned = main([str(argument) for argument in arguments])
+        except SystemExit as stop:  # argparse: --help, --version, usage
+            returned = int(stop.code or 0)
+    assert returned == status, output.getvalue()
+    return output.getvalue()
+
+
+@pytest.fixture(scope="module")
+def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    output = avatar("train", tracked_folder, "--out", run, "--frame-offset", 1, "--size", 40, "--seed", 3, *QUICK)
+    assert "16/16" in output and "loss=" in output and "psnr=" in output
+    assert f"avatar eval {run}" in output
+    return run
+
+
+def test_help_and_version_answer_for_every_command() -> None:
+    overview = avatar("--help")
+    for command in ("train", "eval", "reenact", "prepare", "demo-data", "demo", "doctor"):
+        assert command in overview
+        assert "usage: avatar" in avatar(command, "--help")
+    assert avatar("--version").startswith("avatar ")
+
+
+def test_doctor_says_what_works() -> None:
+    output = avatar("doctor")
+    assert "compiled core    draws" in output and "ffmpeg" in output and "AVATAR_HEAD is not set" in output
+
+
+def test_what_training_was_made_from_is_recorded(trained: Path, tracked_folder: Path) -> None:
+    info = json.loads((trained / "run.json").read_text())
+    assert info["folder"] == str(tracked_folder) and info["frame_offset"] == 1
+    assert info["config"]["data"]["size"] == 40 and info["config"]["trainer"]["seed"] == 3
+    assert len(info["data_hash"]) == len(info["head_fingerprint"]) == 64
+
+
+def test_eval_prints_the_table_and_writes_what_it_says(trained: Path) -> None:
+    output = avatar("eval", trained, "--frames")
+    results = json.loads((trained / "eval" / "results.json").read_text())
+    for name in ("hypergaussians", "flashavatar", "insta350"):
+        assert name in output
+        entry = results["protocols"][name]
+        assert f"{entry['means']['psnr']:.2f}" in output
+        rows = list(csv.DictReader((trained / "eval" / name / "frames.csv").open()))
+        assert [row["name"] for row in rows] == entry["frames"]
+        assert len(list((trained / "eval" / name / "renders").glob("*.png"))) == len(rows)
+    video = trained / "eval" / "truth_render_error.mp4"
+    assert str(video) in output
+    assert len(iio.imread(video)) == 6  # 20% of 30 frames
+    assert "hypergaussians" in avatar("eval", trained, "--protocol", "hypergaussians")
+
+
+@pytest.mark.parametrize("transfer", ["raw", "relative", "mean"])
+@pytest.mark.parametrize("camera", ["driver", "target"])
+def test_reenact_gives_as_many_frames_as_the_driver_has(
+    trained: Path, tmp_path: Path, transfer: str, camera: str
+) -> None:
+    driver = write_tracked_folder(tmp_path / "driver", frames=8, size=48, seed=5)
+    options = ("--transfer", transfer, "--camera", camera, "--frame-offset", 1)
+    output = avatar("reenact", trained, "--driver", driver, *options)
+    video = trained / "reenact" / f"driver-{transfer}.mp4"
+    assert str(video) in output
+    frames = iio.imread(video)
+    assert len(frames) == 8
+    assert ("Neutral expression: frame" in output) == (transfer == "relative")
+    render = frames[:, :, frames.shape[2] // 2 :]
+    assert render.reshape(8, -1).std(axis=1).min() > 5, "the render is empty"
+
+
+def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
+    tracked_folder: Path, tmp_path: Path
+) -> None:
+    """Killed without warning and resumed, the run ends with the bits of one that was never disturbed."""
+    options = ["--frame-offset", "1", *SMALL, "trainer.iterations=60", "trainer.checkpoint_every=5"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    avatar("train", tracked_folder, "--out", whole, *options)
+    command = [sys.executable, "-m", "avatar.cli", "train", str(tracked_folder), "--out", str(killed), *options]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list_checkpoints(killed / "checkpoints") and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    step = newest_checkpoint(killed).step
+    assert step < 60
+
+    output = avatar("train", tracked_folder, "--out", killed, "--resume")
+    assert f"Resuming {killed} at step {step} of 60" in output
+    a, b = newest_checkpoint(whole), newest_checkpoint(killed)
+    assert a.step == b.step == 60
+    assert all(torch.equal(a.tensors[name], b.tensors[name]) for name in a.tensors)
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tracked_folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    options = ["--frame-offset", "1", *SMALL, "trainer.iterations=100000", "trainer.checkpoint_every=100000"]
+    command = [sys.executable, "-m", "avatar.cli", "train", str(tracked_folder), "--out", str(run), *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not list((run / "previews").glob("*.png")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130
+    step = newest_checkpoint(run).step
+    assert f"Interrupted at step {step}" in output and "Add --resume" in output
+
+
+def fresh_copy(trained: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+MISTAKES = {
+    "no such folder": (["train", "{tmp}/nothing"], "nothing is not a folder; give the tracked video folder"),
+    "no head model": (["train", "{tmp}"], "no head model for {tmp}: give --head PATH, or set AVATAR_HEAD"),
+    "head model gone": (["train", "{data}", "--head", "{tmp}/x.pkl"], "x.pkl does not exist; give --head"),
+    "unknown key": (["train", "{data}", "trainer.iteration=5"], "the nearest is 'trainer.iterations'"),
+    "bad size": (["train", "{data}", "--size", "3"], "data.size=3 is out of range"),
+    "no iterations": (["train", "{data}", "--iterations", "0"], "trainer.iterations=0 is out of range"),
+    "run exists": (["train", "{data}", "--out", "{run}"], "holds a run already: add --resume"),
+    "nothing to resume": (["train", "{data}", "--out", "{tmp}/new", "--resume"], "holds no checkpoint"),
+    "resume with another key": (
+        ["train", "{data}", "--out", "{run}", "--resume", "model.latent_dim=4"],
+        "began with model.latent_dim=8, not 4",
+    ),
+    "resume of other data": (["train", "{tmp}", "--out", "{run}", "--resume"], "choose another --out"),
+    "eval of no run": (["eval", "{tmp}"], "is not a run folder: it has no run.json"),
+    "eval with another head": (["eval", "{run}", "--head", "{other}/head_model"], "trained with another head model"),
+    "unknown protocol": (["eval", "{run}", "--protocol", "paper"], "paper"),
+    "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody is not a folder"),
+    "driver of another head": (
+        ["reenact", "{run}", "--driver", "{other}", "--frame-offset", "1"],
+        "was tracked with another head model",
+    ),
+    "LPIPS without weights": (
+        ["train", "{data}", "--frame-offset", "1", "--out", "{tmp}/l", "trainer.perceptual=lpips", *QUICK],
+        "fetch it by other means to",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def other_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A driver whose head model has another expression basis."""
+    return write_tracked_folder(tmp_path_factory.mktemp("other") / "other", frames=6, size=48, expressions=12)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_gets_one_sentence_and_a_status(
+    mistake: str,
+    trained: Path,
+    tracked_folder: Path,
+    other_head: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arguments, sentence = MISTAKES[mistake]
+    places = {"tmp": tmp_path, "data": tracked_folder, "run": trained, "other": other_head}
+    for proxy in ("https_proxy", "http_proxy"):
+        monkeypatch.setenv(proxy, "http://127.0.0.1:1")  # no download can succeed
+    output = avatar(*(a.format(**places) for a in arguments), status=1)
+    assert sentence.format(**places) in output
+    assert output.strip().splitlines()[-1].startswith("avatar: ")
+
+
+def test_a_run_without_a_checkpoint_is_not_evaluated(trained: Path, tmp_path: Path) -> None:
+    run = fresh_copy(trained, tmp_path)
+    shutil.rmtree(run / "checkpoints")
+    assert "holds no checkpoint; train first" in avatar("eval", run, status=1)
+
+
+def test_a_damaged_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:
+    run = fresh_copy(trained, tmp_path)
+    newest = list_checkpoints(run / "checkpoints")[-1]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    assert f"{newest.name} is damaged" in avatar("eval", run, status=1)
+    newest.unlink()
+    assert "hypergaussians" in avatar("eval", run)  # the one before is whole
+
+
+def test_data_that_changed_since_training_is_noticed(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "someone", frames=12, size=48)
+    run = tmp_path / "run"
+    avatar("train", folder, "--out", run, "--frame-offset", 1, *SMALL, "trainer.iterations=2")
+    image = folder / "imgs" / "00003.jpg"
+    image.write_bytes((folder / "imgs" / "00004.jpg").read_bytes())
+    assert "data of someone has changed since" in avatar("eval", run, status=1)
+
+
+def test_prepare_says_what_it_found(tracked_folder: Path, tmp_path: Path) -> None:
+    output = avatar("prepare", tracked_folder, "--out", tmp_path / "prepared")
+    assert "image offset 1" in output and "30 frames of 48x48, 24 to train, 6 to test" in output
+    assert (tmp_path / "prepared" / "manifest.json").is_file()
