@@ -71,7 +71,9 @@ def scenes(draw: st.DrawFn, *, poison: bool) -> Scene:
     else:
         depth = torch.from_numpy(rng.uniform(0.5, 3.0, (count, 1)).astype(F32))
         middle = torch.tensor([camera.width / 2 - camera.cx, camera.height / 2 - camera.cy]) / camera.fx
-        spread = torch.from_numpy(rng.normal(size=(count, 2)).astype(F32)) * max(camera.width, camera.height) / camera.fx
+        spread = (
+            torch.from_numpy(rng.normal(size=(count, 2)).astype(F32)) * max(camera.width, camera.height) / camera.fx
+        )
         in_camera = torch.cat(((middle + 0.5 * spread) * depth, depth), dim=1)
         pixel = 1 / camera.fx
         gaussians = Gaussians(
@@ -94,7 +96,7 @@ def test_random_scenes_agree_with_the_reference(scene: Scene) -> None:
     with torch.no_grad():
         found, expected = render(scene), render(in_float64(scene), "reference")
     scale = 1 + expected.image.abs().max()
-    allowed = 1e-5 * scale + torch.where(ambiguous, jump, 0.0)
+    allowed = 1e-5 * scale + torch.where(ambiguous, 1.001 * jump, 0.0)
     assert ((found.image - expected.image).abs().amax(-1) <= allowed).all()
     assert ((found.alpha - expected.alpha).abs() <= allowed).all()
 
@@ -114,11 +116,11 @@ def test_poison_values_give_the_reference_s_image_and_finite_gradients(scene: Sc
     assert torch.isfinite(found.image).all()
     assert ((found.alpha >= 0) & (found.alpha <= 1)).all()
     ambiguous, jump = ambiguous_pixels(scene)
-    # Colours of 1e30 make the background and all else invisible to float32, so errors are relative to the largest value.
-    scale = 1 + expected.image.abs().max()
-    assert ((found.alpha - expected.alpha).abs() <= 1e-5 + torch.where(ambiguous, jump, 0.0)).all()
+    # What float32 can promise is the weight of each colour, so with colours of 1e30 errors are in units of those.
+    scale = 1 + (scene.gaussians.sh.abs().max().item() if scene.gaussians.sh.numel() else 0.0)
+    assert ((found.alpha - expected.alpha).abs() <= 1e-5 + torch.where(ambiguous, 1.001 * jump, 0.0)).all()
     error = (found.image - expected.image).abs().amax(-1)
-    assert (error <= 1e-5 * scale + torch.where(ambiguous, jump, 0.0)).all()
+    assert (error <= 1e-5 * scale + torch.where(ambiguous, 1.001 * jump, 0.0)).all()
     for grad in gradients(scene, "cpu", torch.ones_like(found.image), torch.ones_like(found.alpha)).values():
         assert not grad.isnan().any()
 

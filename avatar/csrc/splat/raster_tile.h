@@ -75,7 +75,7 @@ struct Step {
         const Ints hit = alpha >= alpha_min, enough = next >= t_min;
         drawn = hit & enough;
         const Ints kept = (Ints)(drawn ? next : before);
-        after = (Floats)(kept | ((hit & ~enough) & Ints{} - 0x7fffffff - 1));
+        after = (Floats)(kept | (hit & ~enough & sign_bits()));
     }
 };
 

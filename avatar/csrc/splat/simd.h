@@ -24,6 +24,7 @@ typedef int Ints __attribute__((vector_size(kLanes * sizeof(int))));
 inline Floats load(const float* p) { return *reinterpret_cast<const Floats*>(p); }  // p aligned
 inline void store(float* p, Floats v) { *reinterpret_cast<Floats*>(p) = v; }        // p aligned
 inline Floats broadcast(float x) { return x - Floats{}; }
+inline Ints sign_bits() { return Ints{} - 0x7fffffff - 1; }
 inline Floats iota() {
     Floats v{};
     for (int i = 0; i < kLanes; ++i) v[i] = float(i);
@@ -43,9 +44,10 @@ inline Floats fma(Floats a, Floats b, Floats c) {
 #endif
 }
 
+// GCC makes one instruction of the comparison for AVX-512 (and warns of its own header's _mm512_min_ps), not for the others.
 inline Floats min(Floats a, Floats b) {
 #if defined(__AVX512F__)
-    return (Floats)_mm512_min_ps((__m512)a, (__m512)b);
+    return a < b ? a : b;
 #elif defined(__AVX2__)
     return (Floats)_mm256_min_ps((__m256)a, (__m256)b);
 #elif defined(__SSE2__)
@@ -57,7 +59,7 @@ inline Floats min(Floats a, Floats b) {
 
 inline Floats max(Floats a, Floats b) {
 #if defined(__AVX512F__)
-    return (Floats)_mm512_max_ps((__m512)a, (__m512)b);
+    return a > b ? a : b;
 #elif defined(__AVX2__)
     return (Floats)_mm256_max_ps((__m256)a, (__m256)b);
 #elif defined(__SSE2__)
@@ -90,11 +92,12 @@ inline float sum(Floats v) {
     return v[0];
 }
 
-// 2^x for x in [-126, 0] (below, 2^-126): relative error below 1.6e-7, and exactly 1 at 0. The polynomial has the least
-// largest relative error to 2^f on [-1/2, 1/2] (9.2e-8, before rounding) among those of degree 5 with constant term 1.
+// 2^x for x <= 0: relative error below 1.6e-7 down to x = -126, exactly 1 at 0 and exactly 0 from -127 on. The polynomial
+// has the least largest relative error to 2^f on [-1/2, 1/2] (9.2e-8, before rounding) among those of degree 5 with
+// constant term 1.
 inline Floats exp2_negative(Floats x) {
     const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to the nearest integer
-    x = max(x, broadcast(-126.0f));
+    x = max(x, broadcast(-127.0f));
     const Floats shifted = x + magic;
     const Floats f = x - (shifted - magic);
     Floats p = broadcast(1.326470869e-3f);
