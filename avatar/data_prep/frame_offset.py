@@ -3,7 +3,7 @@
 Extraction tools number images from 0 or 1 and some drop the first frame, so image = tracking + offset with an offset
 that has to be found. The mesh never fits the masks exactly (hair, clothes, mask conventions), so the overlap at one
 instant says little; what it misses depends on the pose, though, and is fitted and taken out. What remains is large
-when the two clocks differ.
+when the two clocks differ. Where the masks do not decide, the motion in the images does (`image_motion`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from avatar.data.images import read_mask
+from avatar.data_prep.image_motion import motion_residuals
 from avatar.data_prep.metrical_tracker import FrameTrack
 from avatar.data_prep.projection import filled_lips, project_head, region_faces, silhouette
 from avatar.errors import UserError
@@ -33,6 +34,8 @@ _CLIP = 9.0  # squared, in units of the best offset's own misfit: one bad mask m
 _MASK_ON = 127
 _CERTAIN = 100.0  # standard errors; noise-free data would print astronomical ones
 
+Residuals = dict[int, dict[int, np.ndarray]]  # offset -> tracking frame -> one value per feature
+
 
 @dataclass(frozen=True)
 class OffsetEstimate:
@@ -42,15 +45,16 @@ class OffsetEstimate:
     head_overlap: float | None  # mean IoU of head mask and mesh at this offset, None without head masks
     mouth_overlap: float | None
     frames: int
+    used_images: bool  # whether the images' motion had to decide
 
     def sentence(self) -> str:
-        overlaps = [
+        evidence = [
             f"{name} overlap {value:.3f}"
             for name, value in (("head", self.head_overlap), ("mouth", self.mouth_overlap))
             if value is not None
-        ]
+        ] + ["from the motion in the images"] * self.used_images
         return (
-            f"image offset {self.offset} (image number = tracking number {self.offset:+d}): {', '.join(overlaps)}, "
+            f"image offset {self.offset} (image number = tracking number {self.offset:+d}): {', '.join(evidence)}, "
             f"better than offset {self.runner_up} by {self.t:.1f} standard errors over {self.frames} frames"
         )
 
@@ -59,20 +63,15 @@ def detect_offset(
     head: HeadModel,
     tracks: Mapping[int, FrameTrack],
     intrinsics: np.ndarray,
-    image_numbers: Sequence[int],
+    images: Mapping[int, Path],
     head_masks: Mapping[int, Path],
     mouth_masks: Mapping[int, Path],
 ) -> OffsetEstimate:
     """Find the offset, or raise UserError asking for --frame-offset when the evidence does not single one out."""
-    if not head_masks and not mouth_masks:
-        raise UserError(
-            "without any masks (parsing/ or alpha/) the offset between images and tracking cannot be detected; give "
-            "--frame-offset (1 where images are numbered from 1 and tracking from 0)"
-        )
     lips = region_faces(head, "lips")
     use_mouth = bool(mouth_masks) and len(lips) > 0
-    candidates = _candidates(image_numbers, list(tracks))
-    sampled = _frames_with_motion(tracks, use_mouth)
+    candidates = _candidates(list(images), list(tracks))
+    sampled = _frames_with_motion(tracks, use_mouth or not head_masks)
     first = next(iter(tracks.values()))
     width = min(RASTER_WIDTH, first.size[0])
     height = max(1, round(first.size[1] * width / first.size[0]))
@@ -92,13 +91,18 @@ def detect_offset(
         n: np.concatenate((_head_features(bodies[n], cut) if head_masks else [], _mouth_features(mouths[n])))
         for n in sampled
     }
-    misfit = _misfits(predicted, observed, candidates)
-    best, runner_up, t = _decide(misfit)
+    residuals = _mask_residuals(predicted, observed, candidates)
+    best, runner_up, t = _decide(_misfits(residuals))
+    used_images = t < MIN_T
+    if used_images:
+        moving = motion_residuals(head, tracks, intrinsics, images, candidates, sampled, (width, height))
+        best, runner_up, t = _decide(_misfits(_joined(residuals, moving)))
 
     head_overlap = _mean_overlap(bodies, head_masks, best) if head_masks else None
     mouth_overlap = _mean_overlap(mouths, mouth_masks, best) if use_mouth else None
-    estimate = OffsetEstimate(best, t, runner_up, head_overlap, mouth_overlap, len(sampled))
-    if max(head_overlap or 0.0, mouth_overlap or 0.0) < MIN_OVERLAP:
+    estimate = OffsetEstimate(best, t, runner_up, head_overlap, mouth_overlap, len(sampled), used_images)
+    overlaps = [value for value in (head_overlap, mouth_overlap) if value is not None]
+    if overlaps and max(overlaps) < MIN_OVERLAP:
         raise UserError(
             f"the tracked head does not lie on the masks (best is {estimate.sentence()}): is the tracking of this "
             "video, and the head model the one it was made with? Give --frame-offset to go on regardless"
@@ -107,7 +111,7 @@ def detect_offset(
     if t < MIN_T or is_edge:
         raise UserError(
             f"the offset between images and tracking is not clear (best is {estimate.sentence()}); look at the frames "
-            "and give --frame-offset"
+            "and give --frame-offset (1 where images are numbered from 1 and tracking from 0)"
         )
     return estimate
 
@@ -159,7 +163,7 @@ def _observed_features(
         return np.concatenate(parts)
 
     kinds = [masks for masks in (head_masks, mouth_masks) if masks]
-    complete = [n for n in numbers if all(n in masks for masks in kinds)]
+    complete = [n for n in numbers if kinds and all(n in masks for masks in kinds)]
     with ThreadPoolExecutor(max_workers=2) as pool:
         return dict(zip(complete, pool.map(features, complete), strict=True))
 
@@ -184,11 +188,11 @@ def _mouth_features(mask: np.ndarray | None) -> np.ndarray:
     return np.array([m["m10"] / m["m00"], m["m01"] / m["m00"], *spread]) / mask.shape[1]
 
 
-def _misfits(
+def _mask_residuals(
     predicted: Mapping[int, np.ndarray], observed: Mapping[int, np.ndarray], candidates: Sequence[int]
-) -> dict[int, dict[int, float]]:
-    """Offset -> tracking frame -> mean squared misfit of the features, in units of the best offset's own misfit."""
-    residuals: dict[int, tuple[list[int], np.ndarray]] = {}
+) -> Residuals:
+    """What is left of observed minus predicted features when the part that depends on the pose is taken out."""
+    residuals: Residuals = {}
     for offset in candidates:
         common = [
             n
@@ -202,21 +206,37 @@ def _misfits(
         difference -= difference.mean(axis=0)
         pose = (p - p.mean(axis=0)) / (p.std(axis=0) + 1e-9)
         slope = np.linalg.solve(pose.T @ pose + _RIDGE * np.eye(pose.shape[1]), pose.T @ difference)
-        residuals[offset] = common, difference - pose @ slope
-    if not residuals:
-        raise UserError(
-            "too few frames have masks and tracking under any offset to detect it; give --frame-offset "
-            "(1 where images are numbered from 1 and tracking from 0)"
-        )
-    unit = np.min([np.median(np.abs(r), axis=0) for _, r in residuals.values()], axis=0) * 1.4826 + 1e-5
+        residuals[offset] = dict(zip(common, difference - pose @ slope, strict=True))
+    return residuals
+
+
+def _joined(first: Residuals, second: Residuals) -> Residuals:
+    """Both kinds of residual of the frames that have both; one kind where there is no other."""
+    if not first or not second:
+        return first or second
     return {
-        offset: dict(zip(common, np.minimum((r / unit) ** 2, _CLIP).mean(axis=1).tolist(), strict=True))
-        for offset, (common, r) in residuals.items()
+        offset: {n: np.concatenate((rows[n], second[offset][n])) for n in rows if n in second[offset]}
+        for offset, rows in first.items()
+        if offset in second
+    }
+
+
+def _misfits(residuals: Residuals) -> dict[int, dict[int, float]]:
+    """Offset -> tracking frame -> mean squared residual, in units of the best offset's own residuals."""
+    stacks = {k: np.stack(list(rows.values())) for k, rows in residuals.items() if len(rows) >= MIN_COMMON_FRAMES}
+    if not stacks:
+        return {}
+    unit = np.min([np.median(np.abs(r), axis=0) for r in stacks.values()], axis=0) * 1.4826 + 1e-5
+    return {
+        offset: dict(zip(residuals[offset], np.minimum((r / unit) ** 2, _CLIP).mean(axis=1).tolist(), strict=True))
+        for offset, r in stacks.items()
     }
 
 
 def _decide(misfit: Mapping[int, Mapping[int, float]]) -> tuple[int, int, float]:
     """Best offset, the one nearest to it in misfit, and the standard errors between them, over the frames both have."""
+    if not misfit:
+        return 0, 0, 0.0
     best = min(misfit, key=lambda offset: float(np.mean(list(misfit[offset].values()))))
     runner_up, smallest = best, np.inf
     for offset in misfit:

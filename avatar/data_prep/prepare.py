@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -80,11 +81,11 @@ def prepare(
     coefficients = _coefficients(tracks, head, notes)
     model = HeadModel(head, torch.from_numpy(coefficients["shape"]))
     if frame_offset is None:
-        usable_masks = {n: p for n, p in (files.head_masks or files.alphas).items() if n not in inspection.bad}
-        usable_mouths = {n: p for n, p in files.mouth_masks.items() if n not in inspection.bad}
-        estimate = detect_offset(
-            model, tracks.frames, first.intrinsics, list(files.images), usable_masks, usable_mouths
+        images, heads, mouths = (
+            {n: path for n, path in found.items() if n not in inspection.bad}
+            for found in (files.images, files.head_masks or files.alphas, files.mouth_masks)
         )
+        estimate = detect_offset(model, tracks.frames, first.intrinsics, images, heads, mouths)
         offset, evidence = estimate.offset, estimate.sentence()
     else:
         offset, evidence = frame_offset, f"image offset {frame_offset}, given with --frame-offset"
@@ -150,10 +151,14 @@ def _input_hash(files: FrameFiles, options: dict[str, object]) -> str:
 
 def _is_current(target: Path, input_hash: str, is_chosen: bool) -> bool:
     """Whether `target` was prepared from these inputs. A chosen folder that is something else is never overwritten."""
-    if not target.exists():
+    try:
+        names = {path.name for path in target.iterdir()}
+    except FileNotFoundError:
         return False
-    if not (target / MANIFEST_FILE).is_file():
-        if is_chosen and (not target.is_dir() or any(target.iterdir())):
+    except NotADirectoryError:
+        names = {target.name} if target.exists() else set()
+    if MANIFEST_FILE not in names:
+        if is_chosen and names:
             raise UserError(f"{target} exists and is not a prepared subject; choose another --out")
         return False
     try:
@@ -250,8 +255,11 @@ def _write(
     pairing: Pairing,
 ) -> None:
     """Write beside the target and rename, so that a prepared subject is either whole or not there."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another place") from None
     try:
         save_file(arrays, building / TRACKS_FILE)
         if manifest.mouth_masks == "derived":
@@ -263,14 +271,27 @@ def _write(
                 cv2.imwrite(str(building / str(record.mouth_mask)), filled_lips(screen, lips, *size) * 255)
         (building / MANIFEST_FILE).write_text(manifest.to_json(), encoding="utf-8")
         building.chmod(0o755)
-        if target.exists():
-            stale = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-            target.rename(stale / "old")
-            building.rename(target)
-            shutil.rmtree(stale)
-        else:
-            building.rename(target)
+        _replace(target, building, manifest.input_hash)
     except OSError as error:
         raise UserError(f"the prepared subject cannot be written to {target} ({error.strerror})") from error
     finally:
         shutil.rmtree(building, ignore_errors=True)
+
+
+def _replace(target: Path, building: Path, input_hash: str) -> None:
+    """Rename `building` to `target`, moving away what is there; another process may be doing the same."""
+    for attempt in range(100):
+        try:
+            building.rename(target)
+            return
+        except OSError:
+            if attempt == 99:
+                raise
+            if not target.exists():
+                continue  # moved away just now by another process
+        if _is_current(target, input_hash, is_chosen=False):
+            return
+        stale = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
+        with contextlib.suppress(FileNotFoundError):
+            target.rename(stale / "old")
+        shutil.rmtree(stale)

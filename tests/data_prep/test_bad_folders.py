@@ -291,9 +291,13 @@ CASES: dict[str, tuple[Edit, str]] = {
         r"the tracked head is behind the camera",
     ),
     # offset
-    "no masks": (
-        lambda f: (shutil.rmtree(f / "parsing"), shutil.rmtree(f / "alpha")),
-        r"without any masks .* cannot be detected; give --frame-offset",
+    "no masks, and images that do not move": (
+        lambda f: (
+            shutil.rmtree(f / "parsing"),
+            shutil.rmtree(f / "alpha"),
+            [shutil.copy(f / "imgs/00001.jpg", p) for p in matching(f, "imgs/*")[1:]],
+        ),
+        r"the offset between images and tracking is not clear .*and give --frame-offset \(1 where images",
     ),
     "nothing moves": (
         freeze,
@@ -302,7 +306,7 @@ CASES: dict[str, tuple[Edit, str]] = {
     "masks elsewhere": (shift_masks, r"the tracked head does not lie on the masks .*is the tracking of this video"),
     "far too few frames": (
         lambda f: [remove(f"{d}/{n}.*")(f) for d in ("imgs", "checkpoint") for n in ("000[12]*", "0000[5-9]")],
-        r"too few frames have masks and tracking under any offset to detect it; give --frame-offset",
+        r"the offset between images and tracking is not clear .*and give --frame-offset",
     ),
 }
 
@@ -359,6 +363,14 @@ def test_a_folder_that_is_something_else_is_not_overwritten(good_folder: Path, t
     with pytest.raises(UserError, match=r"precious exists and is not a prepared subject; choose another --out"):
         prepare(good_folder, load_head_assets(good_folder / "head_model"), "", out=precious, say=str)
     assert (precious / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_place_that_cannot_be_written(good_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(
+        UserError, match=r"nothing can be written in .*file/sub \(Not a directory\); choose another place"
+    ):
+        prepare(good_folder, load_head_assets(good_folder / "head_model"), "", out=tmp_path / "file/sub/out", say=str)
 
 
 def test_another_head_model_is_noticed_by_its_expressions(good_folder: Path, tmp_path: Path) -> None:

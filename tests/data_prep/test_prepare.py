@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -272,6 +273,23 @@ def test_a_failed_preparation_keeps_the_old_one(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="has no frames"):
         prepare_folder(folder, tmp_path / "out")
     assert Subject.open(tmp_path / "out").data_hash == subject.data_hash
+
+
+@pytest.mark.parametrize("offsets", [(1, 1), (0, 1)])
+def test_several_at_once_all_succeed(offsets: tuple[int, int], tmp_path: Path) -> None:
+    """As trainings that are started together on a new subject do; one's folder stays, whole."""
+    folder = write_tracked_folder(tmp_path / "subject", frames=12, mouth_masks=False)
+    head_path = folder / "head_model"
+    head = load_head_assets(head_path)
+
+    def run(offset: int) -> Path:
+        return prepare(folder, head, head_path, out=tmp_path / "out", frame_offset=offset, say=str)
+
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        assert list(pool.map(run, offsets * 6)) == [tmp_path / "out"] * 12
+    subject = Subject.open(tmp_path / "out")
+    assert subject.frame(len(subject) - 1).mouth_mask.max() > 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "subject"]
 
 
 def test_the_data_hash_does_not_depend_on_the_place(tmp_path: Path) -> None:
