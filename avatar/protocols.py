@@ -19,7 +19,7 @@ from avatar.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.metrics import bounding_box, psnr, ssim
 
 LPIPS_CROP = 64  # pixels; a region is given at least so much context
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "green": (0.0, 1.0, 0.0), "black": (0.0, 0.0, 0.0)}
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "green": (0.0, 1.0, 0.0)}
 
 SHARED_CHOICES = {
     "truth": "image * (alpha * head mask) + background * (1 - alpha * head mask), rounded to 8 bits",
@@ -47,7 +47,7 @@ class Protocol:
     name: str
     summary: str  # one sentence for people
     source: str
-    background: Literal["white", "green", "black"]
+    background: Literal["white", "green"]
     last: int | None  # frames at the end of the video; None: the subject's held-out frames
     multiply: bool  # full-frame figures are of image x head mask (zero outside), else of the composites as they are
     lpips_net: Net
