@@ -21,6 +21,7 @@ from avatar.data.split import Split
 from avatar.errors import UserError
 from avatar.types import Camera, Frame, HeadParams
 
+FAINTEST_MATTE = 10  # of 255: below it a JPEG matte is noise, not foreground
 _TRACK_SHAPES = {
     "expression": "N E",
     "jaw": "N 6",
@@ -132,7 +133,11 @@ class Subject:
             raise UserError(f"the subject's frames are gone: {source} does not exist; prepare the subject again")
         image = self._same_size(read_image(source / record.image), source / record.image)
         alpha = self._mask(source, record.alpha, shape, default=255)
-        head_mask = alpha if record.head_mask is None else self._mask(source, record.head_mask, shape, default=255)
+        if record.head_mask is None:
+            # Where the matte has anything: the matte itself would count twice in `Frame.composite`.
+            head_mask = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))
+        else:
+            head_mask = self._mask(source, record.head_mask, shape, default=255)
         mouth_mask = self._mask(self._mouth_root(source), record.mouth_mask, shape, default=0)
         pixels = FramePixels(image, alpha, head_mask, mouth_mask)
         if size is None or size == self.width:

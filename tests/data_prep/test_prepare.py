@@ -180,7 +180,9 @@ def test_without_head_masks_the_matte_is_the_head(tmp_path: Path) -> None:
     subject, said = prepare_folder(folder, tmp_path / "out")
     assert "note: there are no parsing/*_neckhead.png: the foreground matte is taken as the head" in said
     frame = subject.frame(5)
-    assert torch.equal(frame.head_mask, frame.alpha) and 0.05 < frame.alpha.mean() < 0.6
+    assert torch.equal(frame.head_mask, (frame.alpha >= 10 / 255).float()) and 0.05 < frame.alpha.mean() < 0.6
+    weight = frame.alpha * frame.head_mask
+    assert float((weight - frame.alpha).abs().max()) < 10 / 255, "the matte counts once, not squared"
 
 
 def test_images_that_were_composited_before_are_noticed(tmp_path: Path) -> None:
