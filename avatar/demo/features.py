@@ -144,9 +144,10 @@ def ear_rings() -> Rings:
     """The outer ear as a cup: up its back to the helix (level 0.64), over it and down into the concha."""
     angle = np.arange(EAR_RING_POINTS) * (2 * np.pi / EAR_RING_POINTS)  # 0 is forwards (+z), pi/2 is up
     c, s = np.cos(angle), np.sin(angle)
+    lobe = np.sign(c) * np.abs(c) ** np.where(s < 0, 0.7, 0.95)
     root = np.stack((11.0 * c, 25.0 * s), -1)  # z, y about the ear's centre
-    width = np.where(c > 0, 8.0, 17.0 * (1.0 + 0.35 * s))
-    outline = np.stack((width * c, np.where(s > 0, 30.0, 31.0 - 5.0 * (c < 0) * np.abs(c)) * s), -1)
+    width = np.where(c > 0, 8.0, 17.0 * (1.0 + 0.25 * s))
+    outline = np.stack((width * lobe, np.where(s > 0, 30.0, 31.0 - 5.0 * (c < 0) * np.abs(c)) * s), -1)
     lean = np.radians(12.0)
     turn = np.array([[np.cos(lean), np.sin(lean)], [-np.sin(lean), np.cos(lean)]])
     flare = np.where(c > 0, 4.5 + 3.5 * (1 - np.abs(c)), 8.0 + 8.5 * np.abs(c)) * (1.0 + 0.15 * s)

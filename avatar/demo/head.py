@@ -86,7 +86,9 @@ def _lip_side(mesh: HeadMesh) -> np.ndarray:
     # The vermilion and the inside of the lips, where height says little: by the ring's own order, 0 in the corner.
     rings = mesh.mouth_rings[:, :7]
     order = np.linspace(1.0, -1.0, rings.shape[-1])
-    side[rings] = np.broadcast_to(np.sign(order) * np.sin(np.abs(order) * np.pi / 2) ** 0.7, rings.shape)
+    side[rings] = np.broadcast_to(
+        np.sign(order) * np.sin(np.abs(order) * np.pi / 2) ** np.where(order > 0, 0.7, 0.5), rings.shape
+    )
     return side
 
 
@@ -96,18 +98,12 @@ def _eyelids(mesh: HeadMesh) -> np.ndarray:
     for k, (sign, rings) in enumerate(zip((1.0, -1.0), mesh.eye_rings, strict=True)):
         centre = EYE_CENTRE * np.array([sign, 1.0, 1.0])
         points = mesh.vertices * 1e3 - centre
-        margin = points[rings[1]]
-        order = np.argsort(margin[:, 0])
-        count = len(rings[1])
-        is_upper = np.zeros(count, bool)
-        is_upper[1 : count // 2] = True  # ring order: outer corner, upper lid, inner corner, lower lid
         elevation = np.arctan2(points[:, 1], points[:, 2])
-
-        def lid(upper: bool, margin=margin, order=order, is_upper=is_upper, elevation_of=elevation[rings[1]]):
-            keep = [i for i in order if is_upper[i] == upper or i in (0, count // 2)]
-            return lambda x: np.interp(x, margin[keep, 0], elevation_of[keep])
-
-        upper_at, lower_at = lid(True)(points[:, 0]), lid(False)(points[:, 0])
+        # The margin in the ring's order: outer corner, upper lid, inner corner, lower lid, outer corner.
+        margin = np.append(rings[1], rings[1][0])
+        inner = len(rings[1]) // 2
+        upper_at = _elevation_along(margin[: inner + 1], points, elevation)
+        lower_at = _elevation_along(margin[inner:], points, elevation)
         meet = lower_at + 0.16 * (upper_at - lower_at)
         inside = np.exp(-((np.abs(points[:, 0]) / 17.5) ** 8))
         above, below = elevation - upper_at, lower_at - elevation
@@ -128,6 +124,12 @@ def _eyelids(mesh: HeadMesh) -> np.ndarray:
         shift[np.concatenate(mesh.eyeballs)] = 0.0
         out[k] = shift * 1e-3
     return out
+
+
+def _elevation_along(line: np.ndarray, points: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """The elevation [V] of a lid's margin (vertex indices `line`) above or below each point's x."""
+    line = line[np.argsort(points[line, 0])]
+    return np.interp(points[:, 0], points[line, 0], elevation[line])
 
 
 def _pose_dirs(points: np.ndarray, skin: np.ndarray, eyelids: np.ndarray) -> np.ndarray:

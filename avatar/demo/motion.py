@@ -155,7 +155,7 @@ def _blinks(rng: np.random.Generator, frames: int, with_gaze: list[int]) -> np.n
     lids = np.zeros(frames + len(shape))
     for start in starts:
         lids[start : start + len(shape)] = np.maximum(lids[start : start + len(shape)], shape)
-    tired = np.clip(0.05 + 0.05 * _drift(rng, frames, 3.0, 2), 0.0, 0.22)
+    tired = np.clip(0.10 + 0.05 * _drift(rng, frames, 3.0, 2), 0.0, 0.22)
     return np.clip(lids[:frames, None] + tired * (1 - lids[:frames, None]), 0.0, 1.0)
 
 

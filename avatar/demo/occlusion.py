@@ -47,9 +47,9 @@ def ambient_occlusion(performer: scene.Performer) -> np.ndarray:
 def _lifted(performer: scene.Performer, share: np.ndarray) -> np.ndarray:
     """Lips and lids shade each other only while closed or at rest: do not bake it in."""
     mesh = performer.head.mesh
-    lips = mesh.mouth_rings[:, 2:7]
-    share[lips] = np.maximum(share[lips], 0.68)
-    share[mesh.mouth_rings[:, 1]] = np.maximum(share[mesh.mouth_rings[:, 1]], 0.35)
+    for ring, least in enumerate((0.15, 0.3, 0.38, 0.6, 0.7, 0.7, 0.7)):
+        at = mesh.mouth_rings[:, ring]
+        share[at] = np.maximum(share[at], least)
     lids = mesh.eye_rings[:, :3]
     share[lids] = np.maximum(share[lids], 0.5)
     # Visibility of a finite set of maps is noisy: two rounds of averaging with the neighbours.

@@ -21,7 +21,8 @@ class Prop(NamedTuple):
     colours: np.ndarray
 
 
-def _grid_faces(rows: int, columns: int, wrap: bool = False) -> np.ndarray:
+def grid_faces(rows: int, columns: int, wrap: bool = False) -> np.ndarray:
+    """Triangles [F, 3] of a grid of points stored row by row; `wrap` joins the last column to the first."""
     across = columns if wrap else columns - 1
     r, c = np.meshgrid(np.arange(rows - 1), np.arange(across), indexing="ij")
     a, b = (r * columns + c).ravel(), (r * columns + (c + 1) % columns).ravel()
@@ -41,7 +42,7 @@ def join(props: list[Prop]) -> Prop:
 def _tooth_row(upper: bool) -> Prop:
     """A dental arch as one strip, from the gums to the cutting edge and a little round its back."""
     widths = np.array([8.6, 6.6, 7.6, 7.0, 7.0, 9.0]) if upper else np.array([5.6, 6.0, 6.9, 7.0, 7.2, 9.5])
-    lengths = np.array([9.6, 8.6, 9.4, 8.0, 7.6, 7.0]) if upper else np.array([8.2, 8.4, 9.0, 8.0, 7.6, 7.0])
+    lengths = np.array([9.6, 9.0, 9.3, 8.6, 8.3, 8.0]) if upper else np.array([8.4, 8.5, 8.7, 8.4, 8.2, 8.0])
     run = np.concatenate(([0.0], np.cumsum(widths)))
     s = np.linspace(-run[-1] * 0.98, run[-1] * 0.98, 151)
     tooth = np.clip(np.searchsorted(run, np.abs(s), side="right") - 1, 0, len(widths) - 1)
@@ -49,7 +50,7 @@ def _tooth_row(upper: bool) -> Prop:
     bulge = np.sqrt(np.clip(1.0 - (2 * phase - 1) ** 2, 0, 1))
     # The arch: half an ellipse, about by arc length.
     turn = s / (run[-1] * 0.98) * 1.45
-    half_width, depth, front = (26.0, 34.0, 83.5) if upper else (23.5, 31.0, 80.5)
+    half_width, depth, front = (23.5, 34.0, 83.5) if upper else (21.0, 31.0, 80.5)
     x, z = half_width * np.sin(turn), front - depth * (1 - np.cos(turn))
     outward = np.stack((np.sin(turn) / half_width, np.cos(turn) / depth), -1)
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
@@ -61,13 +62,13 @@ def _tooth_row(upper: bool) -> Prop:
     y = edge - sign * lengths[0] + sign * t[:, None] * length[None]
     swell = thickness[:, None] + np.where(t[:, None] > 0.02, 1.0 * (bulge - 1.0)[None], -0.2)
     points = np.stack((x + swell * outward[:, 0], y, z + swell * outward[:, 1]), -1)
-    enamel = np.array([0.66, 0.61, 0.52])
+    enamel = np.array([0.74, 0.69, 0.60])
     gum = np.array([0.36, 0.12, 0.11])
     is_gum = (t < 0.03)[:, None, None]
     gap = (0.35 + 0.65 * smooth_step(bulge, 0.0, 0.42))[None, :, None]
     back = 1.0 - 0.62 * smooth_step(np.abs(turn), 0.35, 1.25)[None, :, None]
     colours = np.where(is_gum, gum, enamel * gap * (0.88 + 0.12 * t[:, None, None])) * back
-    faces = _grid_faces(len(t), len(s))
+    faces = grid_faces(len(t), len(s))
     return Prop(points.reshape(-1, 3), faces if upper else faces[:, ::-1], colours.reshape(-1, 3))
 
 
@@ -77,7 +78,7 @@ def _ellipsoid(
     polar, turn = np.linspace(0, np.pi, 14), np.arange(24) * (2 * np.pi / 24)
     p, t = np.meshgrid(polar, turn, indexing="ij")
     unit = np.stack((np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)), -1).reshape(-1, 3)
-    faces = _grid_faces(14, 24, wrap=True)
+    faces = grid_faces(14, 24, wrap=True)
     points = unit * np.array(radii) + np.array(centre)
     return Prop(points, faces[:, ::-1] if inward else faces, np.broadcast_to(colour, points.shape).copy())
 
@@ -112,7 +113,7 @@ def _tube(path: np.ndarray, radius: np.ndarray, closed: bool, colour: np.ndarray
     if closed:
         ring = np.concatenate((ring, ring[:1]))
     points = ring.reshape(-1, 3)
-    faces = _grid_faces(len(ring), sides, wrap=True)
+    faces = grid_faces(len(ring), sides, wrap=True)
     return Prop(points, faces, np.broadcast_to(colour, points.shape).copy())
 
 
@@ -132,9 +133,16 @@ def glasses_frame(identity: Identity) -> Prop:
     for side in (1.0, -1.0):
         rim = _rim(identity, side, turn)
         parts.append(_tube(rim, np.full((56, 2), 1.35), True, identity.frame_colour))
-        hinge = _rim(identity, side, np.array([0.42]))[0]
+        x, y, z = _rim(identity, side, np.array([0.42]))[0]
         temple = np.array(
-            [hinge, hinge + [side * 3.5, 0.5, -4.0], [side * 74, 23, 40], [side * 82, 20, -6], [side * 83, 6, -22]]
+            [
+                [x, y, z],
+                [x + side * 3.5, y + 0.5, z - 4.0],
+                [side * 74, 27, 36],
+                [side * 79, 29, -4],
+                [side * 80, 22, -17],
+                [side * 79, 4, -25],
+            ]
         )
         knots = np.linspace(0, 1, len(temple))
         fine = np.linspace(0, 1, 26)
@@ -155,7 +163,7 @@ def glasses_lenses(identity: Identity) -> Prop:
     for side in (1.0, -1.0):
         rings = np.concatenate([_rim(identity, side, turn, s) for s in scales])
         rings[:, 2] += np.repeat(1.8 * (1 - scales**2), 40)
-        faces = _grid_faces(len(scales), 40, wrap=True)
+        faces = grid_faces(len(scales), 40, wrap=True)
         parts.append(Prop(rings, faces if side > 0 else faces[:, ::-1], np.ones_like(rings)))
     return join(parts)
 
@@ -196,4 +204,4 @@ def shirt(identity: Identity) -> Prop:
     weave = 1.0 + 0.03 * np.random.default_rng((identity.seed, 8)).standard_normal(grid.shape[:2])
     band = np.where((fine > 0.5) & (fine < 3.8), 0.82, 1.0)[:, None]
     colours = (weave * band)[..., None] * identity.shirt_colour
-    return Prop(grid.reshape(-1, 3), _grid_faces(len(fine), 72, wrap=True)[:, ::-1], colours.reshape(-1, 3))
+    return Prop(grid.reshape(-1, 3), grid_faces(len(fine), 72, wrap=True)[:, ::-1], colours.reshape(-1, 3))

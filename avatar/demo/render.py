@@ -16,7 +16,7 @@ from avatar.demo import lighting, scene, shading
 from avatar.demo.identity import Identity, sample_identity
 from avatar.demo.occlusion import ambient_occlusion
 from avatar.demo.sculpt import EYE_RADIUS
-from avatar.demo.skin import bake_skin, paint_iris
+from avatar.demo.skin import bake_skin, paint_iris, strand_tile
 from avatar.head.rasterize import MeshRaster, rasterize_mesh
 from avatar.types import Camera, HeadParams
 
@@ -69,11 +69,12 @@ class Renderer:
         self.skin = bake_skin(performer.head, identity, TEXTURE_SIZE)
         self._relief = (self.skin.relief[..., :4].copy(), self.skin.relief[..., 4:].copy())
         self.iris = paint_iris(identity)
+        self._strands = strand_tile(identity.seed)
         mesh = performer.head.mesh
         self._texels = np.stack((mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]), -1).astype(np.float32) * TEXTURE_SIZE - 0.5
         on_lips = np.zeros(performer.num_points, bool)
         on_lips[mesh.mouth_rings[:, :7]] = True
-        self._is_lip = on_lips[performer.faces].all(1)
+        self._is_lip = np.asarray(on_lips[performer.faces].all(1))
         self._occlusion = ambient_occlusion(performer)
         names = performer.head.expression_names
         self._wrinkles_of = np.array(
@@ -127,12 +128,13 @@ class Renderer:
             strands = pixels.interpolate(
                 self.performer.strands @ R_view.T, pixels.corners - self.performer.starts[kind]
             )
-            return shading.hair(surface, self.lights, strands, self.identity.hair_colour)
+            rest = pixels.interpolate(self.performer.hair_rest, pixels.corners - self.performer.starts[kind])
+            return shading.hair(surface, self.lights, strands, shading.strand_pattern(self._strands, rest))
         if kind in (scene.EYE_LEFT, scene.EYE_RIGHT):
             side = int(kind == scene.EYE_RIGHT)
             shadow = _lid_shadow(self.performer.head, geometry, side, surface.normals @ R_view)
             return shading.eye(surface, self.lights, self.iris, R_view @ geometry.eye_turns[side], shadow)
-        if kind in (scene.MOUTH_UPPER, scene.MOUTH_LOWER):
+        if kind in (scene.MOUTH_UPPER, scene.MOUTH_LOWER, scene.LINING):
             return shading.mouth(surface, self.lights)
         if kind == scene.FRAME:
             return shading.frame(surface, self.lights)
@@ -188,12 +190,12 @@ class Renderer:
 
     def _develop(self, colour: np.ndarray, material: np.ndarray, pixels: _Pixels, camera: Camera) -> RenderedFrame:
         height, width = SUPERSAMPLE * camera.height, SUPERSAMPLE * camera.width
-        canvas = _background(self.identity.seed, height, width).copy()
+        canvas = _background(tuple(self.identity.background.tolist()), height, width).copy()
         canvas[pixels.row, pixels.column] = lighting.tone_map(colour)
         masks = np.zeros((height, width, 3), np.float32)
-        in_mouth = (material == scene.MOUTH_UPPER) | (material == scene.MOUTH_LOWER) | self._is_lip[pixels.face]
+        in_mouth = np.isin(material, (scene.MOUTH_UPPER, scene.MOUTH_LOWER, scene.LINING)) | self._is_lip[pixels.face]
         everything = np.ones(len(material), bool)
-        masks[pixels.row, pixels.column] = np.stack((everything, material != scene.SHIRT, in_mouth), -1) * 255.0
+        masks[pixels.row, pixels.column] = np.column_stack((everything, material != scene.SHIRT, in_mouth)) * 255.0
         small = (camera.width, camera.height)
         image = cv2.resize(canvas, small, interpolation=cv2.INTER_AREA)
         masks = cv2.resize(masks, small, interpolation=cv2.INTER_AREA)
@@ -243,11 +245,11 @@ def _lid_shadow(head: scene.DemoHead, geometry: scene.Geometry, side: int, outwa
 
 
 @lru_cache(maxsize=4)
-def _background(seed: int, height: int, width: int) -> np.ndarray:
+def _background(wall_colour: tuple[float, float, float], height: int, width: int) -> np.ndarray:
     """A wall that is lighter behind the head, sRGB [H, W, 3] in 0 to 255."""
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     glow = np.exp(-((x / width - 0.5) ** 2 + (y / height - 0.35) ** 2) / 0.45)
-    wall = (0.35 + 0.65 * glow)[..., None] * sample_identity(seed).background
+    wall = (0.35 + 0.65 * glow)[..., None] * np.array(wall_colour)
     return lighting.tone_map(wall.reshape(-1, 3)).reshape(height, width, 3)
 
 

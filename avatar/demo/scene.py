@@ -11,13 +11,15 @@ from scipy.sparse import csr_matrix
 from avatar.demo.fields import identity_displacement, smooth_step
 from avatar.demo.head import JOINTS, NUM_EXPRESSION, PARENTS, DemoHead, demo_head
 from avatar.demo.identity import Identity
-from avatar.demo.props import Prop, glasses_frame, glasses_lenses, lower_mouth, shirt, upper_mouth
+from avatar.demo.props import Prop, glasses_frame, glasses_lenses, grid_faces, lower_mouth, shirt, upper_mouth
 from avatar.demo.skin import fractal_noise, hair_cover
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.types import HeadParams
 
-SKIN, EYE_LEFT, EYE_RIGHT, MOUTH_UPPER, MOUTH_LOWER, HAIR, FRAME, SHIRT = range(8)
+SKIN, EYE_LEFT, EYE_RIGHT, MOUTH_UPPER, MOUTH_LOWER, LINING, HAIR, FRAME, SHIRT = range(9)
+LINING_COLOUR = np.array([0.09, 0.022, 0.018], np.float32)
+LINING_REACH = np.array([0.0, 0.0, -0.026], np.float32)  # metres
 
 
 def head_assets(head: DemoHead) -> HeadAssets:
@@ -95,6 +97,7 @@ class Performer:
             self.lenses = Prop(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
         self.props[SHIRT] = self._fitted(shirt(identity))
         self._hair_shell()
+        self._inner_lips = np.concatenate((head.mesh.mouth_rings[0, 0], head.mesh.mouth_rings[1, 0, -2:0:-1]))
         self._assemble()
 
     def _fitted(self, prop: Prop) -> Prop:
@@ -150,6 +153,7 @@ class Performer:
         parting = np.exp(-(((at[:, 0] - 1e3 * identity.hair_parting) / 5.0) ** 2)) * top
         height = length * (1 + 0.13 * clumps + 0.10 * broad) * (1 - 0.40 * parting)
         height = height * smooth_step(depth + 1.4 * clumps, -1.0, 15.0) - 0.9 * (1 - smooth_step(depth, -2.0, 2.5))
+        self.hair_rest = at.astype(np.float32)
         # Hair lies from the crown outwards, combed a little away from the parting.
         away = at - np.array([1e3 * identity.hair_parting, 118.0, -38.0])
         self.strands = _unit(away * np.array([1.0, 0.6, 1.0]) + np.array([0.0, -14.0, 0.0])).astype(np.float32)
@@ -162,6 +166,8 @@ class Performer:
     def _assemble(self) -> None:
         parts = [(SKIN, self.head_faces, len(self._neutral))]
         parts.append((HAIR, self.hair_faces, len(self.hair_height)))
+        lip_count = len(self._inner_lips)
+        parts.append((LINING, grid_faces(2, lip_count, wrap=True), 2 * lip_count))
         parts += [(material, prop.faces, len(prop.points)) for material, prop in self.props.items()]
         faces, materials, self.starts, start = [], [], {}, 0
         for material, own, count in parts:
@@ -178,6 +184,7 @@ class Performer:
             self.materials[: len(self.head_faces)][is_ball[self.head_faces].all(1)] = EYE_LEFT + k
         self.colours = np.zeros((start, 3), np.float32)
         self.colours[self.starts[HAIR] :][: len(self.hair_colours)] = self.hair_colours
+        self.colours[self.starts[LINING] :][: 2 * lip_count] = LINING_COLOUR
         for material, prop in self.props.items():
             self.colours[self.starts[material] :][: len(prop.points)] = prop.colours
         self._prop_normals = {}
@@ -203,6 +210,13 @@ class Performer:
         strands = self._hair_of @ points + self.hair_height[:, None] * _unit(self._hair_of @ normals)
         all_points[hair] = strands
         all_normals[hair] = _unit(self._hair_normals_of @ face_normals(all_points[hair], self.hair_faces))
+        # The inside of the cheeks: from the inner edge of the lips back, around the teeth.
+        lining = slice(self.starts[LINING], self.starts[LINING] + 2 * len(self._inner_lips))
+        edge = points[self._inner_lips]
+        back = edge + LINING_REACH
+        all_points[lining] = np.concatenate((edge, back))
+        inward = _unit(edge.mean(0) - edge)
+        all_normals[lining] = np.concatenate((inward, inward))
         pivot = JOINTS[0].astype(np.float32)
         turns = {MOUTH_LOWER: (jaw, self._joints[2]), SHIRT: (body_turn.astype(np.float32), pivot)}
         for material, prop in self.props.items():
@@ -234,4 +248,4 @@ def _ancestry(parents: np.ndarray, count: int) -> csr_matrix:
     step = csr_matrix((np.full(2 * total, 0.5, np.float32), (rows, parents.reshape(-1))), shape=(total, total))
     for _ in range(2):
         weights = step @ weights
-    return weights.tocsr()
+    return csr_matrix(weights)

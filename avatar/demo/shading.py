@@ -70,16 +70,37 @@ def skin(s: Surface, lights: Lights, colour_gloss: np.ndarray, relief: np.ndarra
     shine += lighting.gloss(fine, s.view, lights.rim, 0.50, 0.04)[:, None] * RIM_COLOUR
     sheen = 0.14 * (1.0 - np.clip(_dot(fine, s.view), 0.0, 1.0)) ** 4
     shine += sheen[:, None] * lighting.ambient(fine)
-    return colour_gloss[:, :3] * diffuse + (1.9 * colour_gloss[:, 3] * s.occlusion)[:, None] * shine
+    return colour_gloss[:, :3] * diffuse + (1.35 * colour_gloss[:, 3] * s.occlusion)[:, None] * shine
 
 
-def hair(s: Surface, lights: Lights, strands: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Hair along `strands` [N, 3]; `base` [3] is the mean colour. Source: Kajiya, Kay, "Rendering fur" (1989)."""
+_CROWN = np.array([0.0, 0.94, -0.34], np.float32)  # where the hair's whorl is, from the middle of the skull
+_SKULL = np.array([0.0, 52.0, -16.0], np.float32)
+
+
+def strand_pattern(tile: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Strands [N] at places [N, 3] (millimetres) of the head at rest: a periodic tile laid out from the crown."""
+    d = unit(rest - _SKULL)
+    side = np.array([1.0, 0.0, 0.0], np.float32)
+    ahead = np.cross(side, _CROWN)
+    around = np.arctan2(d @ side, d @ ahead) / (2 * np.pi)
+    away = np.arccos(np.clip(d @ _CROWN, -1.0, 1.0))
+    size = tile.shape[0]
+    wave = 0.004 * np.sin(9.0 * away + 40.0 * around)
+    at = np.stack(((around + wave) * 3 * size, away * 0.55 * size), -1) % size
+    return lookup(np.pad(tile, ((0, 1), (0, 1)), mode="wrap"), at)[:, 0]
+
+
+def hair(s: Surface, lights: Lights, strands: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """Hair along `strands` [N, 3] with light and dark ones by `pattern` [N].
+
+    Source: Kajiya, Kay, "Rendering fur with three dimensional textures" (1989).
+    """
+    s = s._replace(colours=s.colours * np.clip(1.0 + 0.30 * pattern, 0.25, 2.0)[:, None])
     along = unit(strands - _dot(strands, s.normals)[:, None] * s.normals)
     out = s.colours * lighting.ambient(s.normals) * s.occlusion[:, None]
-    jitter = (s.colours[:, 1] / max(float(base[1]), 1e-4) - 1.0) * 0.35
+    jitter = 0.16 * pattern
     bent = unit(along + jitter[:, None] * s.normals)
-    tint = 0.04 + 0.5 * s.colours
+    tint = (0.018 + 0.5 * s.colours) * np.clip(1.0 + 0.5 * pattern, 0.0, 2.2)[:, None]
     for light, colour, lit in (
         (lights.key, KEY_COLOUR, s.lit),
         (lights.fill, FILL_COLOUR, np.float32(1.0)),
@@ -115,8 +136,8 @@ def eye(s: Surface, lights: Lights, iris: np.ndarray, turn: np.ndarray, lid_shad
 def mouth(s: Surface, lights: Lights) -> np.ndarray:
     """Teeth, gums, tongue and the dark behind them."""
     diffuse = lighting.wrapped(s.normals, lights.key, SKIN_WRAP) * (KEY_COLOUR * s.lit[:, None])
-    diffuse += 0.7 * lighting.wrapped(s.normals, lights.fill, SKIN_WRAP) * FILL_COLOUR
-    diffuse += 0.55 * lighting.ambient(s.normals)
+    diffuse += lighting.wrapped(s.normals, lights.fill, SKIN_WRAP) * FILL_COLOUR
+    diffuse += lighting.ambient(s.normals)
     wet = lighting.gloss(s.normals, s.view, lights.key, 0.24, 0.05) * s.lit * np.minimum(s.colours[:, 0] * 2.0, 1.0)
     return s.colours * diffuse + 0.7 * wet[:, None] * KEY_COLOUR
 

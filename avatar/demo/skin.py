@@ -31,15 +31,24 @@ class SkinTextures(NamedTuple):
 
 def hair_cover(points: np.ndarray, identity: Identity) -> np.ndarray:
     """How far inside the hair [N] template points [N, 3] (mm) are: millimetres from the hairline, negative outside."""
-    p = points
-    ax = np.abs(p[:, 0])
-    front = 90.0 - 1e3 * identity.hairline - 0.006 * np.clip(ax - 18, 0, None) ** 2
-    temple = p[:, 1] - front
-    # Behind the temples the hairline runs down in front of the ear, over it, and behind it to the nape.
-    side = (26.0 - p[:, 2]) - 0.55 * np.clip(p[:, 1] - 62.0, -60, 40)
-    sideburn = np.minimum(side, p[:, 1] - np.where(p[:, 2] > -4.0, 6.0, 34.0 - 0.0 * p[:, 2]))
-    behind = np.minimum(-30.0 - p[:, 2], p[:, 1] + 66.0 - 0.10 * (p[:, 2] + 90.0))
-    return np.maximum(np.maximum(temple, sideburn), behind)
+    x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
+    front = y - (83.0 - 1e3 * identity.hairline - 0.0045 * np.clip(x - 14, 0, None) ** 2)
+    # From the temple down in front of the ear to the end of the sideburn, and behind the ear to the nape.
+    edge = np.interp(y, (-2.0, 22.0, 45.0, 70.0, 100.0), (6.0, 10.0, 24.0, 40.0, 66.0))
+    lowest = np.where(z > -6.0, 0.5, 30.0)
+    side = _round_min(0.8 * (edge - z), y - lowest, 8.0)
+    nape = -64.0 + 0.10 * (z + 90.0) + 0.004 * x**2
+    behind = _round_min(-27.0 - z, y - nape, 10.0)
+    return -_round_min(-front, -_round_max(side, behind, 4.0), 22.0)
+
+
+def _round_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    h = np.maximum(k - np.abs(a - b), 0.0) / k
+    return np.minimum(a, b) - h * h * (k / 4.0)
+
+
+def _round_max(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    return -_round_min(-a, -b, k)
 
 
 def fractal_noise(points: np.ndarray, period: float, octaves: int, seed: int) -> np.ndarray:
@@ -72,15 +81,15 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     """Paint the person's skin on maps of `size` x `size` texels."""
     mesh = head.mesh
     V = len(head.template)
-    vermilion, lash, waterline, concha = (np.zeros(V) for _ in range(4))
+    vermilion, lash, waterline = (np.zeros(V) for _ in range(3))
     for level, weight in enumerate((1.0, 1.0, 1.0, 1.0, 1.0, 0.92, 0.5)):
         vermilion[mesh.mouth_rings[:, level]] = weight
     half = mesh.eye_rings.shape[-1] // 2
     lash[mesh.eye_rings[:, 1, 1:half]] = 1.0
-    lash[mesh.eye_rings[:, 2, 1:half]] = 0.45
+    lash[mesh.eye_rings[:, 2, 1:half]] = 0.62
     lash[mesh.eye_rings[:, 1, half:]] = 0.35
     waterline[mesh.eye_rings[:, 0]] = 1.0
-    values = np.column_stack((head.template * 1e3, vermilion, lash, waterline, concha))
+    values = np.column_stack((head.template * 1e3, vermilion, lash, waterline))
     chart, _ = _chart_positions(head, size, values)
     P = chart[..., :3].reshape(-1, 3)
     lip, lash_map, water = (chart[..., 3 + k].reshape(-1) for k in range(3))
@@ -114,8 +123,8 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     shade = smooth_step(y, -110, -66) * smooth_step(-y, 22, 44) * smooth_step(z, -2, 24)
     beard = shade * (1.0 - 0.85 * spot(0, -50, 16, 6)) * (1.0 - 0.8 * spot(46, -26, 18, 14)) * (1.0 - lip)
     beard = np.maximum(beard, spot(0, -35.5, 22, 4.5) * (1 - lip))
-    dots = smooth_step(fractal_noise(P, 1.9, 1, seed + 5), 0.2, 1.2)
-    cover = identity.stubble * beard * (0.22 + 0.42 * dots)
+    dots = smooth_step(fractal_noise(P, 1.2, 1, seed + 5), -0.2, 1.6)
+    cover = identity.stubble * beard * (0.24 + 0.18 * dots)
     colour = colour * (1 - cover[:, None]) + cover[:, None] * (0.5 * identity.hair_colour + 0.08 * identity.skin_colour)
 
     if identity.freckles > 0:
@@ -126,7 +135,7 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     folds = fractal_noise(P * np.array([1.0, 0.16, 0.3]), 2.6, 2, seed + 8)
     lips = identity.lip_colour * (1 + 0.10 * folds[:, None] + 0.05 * broad[:, None])
     lips = lips * (1 - 0.45 * crease[:, None])
-    colour = colour * (1 - 0.88 * lip[:, None]) + 0.88 * lip[:, None] * lips
+    colour = colour * (1 - 0.92 * lip[:, None]) + 0.92 * lip[:, None] * lips
     nostril = np.exp(-(((ax - 6.2) / 3.0) ** 2) - ((y + 23.5) / 2.6) ** 2 - ((z - 98.5) / 6.0) ** 2)
     colour *= 1 - 0.80 * np.clip(1.25 * nostril, 0, 1)[:, None]
     colour = colour * (1 - 0.8 * water[:, None]) + 0.8 * water[:, None] * np.array([0.48, 0.22, 0.19])
@@ -153,7 +162,7 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     gloss = gloss * (1 - 0.75 * beard * identity.stubble) * (1 - 0.95 * scalp) * (1 - 0.7 * brows) * (1 - 0.9 * nostril)
     gloss = gloss * (1 - water) + 2.4 * water
 
-    pores = 0.045 * fractal_noise(P, 1.7, 2, seed + 3) * (1 - 0.7 * lip) + 0.05 * fine + 0.11 * folds * lip
+    pores = 0.013 * fractal_noise(P, 1.6, 2, seed + 3) * (1 - 0.7 * lip) + 0.010 * fine + 0.11 * folds * lip
     heights = np.stack((pores, *_wrinkles(P, seed)), -1).reshape(size, size, 4) * 1e-3
     slopes = []
     for k in range(4):
@@ -164,6 +173,14 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     return SkinTextures(
         rgba.reshape(size, size, 4).astype(np.float32), np.ascontiguousarray(np.stack(slopes, -1), np.float32)
     )
+
+
+def strand_tile(seed: int, size: int = 512) -> np.ndarray:
+    """A periodic map [S, S] of hair strands that run along its rows' axis; unit variance, roughly."""
+    noise = np.random.default_rng((seed, 7)).standard_normal((size, size))
+    fine = gaussian_filter(noise, (26.0, 0.8), mode="wrap")
+    locks = gaussian_filter(noise[::-1], (40.0, 4.0), mode="wrap")
+    return (0.8 * fine / fine.std() + 0.6 * locks / locks.std()).astype(np.float32)
 
 
 def ears_on_chart(head: DemoHead, size: int, ears: np.ndarray) -> np.ndarray:
@@ -181,7 +198,7 @@ def _freckles(P: np.ndarray, identity: Identity) -> np.ndarray:
     distance, index = KDTree(centres).query(P[near], distance_upper_bound=4.0)
     found = np.isfinite(distance)
     out = np.zeros(len(P))
-    chosen = index[found]
+    chosen = np.asarray(index)[found]
     out[near[found]] = strength[chosen] * (
         1 - smooth_step(distance[found], 0.5 * radius[chosen], 1.35 * radius[chosen])
     )
@@ -217,12 +234,12 @@ def _brow_strokes(position: np.ndarray, identity: Identity) -> np.ndarray:
     count = int(90 + 170 * identity.brow_density)
     for side in (1.0, -1.0):
         s = rng.random(count)
-        arch_x = 9.5 + 36.5 * s
-        arch_y = 37.5 + 6.2 * np.sin(np.clip(s / 0.68, 0, 1.45) * np.pi / 2) - 1.5 * s
+        arch_x = 11.5 + 35.5 * s
+        arch_y = 38.6 + 6.0 * np.sin(np.clip(s / 0.68, 0, 1.45) * np.pi / 2) - 1.5 * s
         thick = 3.3 * (1 - 0.75 * s**1.6) * (0.75 + 0.4 * identity.brow_density)
         root = np.stack((arch_x, arch_y + thick * rng.uniform(-1, 1, count)), -1)
-        lean = np.radians(np.interp(s, (0, 0.12, 0.35, 1.0), (80, 58, 28, -14))) + 0.22 * rng.standard_normal(count)
-        length = rng.uniform(3.4, 5.6, count) * (1 - 0.3 * s)
+        lean = np.radians(np.interp(s, (0, 0.12, 0.35, 1.0), (60, 42, 18, -20))) + 0.22 * rng.standard_normal(count)
+        length = rng.uniform(3.0, 5.2, count) * (0.7 + 0.3 * np.minimum(4 * s, 1)) * (1 - 0.3 * s)
         tip = root + length[:, None] * np.stack((np.cos(lean), np.sin(lean)), -1)
         ends = np.stack((root, tip), 1) * np.array([side, 1.0])
         _, nearest = tree.query(ends.reshape(-1, 2))
@@ -243,12 +260,13 @@ def paint_iris(identity: Identity, size: int = 256) -> np.ndarray:
     iris = 0.455
     r = radius / iris
     phases, waves = rng.uniform(0, 2 * np.pi, 24), rng.integers(8, 70, 24)
-    fibres = sum(np.cos(w * angle + p + 1.7 * np.sin(6 * r + p)) for w, p in zip(waves, phases, strict=True)) / 5.0
+    rays = [np.cos(w * angle + p + 1.7 * np.sin(6 * r + p)) for w, p in zip(waves, phases, strict=True)]
+    fibres = np.sum(rays, axis=0) / 5.0
     ring = np.exp(-(((r - 0.46) / 0.10) ** 2))
-    colour = identity.iris_colour * (1.0 + 0.38 * fibres[..., None] + 0.9 * smooth_step(r, 0.35, 0.8)[..., None] * 0.6)
+    colour = identity.iris_colour * (1.0 + 0.38 * fibres[..., None] + 0.54 * smooth_step(r, 0.35, 0.8)[..., None])
     colour = colour + ring[..., None] * identity.iris_colour * np.array([1.3, 0.8, 0.4])
-    colour *= (1 - 0.85 * smooth_step(r, 0.84, 1.0))[..., None]
-    pupil = 1 - smooth_step(r, 0.31, 0.36)
+    colour *= (1 - 0.88 * smooth_step(r, 0.76, 1.0))[..., None]
+    pupil = 1 - smooth_step(r, 0.36, 0.41)
     colour = colour * (1 - pupil[..., None]) + pupil[..., None] * 0.002
     white = np.array([0.68, 0.64, 0.61]) * (1 - 0.14 * smooth_step(radius, 0.6, 1.0))[..., None]
     veins = np.clip(np.cos(angle * 2) ** 2 * smooth_step(radius, 0.62, 1.0), 0, 1)

@@ -148,6 +148,7 @@ def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) ->
     weight = area.reshape(-1) / (0.5 * np.sqrt(3.0) * _spacing(samples) ** 2)
     sample_uv = chart.uv(samples)
     free = ~np.any([_inside(outline, sample_uv) for outline in outlines], axis=0)
+    free &= samples[:, 0] > 0.45 * _spacing(samples)  # nor close to the midline and the seam
     samples, weight, sample_uv = samples[free], weight[free], sample_uv[free]
 
     fixed = cast(RAY_ORIGIN, chart.directions(fixed_uv))
@@ -181,8 +182,10 @@ def build_head_mesh() -> HeadMesh:
         _edge(chart, np.array([0.0, V_RIM]), np.array([1.0, V_RIM]))[1:],
         _edge(chart, np.array([1.0, V_RIM]), np.array([1.0, V_CROWN]))[1:-1],
     ]
-    mouth_outline = np.concatenate((ring_uv[1][-1], [[0.4, mouth_bottom], [0.4, mouth_top]]))
-    outlines = [ring_uv[0][-1], mouth_outline, ring_uv[2][-1]]
+    # Vertices in between keep a little away from the rings' edges.
+    eye_line, mouth_line, ear_line = (r[-1] + 0.1 * (r[-1] - r[-1].mean(0)) for r in ring_uv)
+    mouth_line = np.concatenate((mouth_line, [[0.4, mouth_line[-1, 1]], [0.4, mouth_line[0, 1]]]))
+    outlines = [eye_line, mouth_line, ear_line]
     fixed_uv = np.concatenate((*[r[-1] for r in ring_uv], *edges))
     free_uv = np.concatenate((*edges, _fill(chart, fixed_uv, outlines)))
     ring_index = [_ring_indices(eye, 0)]
@@ -193,31 +196,69 @@ def build_head_mesh() -> HeadMesh:
     uv[np.abs(uv[:, 0] - 0.5) < 1e-9, 0] = 0.5
     half[uv[:, 0] == 0.5, 0] = 0.0
 
-    triangles = _triangulate(chart, uv)
-    centroid = uv[triangles].mean(1)
-    slit = ring_uv[1][0]
-    hole = _inside(ring_uv[0][0], centroid) | _inside(
-        np.concatenate((slit, [[0.4, slit[-1, 1]], [0.4, slit[0, 1]]])), centroid
+    outer = [index[-1] for index in ring_index]
+    around = np.concatenate((*outer, np.arange(len(uv) - len(free_uv), len(uv))))
+    starts = np.cumsum([0] + [len(ring) for ring in outer])
+    rings = [(np.arange(i, j), r.closed) for i, j, r in zip(starts[:-1], starts[1:], features, strict=True)]
+    triangles = around[_triangulate(chart, uv[around], rings)]
+    strips = [_strips(index, r.closed) for index, r in zip(ring_index, features, strict=True)]
+    triangles = np.concatenate((triangles, *strips, _closing(ring_index[2][0])))
+    a, b, c = (uv[triangles[:, k]] for k in range(3))
+    clockwise = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    triangles[clockwise] = triangles[clockwise, ::-1]
+    return _assemble(uv, half, triangles, ring_index)
+
+
+def _strips(index: np.ndarray, closed: bool) -> np.ndarray:
+    """Triangles [F, 3], of either winding, between each of the rings [R, K] and the next."""
+    if closed:
+        index = np.concatenate((index, index[:, :1]), -1)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    quads = np.stack((a, b, c, d), -1).reshape(-1, 4)
+    return np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
+
+
+def _closing(ring: np.ndarray) -> np.ndarray:
+    """Triangles [F, 3], of either winding, that fill a ring by joining opposite points."""
+    count = len(ring)
+    up, down = ring[: count // 2 + 1], np.concatenate((ring[:1], ring[: count // 2 - 1 : -1]))
+    faces = np.stack((up[:-1], up[1:], down[1:]), -1), np.stack((up[:-1], down[1:], down[:-1]), -1)
+    triangles = np.concatenate(faces)
+    repeated = (
+        (triangles[:, 0] == triangles[:, 1])
+        | (triangles[:, 1] == triangles[:, 2])
+        | (triangles[:, 0] == triangles[:, 2])
     )
-    return _assemble(uv, half, triangles[~hole], ring_index)
+    return triangles[~repeated]
 
 
-def _triangulate(chart: SkinChart, uv: np.ndarray) -> np.ndarray:
-    """Delaunay triangles [F, 3] of the left half on a stereographic disc, where angles are nearly those of the surface.
+def _triangulate(chart: SkinChart, uv: np.ndarray, rings: list[tuple[np.ndarray, bool]]) -> np.ndarray:
+    """Delaunay triangles [F, 3] of the left half outside the rings (vertex indices, whether closed).
 
-    Seen from `RAY_ORIGIN` the neck is foreshortened; it is drawn out first, in Mercator's latitude.
+    On a stereographic disc, where angles are nearly those of the surface. Seen from `RAY_ORIGIN` the neck is
+    foreshortened; it is drawn out first, in Mercator's latitude.
     """
     d = chart.directions(uv)
     latitude = np.arcsin(np.clip(d[:, 1], -1.0, 1.0))
     mercator = np.arcsinh(np.tan(np.clip(latitude, -1.55, 1.55))) - NECK_STRETCH * chart.neck_share(uv)
     stretched = np.where(chart.neck_share(uv) > 0, np.arctan(np.sinh(mercator)), latitude)
     d = _directions(np.arctan2(d[:, 0], d[:, 2]), stretched)
-    triangles = Delaunay(d[:, 1:] / (1.0 + d[:, :1])).simplices
-    a, b, c = (d[triangles[:, k]] for k in range(3))
-    outwards = (np.cross(b - a, c - a) * (a + b + c)).sum(-1)
-    triangles = np.where(outwards[:, None] > 0, triangles, triangles[:, ::-1])[np.abs(outwards) > 1e-9]
+    disc = d[:, 1:] / (1.0 + d[:, :1])
+    guards = []  # a point inside each ring edge makes the edge Delaunay
+    for ring, closed in rings:
+        a, b = disc[ring], disc[np.roll(ring, -1)]
+        a, b = (a, b) if closed else (a[:-1], b[:-1])
+        inward = np.stack((a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]), -1)
+        inward *= np.sign(((disc[ring].mean(0) - a) * inward).sum(-1, keepdims=True))
+        guards.append(0.5 * (a + b) + 0.8 * inward)
+    triangles = Delaunay(np.concatenate((disc, *guards))).simplices
+    triangles = triangles[(triangles < len(uv)).all(1)]
+    for ring, _ in rings:
+        triangles = triangles[~_inside(disc[ring], disc[triangles].mean(1))]
     rim = np.abs(uv[:, 1] - V_RIM) < 1e-9
-    return triangles[rim[triangles].sum(1) < 3]
+    triangles = triangles[rim[triangles].sum(1) < 3]
+    a, b, c = (d[triangles[:, k]] for k in range(3))
+    return triangles[np.abs((np.cross(b - a, c - a) * (a + b + c)).sum(-1)) > 1e-9]
 
 
 def _assemble(uv: np.ndarray, half: np.ndarray, triangles: np.ndarray, rings: list[np.ndarray]) -> HeadMesh:
