@@ -13,6 +13,7 @@ from tqdm import tqdm
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.head.model import HeadModel
 from avatar.run import Run
 from avatar.splat import splat
 from avatar.transfer import Transfer, transfer_motion
@@ -45,7 +46,11 @@ def reenact(
     out = out or run.path / "reenact" / f"{driver.name}-{transfer}.mp4"
     target_frames = run.subject.split.train
     moved, source, goal = transfer_motion(
-        [driver.params(i) for i in range(len(driver))], [run.subject.params(i) for i in target_frames], transfer
+        [driver.params(i) for i in range(len(driver))],
+        [run.subject.params(i) for i in target_frames],
+        transfer,
+        HeadModel(run.avatar.head.assets, driver.identity),
+        run.avatar.head,
     )
     if source is not None and goal is not None and source.frame is not None and goal.frame is not None:
         theirs = driver.manifest.frames[source.frame].name

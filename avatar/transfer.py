@@ -17,11 +17,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.head.model import matrix_from_6d
-from avatar.types import HeadParams
+from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.types import IDENTITY_6D, HeadParams
 
 Transfer = Literal["raw", "relative", "mean"]
-NEUTRAL_SHARE = 0.05  # of the frames that are averaged into the neutral expression
+CALM_SHARE = 0.2  # of the frames, those whose face is nearest to the generic neutral
+NEUTRAL_SHARE = 0.02  # of the frames, so many are averaged into the neutral expression
 
 
 @dataclass(frozen=True)
@@ -33,19 +34,29 @@ class RestPose:
     frame: int | None  # the frame that is most like it; None for a mean
 
 
-def find_neutral(motion: Sequence[HeadParams]) -> RestPose:
-    """The pose that a person keeps coming back to: the densest place among the frames' expressions and jaws.
+def find_neutral(motion: Sequence[HeadParams], head: HeadModel) -> RestPose:
+    """A person's own rest: the pose that they keep coming back to while the face is calm.
 
-    The frame whose k nearest neighbours (k = 5% of the frames) are closest is found, and those k are averaged. A face at
-    rest returns to the same place; a face in motion does not.
+    Calm are the 20% of the frames whose face is displaced least from the head model's zero expression; a talking face
+    may come back more often to an open mouth, which is why density alone is not enough. Among them, the frame whose
+    nearest neighbours (2% of all frames) are closest is found, and those neighbours are averaged.
     """
     expression, jaw = _stacked(motion)
-    features = torch.cat((expression, jaw.reshape(len(motion), 9)), dim=1)
-    k = max(1, round(NEUTRAL_SHARE * len(motion)))
+    displacement = torch.stack([_face_displacement(params, head) for params in motion])
+    calm = displacement.argsort()[: max(1, round(CALM_SHARE * len(motion)))]
+    features = torch.cat((expression, jaw.reshape(len(motion), 9)), dim=1)[calm]
+    k = min(len(calm), max(1, round(NEUTRAL_SHARE * len(motion))))
     distances, neighbours = torch.cdist(features, features).topk(k, dim=1, largest=False)
     densest = int(distances.mean(dim=1).argmin())
-    chosen = neighbours[densest]
-    return RestPose(expression[chosen].mean(dim=0), _mean_rotation(jaw[chosen]), densest)
+    chosen = calm[neighbours[densest]]
+    return RestPose(expression[chosen].mean(dim=0), _mean_rotation(jaw[chosen]), int(calm[densest]))
+
+
+def _face_displacement(params: HeadParams, head: HeadModel) -> Float[Tensor, ""]:
+    """RMS distance in metres of the vertices from the identity at rest, gaze and blinks left out."""
+    identity = torch.tensor(IDENTITY_6D)
+    still = replace(params, eyes=identity.repeat(2), eyelids=torch.zeros(2), neck=identity)
+    return (head.vertices(still) - head.neutral_vertices()).square().mean().sqrt()
 
 
 def find_mean(motion: Sequence[HeadParams]) -> RestPose:
@@ -55,7 +66,11 @@ def find_mean(motion: Sequence[HeadParams]) -> RestPose:
 
 
 def transfer_motion(
-    driver: Sequence[HeadParams], target: Sequence[HeadParams], mode: Transfer
+    driver: Sequence[HeadParams],
+    target: Sequence[HeadParams],
+    mode: Transfer,
+    driver_head: HeadModel,
+    target_head: HeadModel,
 ) -> tuple[list[HeadParams], RestPose | None, RestPose | None]:
     """The driver's motion as the target's parameters, as many frames as the driver has.
 
@@ -73,8 +88,10 @@ def transfer_motion(
         )
     if mode == "raw":
         return list(driver), None, None
-    find = find_neutral if mode == "relative" else find_mean
-    source, goal = find(driver), find(target)
+    if mode == "relative":
+        source, goal = find_neutral(driver, driver_head), find_neutral(target, target_head)
+    else:
+        source, goal = find_mean(driver), find_mean(target)
     # R = goal (source^-1 driver): the driver's rotation as seen from its rest, applied to the target's rest.
     jaw_change = goal.jaw @ source.jaw.T
     moved = [

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from heads import rest_params
+from heads import grid_head, rest_params
 
-from avatar.head.model import matrix_from_6d
+from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.transfer import find_mean, find_neutral, transfer_motion
 from avatar.types import HeadParams
 
@@ -31,12 +31,13 @@ def talking(rest: torch.Tensor, jaw_rest: float, frames: int = 100, seed: int = 
     return motion
 
 
+HEAD = HeadModel(grid_head(), torch.zeros(0))
 REST_A, REST_B = torch.tensor([0.4, 0, 0.2, 0, 0]), torch.tensor([0, -0.3, 0, 0.5, 0])
 
 
 def test_the_neutral_is_found_and_the_mean_is_not_it() -> None:
     motion = talking(REST_A, 3.0)
-    neutral, mean = find_neutral(motion), find_mean(motion)
+    neutral, mean = find_neutral(motion, HEAD), find_mean(motion)
     assert (neutral.expression - REST_A).abs().max() < 0.02
     assert (neutral.jaw - rotation_x(3.0)).abs().max() < 0.01
     assert neutral.frame is not None and neutral.frame % 2 == 1
@@ -46,18 +47,18 @@ def test_the_neutral_is_found_and_the_mean_is_not_it() -> None:
 def test_relative_transfer_recovers_the_motion_about_the_targets_own_rest() -> None:
     """The same performance by two people with different rest poses: relative finds it, raw is off by the difference."""
     driver, target = talking(REST_A, 3.0), talking(REST_B, -2.0)
-    moved, source, goal = transfer_motion(driver, target, "relative")
+    moved, source, goal = transfer_motion(driver, target, "relative", HEAD, HEAD)
     assert len(moved) == len(driver) and source is not None and goal is not None
     error = max(float((m.expression - t.expression).abs().max()) for m, t in zip(moved, target, strict=True))
     jaw_error = max(float((m.jaw - t.jaw).abs().max()) for m, t in zip(moved, target, strict=True))
-    raw, _, _ = transfer_motion(driver, target, "raw")
+    raw, _, _ = transfer_motion(driver, target, "raw", HEAD, HEAD)
     raw_error = max(float((m.expression - t.expression).abs().max()) for m, t in zip(raw, target, strict=True))
     assert error < 0.03 and jaw_error < 0.01 and raw_error > 0.4
 
 
 def test_mean_transfer_moves_mean_to_mean() -> None:
     driver, target = talking(REST_A, 3.0, seed=1), talking(REST_B, -2.0, seed=2)
-    moved, _, _ = transfer_motion(driver, target, "mean")
+    moved, _, _ = transfer_motion(driver, target, "mean", HEAD, HEAD)
     torch.testing.assert_close(find_mean(moved).expression, find_mean(target).expression)
     torch.testing.assert_close(find_mean(moved).jaw, find_mean(target).jaw, rtol=0, atol=1e-5)
 
@@ -65,7 +66,7 @@ def test_mean_transfer_moves_mean_to_mean() -> None:
 @pytest.mark.parametrize("mode", ["raw", "relative", "mean"])
 def test_gaze_eyelids_and_the_number_of_frames_are_the_drivers(mode) -> None:
     driver, target = talking(REST_A, 3.0, frames=33), talking(REST_B, -2.0, frames=60)
-    moved, _, _ = transfer_motion(driver, target, mode)
+    moved, _, _ = transfer_motion(driver, target, mode, HEAD, HEAD)
     assert len(moved) == 33
     for before, after in zip(driver, moved, strict=True):
         assert torch.equal(before.eyelids, after.eyelids) and torch.equal(before.eyes, after.eyes)
@@ -75,7 +76,7 @@ def test_gaze_eyelids_and_the_number_of_frames_are_the_drivers(mode) -> None:
 
 def test_transferring_to_oneself_changes_nothing() -> None:
     motion = talking(REST_A, 3.0)
-    moved, _, _ = transfer_motion(motion, motion, "relative")
+    moved, _, _ = transfer_motion(motion, motion, "relative", HEAD, HEAD)
     for before, after in zip(motion, moved, strict=True):
         torch.testing.assert_close(after.expression, before.expression)
         torch.testing.assert_close(after.jaw, before.jaw, rtol=0, atol=1e-6)
@@ -83,8 +84,8 @@ def test_transferring_to_oneself_changes_nothing() -> None:
 
 def test_one_frame_is_enough_and_none_or_another_basis_is_refused() -> None:
     one = talking(REST_A, 0.0, frames=1)
-    assert len(transfer_motion(one, one, "relative")[0]) == 1
+    assert len(transfer_motion(one, one, "relative", HEAD, HEAD)[0]) == 1
     with pytest.raises(ValueError, match="0 of the driver, 1 of the target"):
-        transfer_motion([], one, "raw")
+        transfer_motion([], one, "raw", HEAD, HEAD)
     with pytest.raises(ValueError, match="5 expression coefficients, the target 2"):
-        transfer_motion(one, [replace(one[0], expression=torch.zeros(2))], "relative")
+        transfer_motion(one, [replace(one[0], expression=torch.zeros(2))], "relative", HEAD, HEAD)
