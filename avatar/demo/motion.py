@@ -18,20 +18,20 @@ Motion = Literal["speech", "turn"]
 MOTIONS: tuple[Motion, ...] = ("speech", "turn")
 FPS = 25.0
 CAMERA_DISTANCE = 1.0  # metres
-FIELD_OF_VIEW_HEIGHT = 0.42  # metres that the picture covers at the head
-VIEW_HEIGHT = -0.032  # metres, y of the point of the head's space that is in the middle of the picture
+FIELD_OF_VIEW_HEIGHT = 0.37  # metres that the picture covers at the head
+VIEW_HEIGHT = -0.014  # metres, y of the point of the head's space that is in the middle of the picture
 FLIP = np.diag([1.0, -1.0, -1.0])  # head axes (y up, z forward) seen by an OpenCV camera in front of the face
 
 # Shapes of the mouth that syllables go through: jaw opening in radians, and expression coefficients of both sides.
 _VISEMES: tuple[tuple[float, dict[str, float]], ...] = (
-    (0.230, {"lower_lip_down": 0.35, "upper_lip_up": 0.20}),  # a
-    (0.120, {"stretch": 0.55, "smile": 0.35, "upper_lip_up": 0.35, "lower_lip_down": 0.45}),  # e
+    (0.190, {"lower_lip_down": 0.35, "upper_lip_up": 0.20}),  # a
+    (0.095, {"stretch": 0.55, "smile": 0.35, "upper_lip_up": 0.35, "lower_lip_down": 0.45}),  # e
     (0.055, {"stretch": 0.65, "smile": 0.35, "lower_lip_down": 0.55, "upper_lip_up": 0.25}),  # i, s
-    (0.150, {"funnel": 0.75, "pucker": 0.30}),  # o
+    (0.125, {"funnel": 0.75, "pucker": 0.30}),  # o
     (0.060, {"pucker": 0.95, "funnel": 0.30}),  # u, w
     (0.000, {"lip_press": 0.75, "lip_roll_in": 0.30}),  # m, b, p
     (0.030, {"lip_roll_in": 0.25, "upper_lip_up": 0.40, "lower_lip_thrust": -0.5}),  # f, v
-    (0.090, {"upper_lip_up": 0.20, "lower_lip_down": 0.25, "frown": 0.10}),  # l, n, d
+    (0.070, {"upper_lip_up": 0.20, "lower_lip_down": 0.25, "frown": 0.10}),  # l, n, d
 )
 
 
