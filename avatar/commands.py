@@ -170,14 +170,14 @@ def demo(arguments: Namespace) -> int:
     if not actor.is_dir():
         make_subject(actor, 500, 192, 1, "speech")
     if not driver.is_dir():
-        make_subject(driver, 100, 192, 2, "turn")
+        make_subject(driver, 100, 192, 2, "speech")
     if not (run / "run.json").is_file():
         status = train_new(Source(actor, actor / "head_model"), load_config(["experiment=demo"]), run)
         if status != OK:
             return status
     trained = load_run(run)
-    results = evaluate(trained, None, write_frames=False)
     video = drive(trained, open_driver(driver, trained, None, None, None))
+    results = evaluate(trained, None, write_frames=False)
     print("\nThe demo is done. Look at")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
     print(f"  {video}   another person's motion on the avatar")
