@@ -42,7 +42,7 @@ def splat(
     alpha_min    a splat is skipped at pixels where its alpha is below this, and everywhere if its opacity is; in [0, 1)
     alpha_max    alpha is clamped to this, with zero gradient where it is; in (0, 0.9999]
     t_min        the splat that would bring the transmittance of a pixel below this is not drawn, nor any after it; [0, 1)
-    blur         pixels^2 added to both variances of a projected splat (D and G of the field: 0.3)
+    blur         pixels^2 added to both variances of a projected splat, so that none falls between pixels; >= 0
     near         splats whose centre is nearer than this along the optical axis are left out; metres, > 0
     antialiased  multiply the opacity by sqrt(det / det with blur), so that the blur adds no light (Mip-Splatting)
 

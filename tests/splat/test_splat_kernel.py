@@ -19,8 +19,10 @@ from splat.scenes import (
     gradients,
     head_camera,
     head_shell,
+    in_float64,
     random_gaussians,
     render,
+    single_splat,
     use_simd,
 )
 
@@ -62,6 +64,18 @@ def test_instruction_sets_agree_to_rounding(monkeypatch: pytest.MonkeyPatch) -> 
     baseline = render(scene)
     use_simd(monkeypatch, "avx2")
     assert (render(scene).image - baseline.image).abs().max() < 5e-6
+
+
+@pytest.mark.parametrize("simd", SIMD)
+def test_falloff_has_the_relative_precision_of_float32(simd: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A white splat on black is its alpha, down to 1e-13 of the middle's; the exponent's rounding grows with it, the
+    # exponential, opacity and colour add 4e-7.
+    use_simd(monkeypatch, simd)
+    scene = replace(single_splat(opacity=0.9, scale=0.03, colour=1.0), background=torch.zeros(3))
+    scene = scene.with_options(alpha_min=0.0, t_min=0.0)
+    found, expected = render(scene).image[..., 0].double(), render(in_float64(scene), "reference").image[..., 0]
+    assert 1e-14 < expected.min() < 1e-10
+    assert ((found / expected - 1).abs() < 4e-7 + 3e-7 * (0.9 / expected).log()).all()
 
 
 def test_unknown_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

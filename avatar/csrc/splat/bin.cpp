@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <cstring>
+#include <numeric>
 #include <stdexcept>
 #include <string>
 
@@ -35,7 +36,7 @@ void for_each_tile_row(const Splat& s, int width, int height, const Visit& visit
     const PixelRange rows = pixels_between(s.y - radius / s.c, s.y + radius / s.c, height);
     if (rows.first > rows.last) return;
     // The ellipse's rightmost point has v = -extreme, its leftmost v = +extreme.
-    const double extreme = skew * radius / std::sqrt(1.0 + skew * skew);
+    const double extreme = skew * radius / std::sqrt(1.0 + skew * skew), inv_a = 1.0 / s.a;
     for (int ty = rows.first / kTileHeight; ty <= rows.last / kTileHeight; ++ty) {
         const int top = std::max(rows.first, ty * kTileHeight);
         const int bottom = std::min(rows.last, ty * kTileHeight + kTileHeight - 1);
@@ -44,8 +45,8 @@ void for_each_tile_row(const Splat& s, int width, int height, const Visit& visit
         const double v_left = std::clamp(extreme, v0, v1), v_right = std::clamp(-extreme, v0, v1);
         const double half_left = std::sqrt(std::max(reach - v_left * v_left, 0.0));
         const double half_right = std::sqrt(std::max(reach - v_right * v_right, 0.0));
-        const PixelRange columns = pixels_between(s.x - (skew * v_left + half_left) / s.a,
-                                                  s.x - (skew * v_right - half_right) / s.a, width);
+        const PixelRange columns = pixels_between(s.x - (skew * v_left + half_left) * inv_a,
+                                                  s.x - (skew * v_right - half_right) * inv_a, width);
         if (columns.first <= columns.last) visit(ty, columns.first / kTileWidth, columns.last / kTileWidth);
     }
 }
@@ -97,13 +98,26 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, i
     const std::int64_t tiles = std::int64_t{lists.tiles_x} * lists.tiles_y;
 
     // A stable counting sort by tile. The splats are cut into one chunk a thread; each chunk counts its pairs for every
-    // tile, and then knows where its own begin. The result does not depend on the number of chunks.
+    // splat and every tile, and then knows where its own begin. The result does not depend on the number of chunks.
+    const std::int64_t chunks = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, count / 1024));
+    const std::int64_t chunk_size = (count + chunks - 1) / chunks;
+    std::vector<std::uint32_t> next(chunks * tiles, 0);
+    const auto splats_of = [&](std::int64_t chunk) {
+        return std::pair(std::min(chunk * chunk_size, count), std::min((chunk + 1) * chunk_size, count));
+    };
     lists.slot_begin.assign(count + 1, 0);
-    parallel_for(threads, count, 2048, [&](std::int64_t begin, std::int64_t end) {
+    parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
+        std::uint32_t* counts = next.data() + chunk * tiles;
+        const auto [begin, end] = splats_of(chunk);
+        std::int64_t total = 0;
         for (std::int64_t i = begin; i < end; ++i) {
-            std::int64_t pairs = 0;
-            for_each_tile_row(splats[i], width, height, [&](int, int first, int last) { pairs += last - first + 1; });
-            lists.slot_begin[i + 1] = pairs;
+            const std::int64_t before = total;
+            for_each_tile_row(splats[i], width, height, [&](int ty, int first, int last) {
+                total += last - first + 1;
+                if (total > max_pairs) return;  // refused below: only the number still matters
+                for (int tx = first; tx <= last; ++tx) ++counts[std::int64_t{ty} * lists.tiles_x + tx];
+            });
+            lists.slot_begin[i + 1] = total - before;
         }
     });
     for (std::int64_t i = 0; i < count; ++i) lists.slot_begin[i + 1] += lists.slot_begin[i];
@@ -114,20 +128,6 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, i
                                 " pixels and a splat, the limit is " + std::to_string(max_pairs) +
                                 "; are the scales too large for this camera?");
 
-    const std::int64_t chunks = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, count / 2048));
-    const std::int64_t chunk_size = (count + chunks - 1) / chunks;
-    std::vector<std::uint32_t> next(chunks * tiles, 0);
-    const auto splats_of = [&](std::int64_t chunk) {
-        return std::pair(std::min(chunk * chunk_size, count), std::min((chunk + 1) * chunk_size, count));
-    };
-    parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
-        std::uint32_t* counts = next.data() + chunk * tiles;
-        const auto [begin, end] = splats_of(chunk);
-        for (std::int64_t i = begin; i < end; ++i)
-            for_each_tile_row(splats[i], width, height, [&](int ty, int first, int last) {
-                for (int tx = first; tx <= last; ++tx) ++counts[std::int64_t{ty} * lists.tiles_x + tx];
-            });
-    });
     lists.tile_begin.resize(tiles + 1);
     std::int64_t sum = 0;
     for (std::int64_t tile = 0; tile < tiles; ++tile) {
@@ -139,6 +139,11 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, i
         }
     }
     lists.tile_begin[tiles] = sum;
+    lists.tile_order.resize(tiles);
+    std::iota(lists.tile_order.begin(), lists.tile_order.end(), 0u);
+    std::sort(lists.tile_order.begin(), lists.tile_order.end(), [&](std::uint32_t i, std::uint32_t j) {
+        return lists.tile_begin[i + 1] - lists.tile_begin[i] > lists.tile_begin[j + 1] - lists.tile_begin[j];
+    });
     lists.pairs.reset(new Pair[lists.pair_count]);  // not initialised: every element is written below
     parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
         std::uint32_t* position = next.data() + chunk * tiles;

@@ -11,6 +11,7 @@ namespace avatar::splat {
 struct TileLists {
     int tiles_x = 0, tiles_y = 0;
     std::vector<std::int64_t> tile_begin;   // [tiles + 1] into `pairs`; a tile's pairs are front to back
+    std::vector<std::uint32_t> tile_order;  // [tiles] the tiles with most pairs first, so that threads end together
     std::vector<std::int64_t> slot_begin;   // [splats + 1]: the slots of a splat
     std::unique_ptr<Pair[]> pairs;
     std::int64_t pair_count = 0;

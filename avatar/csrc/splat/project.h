@@ -2,7 +2,8 @@
 #include "splat/scene.h"
 
 // Gaussian -> Splat and its derivative: pinhole projection of mean and covariance (Zwicker et al. 2002), colour from
-// spherical harmonics. The geometry is in double: scales of 1e-12 and of 1e6 in one scene must give neither zeros nor NaN.
+// spherical harmonics. The geometry is in double: scales of 1e-12 and of 1e6 in one scene must give neither zeros nor
+// NaN.
 namespace avatar::splat {
 
 // What is the same for all Gaussians of one call.

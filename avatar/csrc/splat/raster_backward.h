@@ -4,9 +4,10 @@
 namespace avatar::splat {
 namespace {
 
-// Front to back, as the forward pass, so that the transmittance is found by the same products and not by division. With g
-// = dL/dcolour of a pixel, splat k's alpha has the gradient
-//     T_k g.c_k - behind_k / (1 - alpha_k),   behind_k = sum over j > k of T_j alpha_j g.c_j + T_end (g.background - dL/dA)
+// Front to back, as the forward pass, so that the transmittance is found by the same products and not by division. With
+// g = dL/dcolour of a pixel, splat k's alpha has the gradient
+//     T_k g.c_k - behind_k / (1 - alpha_k),
+//     behind_k = sum over j > k of T_j alpha_j g.c_j + T_end (g.background - dL/dA)
 // where A = 1 - T_end is the alpha output; behind starts as the sum over all and loses each splat as it is passed.
 void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& source, const BackwardTarget& target) {
     const TileArea area(r, tile);

@@ -22,7 +22,8 @@ const Kernels& select_kernels(const char* name) {
 #endif
     if (wanted.empty() || wanted == kernels_baseline.name) return kernels_baseline;
     if (wanted == "avx2" || wanted == "avx512")
-        throw std::invalid_argument("AVATAR_SIMD=" + wanted + " asks for instructions that this processor does not have");
+        throw std::invalid_argument("AVATAR_SIMD=" + wanted +
+                                    " asks for instructions that this processor does not have");
     throw std::invalid_argument("AVATAR_SIMD must be baseline, avx2 or avx512, got " + wanted);
 }
 

@@ -1,6 +1,6 @@
 #pragma once
-// What the forward and the backward kernel share: the pixels of a tile, and the alpha of a splat at them. Both directions
-// must make the same decisions (skipped, drawn, stopped) to the last bit, so both get them here.
+// What the forward and the backward kernel share: the pixels of a tile, and the alpha of a splat at them. Both
+// directions must make the same decisions (skipped, drawn, stopped) to the last bit, so both get them here.
 #include "splat/raster.h"
 #include "splat/simd.h"
 
@@ -64,8 +64,8 @@ struct SplatInTile {
 
 inline unsigned first_bit(unsigned bits) { return static_cast<unsigned>(__builtin_ctz(bits)); }
 
-// Whether splats are skipped, drawn or end a pixel, and the transmittance behind them. A pixel that has stopped, or that
-// is outside the image, is marked by the sign bit of its transmittance; nothing is drawn there any more.
+// Whether splats are skipped, drawn or end a pixel, and the transmittance behind them. A pixel that has stopped, or
+// that is outside the image, is marked by the sign bit of its transmittance; nothing is drawn there any more.
 struct Step {
     Ints drawn;
     Floats after;

@@ -35,7 +35,8 @@ inline void sh_basis(int degree, const float d[3], float basis[kMaxCoefficients]
     basis[15] = -c33 * x * (xx - 3 * yy);
 }
 
-// gradient[j] += sum over k of g[k] * d basis[k] / d direction[j], the direction's three components taken as independent.
+// gradient[j] += sum over k of g[k] * d basis[k] / d direction[j], the direction's three components taken as
+// independent.
 inline void sh_basis_backward(int degree, const float d[3], const float g[kMaxCoefficients], float gradient[3]) {
     const float x = d[0], y = d[1], z = d[2];
     if (degree < 1) return;

@@ -44,7 +44,8 @@ inline Floats fma(Floats a, Floats b, Floats c) {
 #endif
 }
 
-// GCC makes one instruction of the comparison for AVX-512 (and warns of its own header's _mm512_min_ps), not for the others.
+// GCC makes one instruction of the comparison for AVX-512 (and warns of its own header's _mm512_min_ps), not for the
+// others.
 inline Floats min(Floats a, Floats b) {
 #if defined(__AVX512F__)
     return a < b ? a : b;
@@ -92,9 +93,9 @@ inline float sum(Floats v) {
     return v[0];
 }
 
-// 2^x for x <= 0: relative error below 1.6e-7 down to x = -126, exactly 1 at 0 and exactly 0 from -127 on. The polynomial
-// has the least largest relative error to 2^f on [-1/2, 1/2] (9.2e-8, before rounding) among those of degree 5 with
-// constant term 1.
+// 2^x for x <= 0: relative error below 1.6e-7 down to x = -126, exactly 1 at 0 and exactly 0 from -127 on. The
+// polynomial has the least largest relative error to 2^f on [-1/2, 1/2] (9.2e-8, before rounding) among those of degree
+// 5 with constant term 1.
 inline Floats exp2_negative(Floats x) {
     const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to the nearest integer
     x = max(x, broadcast(-127.0f));

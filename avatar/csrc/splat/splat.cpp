@@ -66,7 +66,8 @@ bool project_all(const Gaussians& gaussians, Drawing& drawing) {
     visible_depths.reserve(count);
     for (std::int64_t i = 0; i < count; ++i) {
         if (visibility[i] == Visibility::kColourOverflow)
-            throw std::invalid_argument("sh gives splat " + std::to_string(i) + " a colour beyond the range of float32");
+            throw std::invalid_argument("sh gives splat " + std::to_string(i) +
+                                        " a colour beyond the range of float32");
         if (visibility[i] != Visibility::kVisible) continue;
         visible.push_back(static_cast<std::uint32_t>(i));
         visible_depths.push_back(depths[i]);
@@ -99,7 +100,7 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
     const Raster raster = raster_of(*drawing);
     const ForwardTarget target{image, alpha, drawing->transmittance.data(), drawing->processed.data()};
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t tile = begin; tile < end; ++tile) kernels.forward_tile(raster, tile, target);
+        for (std::int64_t k = begin; k < end; ++k) kernels.forward_tile(raster, drawing->lists.tile_order[k], target);
     });
     return drawing;
 }
@@ -114,8 +115,8 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* i
     const BackwardSource source{image, drawing.transmittance.data(), drawing.processed.data(), grad_image, grad_alpha};
     const BackwardTarget target{moments.get(), tile_backgrounds.data()};
     parallel_for(drawing.threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t tile = begin; tile < end; ++tile)
-            drawing.kernels->backward_tile(raster, tile, source, target);
+        for (std::int64_t k = begin; k < end; ++k)
+            drawing.kernels->backward_tile(raster, lists.tile_order[k], source, target);
     });
     double total[3] = {};
     for (std::int64_t tile = 0; tile < tiles; ++tile)

@@ -76,8 +76,8 @@ private:
     int workers_ = 0, openings_ = 0, joined_ = 0;
 };
 
-// The pool lives until the process ends: its workers may wait in it while static objects are destroyed. The threads of a
-// parent do not exist in a forked child, so a child makes its own.
+// The pool lives until the process ends: its workers may wait in it while static objects are destroyed. The threads of
+// a parent do not exist in a forked child, so a child makes its own.
 Pool& process_pool() {
     static std::mutex mutex;
     static Pool* pool = nullptr;
