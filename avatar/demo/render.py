@@ -48,14 +48,14 @@ class _Pixels(NamedTuple):
     ray: np.ndarray  # [N, 3] view-space direction with z = -1
 
     def take(self, at: np.ndarray) -> _Pixels:
-        return _Pixels(*[values[at] for values in self])
+        return _Pixels(*[np.take(values, at, axis=0) for values in self])
 
     def interpolate(self, values: np.ndarray, corners: np.ndarray | None = None) -> np.ndarray:
         """Per-vertex values [V, C] at the pixels [N, C]; other `corners` index other vertices, those of the chart say."""
         corners = self.corners if corners is None else corners
-        out = values[corners[:, 0]] * self.barycentric[:, :1]
-        out += values[corners[:, 1]] * self.barycentric[:, 1:2]
-        out += values[corners[:, 2]] * self.barycentric[:, 2:]
+        out = np.take(values, corners[:, 0], axis=0) * self.barycentric[:, :1]
+        out += np.take(values, corners[:, 1], axis=0) * self.barycentric[:, 1:2]
+        out += np.take(values, corners[:, 2], axis=0) * self.barycentric[:, 2:]
         return out
 
 
@@ -107,7 +107,7 @@ class Renderer:
         colour = np.empty((len(material), 3), np.float32)
         for kind in np.unique(material):
             at = np.flatnonzero(material == kind)
-            surface = shading.Surface(*[values[at] for values in whole])
+            surface = shading.Surface(*[np.take(values, at, axis=0) for values in whole])
             colour[at] = self._shade(int(kind), surface, pixels.take(at), geometry, R_view, params)
         if len(geometry.lens_points):
             self._add_lenses(colour, geometry, pixels, depth, whole.view, R_view, t_view, big)

@@ -62,14 +62,15 @@ def skin(s: Surface, lights: Lights, colour_gloss: np.ndarray, relief: np.ndarra
     share = np.stack((s.lit**0.65, s.lit**0.9, s.lit), -1)
     open_sky = s.occlusion[:, None] ** np.array([0.7, 1.0, 1.1], np.float32)
     diffuse = _three_lights(soft, lights, SKIN_WRAP, share * (0.45 + 0.55 * open_sky) / np.maximum(open_sky, 0.05))
-    diffuse = (diffuse + lighting.ambient(soft)) * open_sky
+    sky = lighting.ambient(soft)
+    diffuse = (diffuse + sky) * open_sky
     lobes = 0.65 * lighting.gloss(fine, s.view, lights.key, 0.46, 0.04)
     lobes += 0.35 * lighting.gloss(fine, s.view, lights.key, 0.28, 0.04)
     shine = (lobes * s.lit)[:, None] * KEY_COLOUR
     shine += lighting.gloss(fine, s.view, lights.fill, 0.45, 0.04)[:, None] * FILL_COLOUR
     shine += lighting.gloss(fine, s.view, lights.rim, 0.50, 0.04)[:, None] * RIM_COLOUR
     sheen = 0.14 * (1.0 - np.clip(_dot(fine, s.view), 0.0, 1.0)) ** 4
-    shine += sheen[:, None] * lighting.ambient(fine)
+    shine += sheen[:, None] * sky
     return colour_gloss[:, :3] * diffuse + (1.35 * colour_gloss[:, 3] * s.occlusion)[:, None] * shine
 
 
