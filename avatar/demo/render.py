@@ -94,7 +94,9 @@ class Renderer:
         depth = raster.depth[pixels.row, pixels.column]
         lit = self._key_share(geometry, R_view, t_view, pixels.ray * depth[:, None])
 
-        table = np.concatenate((geometry.normals @ R_view.T, self._occlusion[:, None], self.performer.colours), -1)
+        table = np.concatenate(
+            (lighting.turn(geometry.normals, R_view), self._occlusion[:, None], self.performer.colours), -1
+        )
         attributes = pixels.interpolate(table)
         whole = shading.Surface(
             normals=lighting.unit(attributes[:, :3]),
@@ -126,13 +128,13 @@ class Renderer:
             return self._shade_skin(surface, pixels, R_view, params)
         if kind == scene.HAIR:
             strands = pixels.interpolate(
-                self.performer.strands @ R_view.T, pixels.corners - self.performer.starts[kind]
+                lighting.turn(self.performer.strands, R_view), pixels.corners - self.performer.starts[kind]
             )
             rest = pixels.interpolate(self.performer.hair_rest, pixels.corners - self.performer.starts[kind])
             return shading.hair(surface, self.lights, strands, shading.strand_pattern(self._strands, rest))
         if kind in (scene.EYE_LEFT, scene.EYE_RIGHT):
             side = int(kind == scene.EYE_RIGHT)
-            shadow = _lid_shadow(self.performer.head, geometry, side, surface.normals @ R_view)
+            shadow = _lid_shadow(self.performer.head, geometry, side, lighting.turn(surface.normals, R_view.T))
             return shading.eye(surface, self.lights, self.iris, R_view @ geometry.eye_turns[side], shadow)
         if kind in (scene.MOUTH_UPPER, scene.MOUTH_LOWER, scene.LINING):
             return shading.mouth(surface, self.lights)
@@ -149,7 +151,9 @@ class Renderer:
         wrinkle = np.clip(self._wrinkles_of[:, : len(expression)] @ expression, 0.0, 1.2)
         low, high = (shading.lookup(half, texels) for half in self._relief)
         relief = low[:, :2] + wrinkle[0] * low[:, 2:] + wrinkle[1] * high[:, :2] + wrinkle[2] * high[:, 2:]
-        gradients = np.concatenate((performer.slopes_u @ R_view.T, performer.slopes_v @ R_view.T), -1)
+        gradients = np.concatenate(
+            (lighting.turn(performer.slopes_u, R_view), lighting.turn(performer.slopes_v, R_view)), -1
+        )
         colour = shading.lookup(self.skin.colour, texels)
         return shading.skin(surface, self.lights, colour, relief, pixels.interpolate(gradients))
 
@@ -161,12 +165,12 @@ class Renderer:
         size = lighting.SHADOW_SIZE
         scale = np.array([size / lighting.SHADOW_REACH, size / lighting.SHADOW_REACH, 1.0], np.float32)
         shift = np.array([size / 2, size / 2, 0.0], np.float32)
-        on_map = (geometry.points - SCENE_CENTRE) @ (basis @ R_view).T * scale + shift
+        on_map = lighting.turn(geometry.points - SCENE_CENTRE, basis @ R_view) * scale + shift
         away = np.array([0.0, 0.0, 10.0], np.float32)  # the rasteriser draws positive depths
         raster = rasterize_mesh(on_map + away, self.performer.faces, size, size)
         shadow_map = lighting.blurred_shadow_map(raster.depth - away[2], raster.face_id >= 0)
         centre = R_view @ SCENE_CENTRE + t_view
-        return lighting.lit_share(shadow_map, (at - centre) @ basis.T * scale + shift)
+        return lighting.lit_share(shadow_map, lighting.turn(at - centre, basis) * scale + shift)
 
     def _add_lenses(
         self,
@@ -185,7 +189,8 @@ class Renderer:
         face, lens_depth = front.face_id[pixels.row, pixels.column], front.depth[pixels.row, pixels.column]
         at = np.flatnonzero((face >= 0) & (lens_depth < depth))
         weights = front.barycentric[pixels.row[at], pixels.column[at]]
-        normals = np.einsum("nkc,nk->nc", self.performer.lens_normals[faces[face[at]]], weights) @ R_view.T
+        normals = np.einsum("nkc,nk->nc", self.performer.lens_normals[faces[face[at]]], weights)
+        normals = lighting.turn(normals, R_view)
         colour[at] = shading.lens(colour[at], lighting.unit(normals), view[at], self.lights)
 
     def _develop(self, colour: np.ndarray, material: np.ndarray, pixels: _Pixels, camera: Camera) -> RenderedFrame:
@@ -204,7 +209,7 @@ class Renderer:
 
 
 def _to_screen(points: np.ndarray, R_view: np.ndarray, t_view: np.ndarray, camera: Camera) -> np.ndarray:
-    p = points @ R_view.T + t_view
+    p = lighting.turn(points, R_view) + t_view
     depth = -p[:, 2]
     return np.stack((p[:, 0] / depth * camera.fx + camera.cx, -p[:, 1] / depth * camera.fy + camera.cy, depth), -1)
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from avatar.demo import lighting
-from avatar.demo.lighting import FILL_COLOUR, KEY_COLOUR, RIM_COLOUR, Lights, unit
+from avatar.demo.lighting import FILL_COLOUR, KEY_COLOUR, RIM_COLOUR, Lights, along, turn, unit
 from avatar.demo.sculpt import EYE_RADIUS
 
 SKIN_WRAP = np.array([0.42, 0.20, 0.13], np.float32)
@@ -83,8 +83,9 @@ def strand_pattern(tile: np.ndarray, rest: np.ndarray) -> np.ndarray:
     d = unit(rest - _SKULL)
     side = np.array([1.0, 0.0, 0.0], np.float32)
     ahead = np.cross(side, _CROWN)
-    around = np.arctan2(d @ side, d @ ahead) / (2 * np.pi)
-    away = np.arccos(np.clip(d @ _CROWN, -1.0, 1.0))
+    x, z, up = turn(d, np.stack((side, ahead, _CROWN))).T
+    around = np.arctan2(x, z) / (2 * np.pi)
+    away = np.arccos(np.clip(up, -1.0, 1.0))
     size = tile.shape[0]
     wave = 0.004 * np.sin(9.0 * away + 40.0 * around)
     at = np.stack(((around + wave) * 3 * size, away * 0.55 * size), -1) % size
@@ -97,36 +98,36 @@ def hair(s: Surface, lights: Lights, strands: np.ndarray, pattern: np.ndarray) -
     Source: Kajiya, Kay, "Rendering fur with three dimensional textures" (1989).
     """
     s = s._replace(colours=s.colours * np.clip(1.0 + 0.30 * pattern, 0.25, 2.0)[:, None])
-    along = unit(strands - _dot(strands, s.normals)[:, None] * s.normals)
+    strand = unit(strands - _dot(strands, s.normals)[:, None] * s.normals)
     out = s.colours * lighting.ambient(s.normals) * s.occlusion[:, None]
     jitter = 0.16 * pattern
-    bent = unit(along + jitter[:, None] * s.normals)
+    bent = unit(strand + jitter[:, None] * s.normals)
     tint = (0.018 + 0.5 * s.colours) * np.clip(1.0 + 0.5 * pattern, 0.0, 2.2)[:, None]
     for light, colour, lit in (
         (lights.key, KEY_COLOUR, s.lit),
         (lights.fill, FILL_COLOUR, np.float32(1.0)),
         (lights.rim, RIM_COLOUR, np.float32(1.0)),
     ):
-        across = np.sqrt(np.maximum(1.0 - (along @ light) ** 2, 0.0))
-        front = np.clip((s.normals @ light) * 0.75 + 0.25, 0.0, 1.0) * lit
+        across = np.sqrt(np.maximum(1.0 - along(strand, light) ** 2, 0.0))
+        front = np.clip(along(s.normals, light) * 0.75 + 0.25, 0.0, 1.0) * lit
         shine = np.maximum(1.0 - _dot(bent, unit(s.view + light)) ** 2, 0.0) ** 30
         out += (front * across * 0.8)[:, None] * colour * s.colours
         out += (front * shine * s.occlusion * 0.45)[:, None] * colour * tint
     return out
 
 
-def eye(s: Surface, lights: Lights, iris: np.ndarray, turn: np.ndarray, lid_shadow: np.ndarray) -> np.ndarray:
-    """Eyeball with its colour map `iris`; `turn` [3, 3] eyeball to view; `lid_shadow` [N] from the lids."""
-    outward = s.normals @ turn  # in the eyeball's own axes; the pupil is at +z
+def eye(s: Surface, lights: Lights, iris: np.ndarray, eye_view: np.ndarray, lid_shadow: np.ndarray) -> np.ndarray:
+    """Eyeball with its colour map `iris`; `eye_view` [3, 3] eyeball to view; `lid_shadow` [N] from the lids."""
+    outward = turn(s.normals, eye_view.T)  # in the eyeball's own axes; the pupil is at +z
     edge = np.hypot(outward[:, 0], outward[:, 1])
     on_iris = np.clip((0.51 - edge) / 0.06, 0.0, 1.0) * (outward[:, 2] > 0)
     # The cornea is a smaller sphere that stands out of the eyeball; the iris lies behind it.
-    own_view = s.view @ turn
+    own_view = turn(s.view, eye_view.T)
     behind = np.clip(np.sqrt(np.maximum(1.0 - edge**2, 0.0)) - np.sqrt(1 - IRIS_EDGE**2), 0.0, 0.12) * on_iris
     at = outward[:, :2] - (1.1 * behind)[:, None] * own_view[:, :2] / np.maximum(own_view[:, 2:], 0.35)
     colour = lookup(iris, np.stack((at[:, 0] + 1, 1 - at[:, 1]), -1) * (iris.shape[0] / 2) - 0.5)
     cornea = unit(outward * np.float32(EYE_RADIUS) - np.array([0.0, 0.0, 5.6], np.float32))
-    wet = unit(cornea * on_iris[:, None] + outward * (1 - on_iris[:, None])) @ turn.T
+    wet = turn(unit(cornea * on_iris[:, None] + outward * (1 - on_iris[:, None])), eye_view)
     diffuse = _three_lights(s.normals, lights, SKIN_WRAP, (0.25 + 0.75 * s.lit)[:, None])
     diffuse += 0.9 * lighting.ambient(s.normals)
     tinted = lid_shadow[:, None] ** np.array([0.85, 1.0, 1.05], np.float32)
@@ -145,7 +146,7 @@ def mouth(s: Surface, lights: Lights) -> np.ndarray:
 
 def frame(s: Surface, lights: Lights) -> np.ndarray:
     """The polished frame of the glasses."""
-    direct = np.maximum(s.normals @ lights.key, 0.0)[:, None] * KEY_COLOUR * s.lit[:, None]
+    direct = np.maximum(along(s.normals, lights.key), 0.0)[:, None] * KEY_COLOUR * s.lit[:, None]
     return s.colours * (lighting.ambient(s.normals) + direct) + _mirrored(s.normals, s.view, lights, 0.05, 0.6)
 
 
