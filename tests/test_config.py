@@ -20,7 +20,7 @@ def test_the_default_is_the_papers_recipe() -> None:
 def test_later_overrides_win_and_survive_a_round_trip() -> None:
     config = load_config(["experiment=demo", "model=flashavatar", "trainer.iterations=7", "trainer.iterations=9"])
     assert config.trainer.iterations == 9
-    assert (config.model.name, config.model.uv_size) == ("flashavatar", 64)
+    assert (config.model.name, config.model.mlp_width) == ("flashavatar", 128)
     assert config_from_dict(config.to_dict()) == config
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -161,21 +162,23 @@ def render_held_out(avatar: Avatar, loader: FrameLoader, subject: Subject, backg
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a flag that the loop reads between steps; a second one acts at once."""
+    """Turn the first Ctrl-C or SIGTERM into a flag that the loop reads between steps; a second one acts at once.
+
+    A signal that is ignored (a job in the background of a shell, nohup) stays ignored, and outside the main thread the
+    signals are somebody else's.
+    """
     caught = False
+    previous: dict[int, Any] = {}
 
     def note(number: int, _: FrameType | None) -> None:
         nonlocal caught
         caught = True
         signal.signal(number, previous[number])
 
-    previous: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        for number in previous:
-            signal.signal(number, note)
-    except ValueError:  # not the main thread: signals are somebody else's
-        yield lambda: False
-        return
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) != signal.SIG_IGN:
+                previous[number] = signal.signal(number, note)
     try:
         yield lambda: caught
     finally:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,15 @@ def test_another_seed_is_another_avatar(tracked_folder: Path, tmp_path: Path) ->
     assert not torch.equal(a.deformation.output.weight, b.deformation.output.weight)
 
 
+@pytest.fixture
+def ctrl_c_works() -> Iterator[None]:
+    """SIGINT is ignored where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c_works")
 def test_an_interruption_saves_the_state_and_stops(tracked_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     log_step = trainer_module.TrainingLog.step
@@ -78,12 +88,22 @@ def test_an_interruption_saves_the_state_and_stops(tracked_folder: Path, tmp_pat
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.usefixtures("ctrl_c_works")
 def test_a_second_interruption_acts_at_once() -> None:
     with pytest.raises(KeyboardInterrupt), interruption() as interrupted:
         os.kill(os.getpid(), signal.SIGINT)
         assert interrupted()
         os.kill(os.getpid(), signal.SIGINT)
         assert not interrupted(), "the second signal was swallowed"
+
+
+@pytest.mark.usefixtures("ctrl_c_works")
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interruption() as interrupted:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert not interrupted()
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
 
 
 def test_a_gradient_that_is_not_finite_stops_and_leaves_the_last_checkpoint(
