@@ -8,8 +8,9 @@ PIP_FLAGS ?=
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
 NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
+STRESS_EXAMPLES ?= 20000
 
-.PHONY: help setup demo test check format smoke wheel clean
+.PHONY: help setup demo test stress sanitize check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
@@ -20,6 +21,12 @@ demo: setup ## make a subject, train an avatar on it, evaluate it and let anothe
 
 test: setup ## run all tests
 	$(BIN)/python -m pytest
+
+stress: setup ## draw tens of thousands of random and poisoned scenes (STRESS_EXAMPLES=20000 of each kind)
+	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest --timeout=0 tests/stress
+
+sanitize: setup ## run the splatter's tests with AddressSanitizer and UndefinedBehaviorSanitizer
+	scripts/sanitize.sh
 
 check: setup ## lint, formatting and types
 	$(BIN)/ruff check .
