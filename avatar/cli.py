@@ -1,4 +1,4 @@
-"""The command line: `avatar train | eval | reenact | prepare | demo-data | demo | doctor`."""
+"""The command line: `avatar train | eval | reenact | prepare | demo-data | demo | bench | doctor`."""
 
 from __future__ import annotations
 
@@ -92,6 +92,11 @@ def build_parser() -> argparse.ArgumentParser:
 
     demo = commands.add_parser("demo", help="make two subjects, train on one, evaluate, reenact with the other")
     demo.add_argument("out", type=Path, metavar="OUT")
+
+    bench = commands.add_parser("bench", help="measure time and error of a part on this machine")
+    bench.add_argument("part", choices=("splat",))
+    bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
+    bench.add_argument("--quick", action="store_true", help="tiny scenes, to see that the measurement works")
 
     doctor = commands.add_parser("doctor", help="say what this installation can do and what is missing")
     doctor.set_defaults()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from avatar.bench.report import bench_splat
 from avatar.checkpoint import Checkpoint, newest_checkpoint, read_run_info
 from avatar.config import Config, load_config
 from avatar.data.subject import Subject
@@ -59,6 +60,9 @@ def resume_training(run: Path, arguments: Namespace, overrides: list[str]) -> in
             f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
             f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
         )
+    if checkpoint.step >= config.trainer.iterations:
+        print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
+        return OK
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
     avatar = Avatar(assets, subject.identity, config.model)
     return finish_training(avatar, subject, config, run, checkpoint)
@@ -182,6 +186,12 @@ def demo(arguments: Namespace) -> int:
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
+    return OK
+
+
+def bench(arguments: Namespace) -> int:
+    """The splatter is the only part with a benchmark, so there is nothing to choose yet."""
+    bench_splat(arguments.out, quick=arguments.quick)
     return OK
 
 

@@ -1,0 +1,93 @@
+"""What a run of the benchmark leaves: a table on the terminal, bench_splat.json and bench_splat.png."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from avatar.bench.splat import Row, all_variants, as_json, measure
+from avatar.errors import UserError
+
+QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
+
+
+def bench_splat(out: Path, *, quick: bool = False, say: Callable[[str], None] = print) -> list[Row]:
+    """Measure, print and write; `quick` is a check of the benchmark itself, on scenes too small to say anything."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out} cannot be made ({error.strerror}); choose another --out") from error
+    if quick:
+        variants = all_variants(QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE)
+        rows = measure(variants, repeats=3, validation_size=QUICK_SIZE, say=say)
+    else:
+        rows = measure(all_variants(), repeats=21, validation_size=512, say=say)
+    for line in table(rows):
+        say(line)
+    figures, plot = out / "bench_splat.json", out / "bench_splat.png"
+    figures.write_text(json.dumps(as_json(rows), indent=1) + "\n", encoding="utf-8")
+    write_plot(rows, plot)
+    say(f"\nFigures  {figures}\nPlot     {plot}")
+    return rows
+
+
+def table(rows: Iterable[Row]) -> list[str]:
+    """Milliseconds as median (95th percentile); errors against the float64 reference."""
+    lines = [
+        f"{'backend':>18} {'splats':>7} {'size':>5} {'threads':>7} {'forward ms':>17} {'backward ms':>17} {'sum':>8} "
+        f"{'image error':>11} {'gradient error':>14}"
+    ]
+    for row in rows:
+        variant, accuracy, timing = row.variant, row.accuracy, row.timing
+        forward = f"{timing.forward:.2f} ({timing.forward_p95:.2f})"
+        backward = f"{timing.backward:.2f} ({timing.backward_p95:.2f})"
+        errors = f"{accuracy.image:11.1e} {accuracy.gradient:14.1e}" if accuracy else f"{'is the truth':>26}"
+        lines.append(
+            f"{label(row):>18} {variant.count:7,} {variant.size:5} {variant.threads:7} {forward:>17} {backward:>17} "
+            f"{timing.forward + timing.backward:8.2f} {errors}"
+        )
+    return lines
+
+
+def label(row: Row) -> str:
+    return f"{row.variant.backend} {row.variant.simd}".strip()
+
+
+def write_plot(rows: Sequence[Row], path: Path) -> None:
+    """Time against error, against resolution and against the number of splats."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    by_error, by_size, by_count = figure.subplots(1, 3)
+    measured = [(row, row.accuracy) for row in rows if row.accuracy]
+    for name in dict.fromkeys(label(row) for row, _ in measured):
+        points = [(a.gradient, total(row)) for row, a in measured if label(row) == name]
+        by_error.scatter(*zip(*points, strict=True), s=18, label=name)
+    by_error.set(xlabel="largest relative error of a gradient", ylabel="forward + backward, ms")
+
+    slow = next(row for row in rows if row.variant.backend == "reference")  # where the two sweeps cross
+    count, size = slow.variant.count, slow.variant.size
+    best = measured[0][0].variant.simd
+    cpu = [row for row, _ in measured if row.variant.simd == best]
+    for threads in sorted({row.variant.threads for row in cpu}):
+        own = [row for row in cpu if row.variant.threads == threads]
+        sizes = sorted((row.variant.size, total(row)) for row in own if row.variant.count == count)
+        counts = sorted((row.variant.count, total(row)) for row in own if row.variant.size == size)
+        for axes, line in ((by_size, sizes), (by_count, counts)):
+            axes.plot(*zip(*line, strict=True), marker="o", ms=4, label=f"cpu {best}, threads: {threads}")
+    by_size.plot(size, total(slow), "k*", label="reference (plain torch, float64)")
+    by_count.plot(count, total(slow), "k*", label="reference (plain torch, float64)")
+    by_size.set(xlabel=f"width and height in pixels, {count:,} splats")
+    by_count.set(xlabel=f"splats, {size} x {size} pixels")
+    for axes in (by_error, by_size, by_count):
+        axes.set(xscale="log", yscale="log")
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def total(row: Row) -> float:
+    return row.timing.forward + row.timing.backward

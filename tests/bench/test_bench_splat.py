@@ -1,0 +1,79 @@
+"""The benchmark writes what it promises, and never times a wrong result."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from avatar import cli
+from avatar.bench.scenes import head_shell
+from avatar.bench.splat import Variant, available_simd, draw, measure, timing_of
+from avatar.errors import UserError
+from avatar.splat import splat
+from avatar.types import Gaussians, Rendering
+
+
+def test_quick_run_prints_a_table_and_writes_figures_and_plot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["bench", "splat", "--quick", "--out", str(tmp_path / "out")]) == 0
+    written = json.loads((tmp_path / "out" / "bench_splat.json").read_text())
+    assert written["machine"]["simd"] == available_simd()
+    simd = {row["variant"]["simd"] for row in written["rows"] if row["variant"]["backend"] == "cpu"}
+    assert simd == set(available_simd())
+    assert [row["accuracy"] for row in written["rows"] if row["variant"]["backend"] == "reference"] == [None]
+    for row in written["rows"]:
+        assert 0 < row["timing"]["forward"] <= row["timing"]["forward_p95"]
+        assert 0 < row["timing"]["backward"] <= row["timing"]["backward_p95"]
+        if row["accuracy"]:
+            assert row["accuracy"]["image"] <= 1e-5
+            assert row["accuracy"]["gradient"] <= 1e-4
+    assert (tmp_path / "out" / "bench_splat.png").read_bytes().startswith(b"\x89PNG")
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.lstrip().startswith(("cpu", "reference"))]
+    assert len(lines) == len(written["rows"])
+
+
+def brighter(gaussians: Gaussians, *arguments: Any, **options: Any) -> Rendering:
+    image, alpha = splat(gaussians, *arguments, **options)
+    return Rendering(image + 2e-5, alpha)
+
+
+def with_steeper_gradients(gaussians: Gaussians, *arguments: Any, **options: Any) -> Rendering:
+    image, alpha = splat(gaussians, *arguments, **options)
+    return Rendering(image + 1e-3 * (image - image.detach()), alpha)
+
+
+def not_a_number(gaussians: Gaussians, *arguments: Any, **options: Any) -> Rendering:
+    image, alpha = splat(gaussians, *arguments, **options)
+    return Rendering(image * torch.nan, alpha)
+
+
+@pytest.mark.parametrize("wrong", [brighter, with_steeper_gradients, not_a_number])
+def test_a_wrong_variant_is_refused(wrong: Any) -> None:
+    variant = Variant("cpu", 200, 32, 1, "baseline")
+    measure([variant], repeats=1, validation_size=32, say=lambda _: None)
+    with pytest.raises(UserError, match="is wrong, so it is not timed"):
+        measure([variant], repeats=1, validation_size=32, say=lambda _: None, function=wrong)
+
+
+def test_drawing_a_variant_leaves_threads_and_environment_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AVATAR_THREADS", "2")
+    monkeypatch.delenv("AVATAR_SIMD", raising=False)
+    threads = torch.get_num_threads()
+    draw(Variant("cpu", 10, 8, threads + 1, "baseline"), head_shell(10), 8)
+    assert (os.environ["AVATAR_THREADS"], os.environ.get("AVATAR_SIMD")) == ("2", None)
+    assert torch.get_num_threads() == threads
+
+
+def test_timing_is_the_median_and_the_95th_percentile() -> None:
+    timing = timing_of([(float(i), 2.0 * i) for i in range(21)])
+    assert (timing.forward, timing.forward_p95, timing.backward, timing.backward_p95) == (10.0, 19.0, 20.0, 38.0)
+
+
+def test_the_scene_is_the_same_every_time() -> None:
+    assert all(torch.equal(a, b) for a, b in zip(head_shell(100), head_shell(100), strict=True))
