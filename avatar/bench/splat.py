@@ -167,23 +167,29 @@ def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, fu
 def time_in_turns(
     variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int, function: Draw = splat
 ) -> list[Timing]:
-    """One unmeasured round, then `repeats` rounds; the reference, seconds long, takes part in the first three."""
-    cotangent = torch.ones(size, size, 3)
-    times: list[list[tuple[float, float]]] = [[] for _ in variants]
-    for turn in range(-1, repeats):
-        for variant, measured in zip(variants, times, strict=True):
-            if variant.backend == "reference" and not 0 <= turn < 3:
-                continue
-            leaves = Gaussians(*(t.clone().requires_grad_() for t in gaussians))
-            begin = time.perf_counter()
-            rendering = draw(variant, leaves, size, function)
-            middle = time.perf_counter()
-            with threads_of(variant):
-                torch.autograd.grad(rendering.image, leaves, cotangent)
-            end = time.perf_counter()
-            if turn >= 0:
-                measured.append((1e3 * (middle - begin), 1e3 * (end - middle)))
-    return [timing_of(measured) for measured in times]
+    """One unmeasured round, then `repeats` rounds; the reference, seconds long, has three of its own after them."""
+    times: dict[Variant, list[tuple[float, float]]] = {variant: [] for variant in variants}
+    fast = [v for v in variants if v.backend == "cpu"]
+    slow = [v for v in variants if v.backend == "reference"]
+    for group, rounds in ((fast, repeats), (slow, min(repeats, 3))):
+        for turn in range(-1, rounds):
+            for variant in group:
+                measured = time_once(variant, gaussians, size, function)
+                if turn >= 0:
+                    times[variant].append(measured)
+    return [timing_of(times[variant]) for variant in variants]
+
+
+def time_once(variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat) -> tuple[float, float]:
+    """Milliseconds of one forward and of one backward pass."""
+    leaves, cotangent = Gaussians(*(t.clone().requires_grad_() for t in gaussians)), torch.ones(size, size, 3)
+    with threads_of(variant):
+        begin = time.perf_counter()
+        rendering = draw(variant, leaves, size, function)
+        middle = time.perf_counter()
+        torch.autograd.grad(rendering.image, leaves, cotangent)
+        end = time.perf_counter()
+    return 1e3 * (middle - begin), 1e3 * (end - middle)
 
 
 def timing_of(times: Sequence[tuple[float, float]]) -> Timing:
