@@ -80,10 +80,16 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
             axes.plot(*zip(*line, strict=True), marker="o", ms=4, label=f"cpu {best}, threads: {threads}")
     by_size.plot(size, total(slow), "k*", label="reference (plain torch, float64)")
     by_count.plot(count, total(slow), "k*", label="reference (plain torch, float64)")
+    for axes, key in ((by_size, "size"), (by_count, "count")):
+        shown = sorted({getattr(row.variant, key) for row in cpu})
+        axes.set_xscale("log")
+        axes.set_xticks(shown, [f"{value:,}" for value in shown])
+        axes.set_xticks([], minor=True)
+    by_error.set(xscale="log", xlim=(1e-7, 1e-4))
     by_size.set(xlabel=f"width and height in pixels, {count:,} splats")
     by_count.set(xlabel=f"splats, {size} x {size} pixels")
     for axes in (by_error, by_size, by_count):
-        axes.set(xscale="log", yscale="log")
+        axes.set(yscale="log")
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=90)
