@@ -1,4 +1,4 @@
-"""The scene that the splatter is measured on: splats on the surface of something of a head's size, as after training."""
+"""The scene that the splatter is measured on: splats on the surface of something of a head's size."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ SEMI_AXES = (0.075, 0.11, 0.095)  # metres
 def head_shell(count: int = HEAD_SPLATS, *, seed: int = 0) -> Gaussians:
     """`count` splats on a bumpy ellipsoid around the origin, the same for the same seed; colours of degree 3.
 
-    Scales come from the spacing of the splats, and the opacities (half of them between 0.38 and 0.82) spread as those of
-    a trained avatar, so that a pixel takes several splats to fill.
+    Scales come from the spacing of the splats. Opacities spread over the whole range, half of them between 0.38 and 0.82,
+    so that a pixel takes several splats to fill, as on a trained avatar.
     """
     g = torch.Generator().manual_seed(seed)
     i = torch.arange(count, dtype=torch.float64) + 0.5
