@@ -49,7 +49,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="avatar", description="Animatable 3D Gaussian head avatars from one tracked video, on a CPU or a GPU."
+        prog="avatar", description="Animatable 3D Gaussian head avatars from one tracked video, on a CPU."
     )
     parser.add_argument("--version", action="version", version=f"avatar {avatar.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -98,8 +98,7 @@ def build_parser() -> argparse.ArgumentParser:
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
     bench.add_argument("--quick", action="store_true", help="tiny scenes, to see that the measurement works")
 
-    doctor = commands.add_parser("doctor", help="say what this installation can do and what is missing")
-    doctor.set_defaults()
+    commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser
 
 

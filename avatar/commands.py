@@ -10,7 +10,7 @@ import torch
 
 from avatar.bench.report import bench_splat
 from avatar.checkpoint import Checkpoint, newest_checkpoint, read_run_info
-from avatar.config import Config, load_config
+from avatar.config import Config, flatten, load_config
 from avatar.data.subject import Subject
 from avatar.data_prep.prepare import prepare as prepare_folder
 from avatar.demo import make_subject
@@ -103,7 +103,7 @@ def config_overrides(arguments: Namespace) -> list[str]:
 
 def refuse_changes(run: Path, config: Config, overrides: list[str]) -> None:
     """A resumed run keeps its configuration; naming another value for a key is an error, not a silent choice."""
-    recorded, asked = flat(config.to_dict()), flat(load_config(overrides).to_dict())
+    recorded, asked = flatten(config.to_dict()), flatten(load_config(overrides).to_dict())
     named = {o.partition("=")[0] for o in overrides}
     for key, value in asked.items():
         mentioned = key in named or key.partition(".")[0] in named or "experiment" in named
@@ -111,13 +111,6 @@ def refuse_changes(run: Path, config: Config, overrides: list[str]) -> None:
             raise UserError(
                 f"{run} began with {key}={recorded[key]}, not {value}: leave the override out to resume, or start a new run"
             )
-
-
-def flat(values: dict, prefix: str = "") -> dict:
-    pairs: dict = {}
-    for key, value in values.items():
-        pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return pairs
 
 
 def eval(arguments: Namespace) -> int:

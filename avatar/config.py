@@ -171,7 +171,7 @@ def config_from_dict(values: dict[str, Any]) -> Config:
 
 
 def _check_values(config: Config) -> None:
-    flat = _flatten(config.to_dict())
+    flat = flatten(config.to_dict())
     for key, choices in CHOICES.items():
         if flat[key] not in choices:
             raise UserError(f"{key}={flat[key]} is not one of {', '.join(choices)}")
@@ -218,11 +218,12 @@ def _nearest_hint(key: str, groups: Sequence[str] = ()) -> str:
     return f"; the nearest is '{near[0]}'" if near else ""
 
 
-def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dictionaries as one, with keys as they are written in overrides: `trainer.learning_rates.mlp`."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{key}.")
+            flat |= flatten(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = value
     return flat

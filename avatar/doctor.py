@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 import sys
@@ -30,11 +29,6 @@ def report(say: Callable[[str], None] = print) -> int:
     check("head model", find_default_head, say)
     for net in ("vgg", "alex", "squeeze"):
         check(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
-    has_gpu = torch.cuda.is_available()
-    say(f"  {'CUDA':16} {torch.cuda.get_device_name() if has_gpu else 'no device; everything runs on the CPU'}")
-    for package, purpose in (("gsplat", "GPU splatting"), ("viser", "live viewer"), ("mediapipe", "landmarks")):
-        found = importlib.util.find_spec(package) is not None
-        say(f"  {package:16} {'installed' if found else f'not installed (optional: {purpose})'}")
     return 0 if all(works) else 1
 
 
