@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from avatar.bench.scenes import head_camera, head_shell
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, Rendering
 
@@ -60,27 +61,6 @@ def random_gaussians(
         opacities=torch.rand(count, generator=g),
         sh=0.3 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=g),
     )
-
-
-def head_shell(count: int = 14_876, *, seed: int = 0) -> Gaussians:
-    """Splats on a bumpy ellipsoid of the size of a head, their sizes from the spacing, as a trained avatar has them."""
-    g = torch.Generator().manual_seed(seed)
-    i = torch.arange(count, dtype=torch.float64) + 0.5
-    polar, azimuth = torch.acos(1 - 2 * i / count), math.pi * (1 + math.sqrt(5)) * i
-    unit = torch.stack((azimuth.cos() * polar.sin(), polar.cos(), azimuth.sin() * polar.sin()), -1).float()
-    radii = torch.tensor([0.075, 0.11, 0.095])
-    spacing = 0.093 * math.sqrt(4 * math.pi / count)
-    return Gaussians(
-        means=radii * unit * (1 + 0.08 * torch.sin(7 * unit[:, :1])) + 0.0015 * torch.randn(count, 3, generator=g),
-        quats=torch.randn(count, 4, generator=g),
-        scales=spacing * torch.exp(0.35 * torch.randn(count, 3, generator=g)),
-        opacities=torch.sigmoid(1.5 * torch.randn(count, generator=g) + 0.5),
-        sh=0.1 * torch.randn(count, 16, 3, generator=g),
-    )
-
-
-def head_camera(size: int) -> Camera:
-    return Camera(torch.eye(3), torch.tensor([0.0, 0.0, 0.75]), 2.2 * size, 2.2 * size, size / 2, size / 2, size, size)
 
 
 def single_splat(*, opacity: float = 0.8, scale: float = 0.02, depth: float = 1.0, colour: float = 0.3) -> Scene:

@@ -17,8 +17,6 @@ from splat.scenes import (
     Scene,
     camera,
     gradients,
-    head_camera,
-    head_shell,
     in_float64,
     random_gaussians,
     render,
@@ -26,6 +24,7 @@ from splat.scenes import (
     use_simd,
 )
 
+from avatar.bench.scenes import head_camera, head_shell
 from avatar.types import Gaussians
 
 HEAD = Scene(head_shell(), head_camera(200), torch.ones(3))
