@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from avatar import _core
 from avatar.check import check_finite
+from avatar.native import instruction_set, thread_count
 from avatar.types import Camera, Gaussians, Rendering
 
 
@@ -38,21 +38,11 @@ def splat_cpu(
         "blur": blur,
         "near": near,
         "antialiased": antialiased,
-        "simd": os.environ.get("AVATAR_SIMD", ""),
+        "simd": instruction_set(),
         "threads": thread_count(),
     }
     image, alpha = _Splat.apply(*gaussians, background, (camera.height, camera.width), settings)  # pyright: ignore
     return Rendering(image, alpha)
-
-
-def thread_count() -> int:
-    """Threads that the kernel uses: the variable AVATAR_THREADS, or as many as torch does."""
-    text = os.environ.get("AVATAR_THREADS")
-    if text is None:
-        return torch.get_num_threads()
-    if not text.isdigit() or not 1 <= int(text) <= 1024:
-        raise ValueError(f"AVATAR_THREADS must be a number of threads from 1 to 1024, got {text!r}")
-    return int(text)
 
 
 class _Splat(torch.autograd.Function):

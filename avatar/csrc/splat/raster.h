@@ -39,13 +39,11 @@ struct BackwardTarget {
 };
 
 struct Kernels {
-    const char* name;
     void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
     void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
 };
 
-// "baseline", "avx2" or "avx512"; "" is the best that this processor has. Throws std::invalid_argument for a name that
-// is unknown or that this processor or build does not support.
+// The kernels for a name that choose_instruction_set() takes.
 const Kernels& select_kernels(const char* name);
 
 }  // namespace avatar::splat

@@ -1,6 +1,4 @@
-#include <stdexcept>
-#include <string>
-
+#include "instruction_set.h"
 #include "splat/raster.h"
 
 namespace avatar::splat {
@@ -12,19 +10,16 @@ extern const Kernels kernels_avx512;
 #endif
 
 const Kernels& select_kernels(const char* name) {
-    const std::string wanted = name;
+    switch (choose_instruction_set(name)) {
 #ifdef AVATAR_X86_KERNELS
-    const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-    const bool avx512 = avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                        __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
-    if (avx512 && (wanted.empty() || wanted == kernels_avx512.name)) return kernels_avx512;
-    if (avx2 && (wanted.empty() || wanted == kernels_avx2.name)) return kernels_avx2;
+        case InstructionSet::avx512:
+            return kernels_avx512;
+        case InstructionSet::avx2:
+            return kernels_avx2;
 #endif
-    if (wanted.empty() || wanted == kernels_baseline.name) return kernels_baseline;
-    if (wanted == "avx2" || wanted == "avx512")
-        throw std::invalid_argument("AVATAR_SIMD=" + wanted +
-                                    " asks for instructions that this processor does not have");
-    throw std::invalid_argument("AVATAR_SIMD must be baseline, avx2 or avx512, got " + wanted);
+        default:
+            return kernels_baseline;
+    }
 }
 
 }  // namespace avatar::splat

@@ -6,7 +6,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "splat/thread_pool.h"
+#include "thread_pool.h"
 
 namespace avatar::splat {
 namespace {

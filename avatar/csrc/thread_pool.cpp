@@ -1,4 +1,4 @@
-#include "splat/thread_pool.h"
+#include "thread_pool.h"
 
 #include <unistd.h>
 
