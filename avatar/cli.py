@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import avatar
+from avatar.bench import PARTS
 from avatar.errors import UserError
 
 EXIT_ERROR = 1
@@ -94,9 +95,11 @@ def build_parser() -> argparse.ArgumentParser:
     demo.add_argument("out", type=Path, metavar="OUT")
 
     bench = commands.add_parser("bench", help="measure time and error of a part on this machine")
-    bench.add_argument("part", choices=("splat",))
+    bench.add_argument("part", choices=tuple(PARTS))
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
-    bench.add_argument("--quick", action="store_true", help="tiny scenes, to see that the measurement works")
+    extent = bench.add_mutually_exclusive_group()
+    extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
+    extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")
 
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
+from importlib import import_module
 from pathlib import Path
 
 import torch
 
-from avatar.bench.report import bench_splat
+from avatar.bench import PARTS
 from avatar.checkpoint import Checkpoint, newest_checkpoint, read_run_info
 from avatar.config import Config, flatten, load_config
 from avatar.data.subject import Subject
@@ -183,8 +184,13 @@ def demo(arguments: Namespace) -> int:
 
 
 def bench(arguments: Namespace) -> int:
-    """The splatter is the only part with a benchmark, so there is nothing to choose yet."""
-    bench_splat(arguments.out, quick=arguments.quick)
+    out: Path = arguments.out
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out} cannot be made ({error.strerror}); choose another --out") from error
+    # Only the part that is asked for is imported.
+    import_module(PARTS[arguments.part]).run(out, quick=arguments.quick, full=arguments.full)
     return OK
 
 

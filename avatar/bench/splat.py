@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import platform
-import statistics
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-import avatar
+from avatar.bench.clock import Time, paired_medians
+from avatar.bench.machine import available_simd, describe_machine, limited_to
 from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.types import Gaussians, Rendering
 
-SIMD = ("baseline", "avx2", "avx512")
 # What float32 and the cut-offs allow; tests/splat holds the kernel to the same.
 IMAGE_TOLERANCE = 1e-5
 GRADIENT_TOLERANCE = 1e-4
@@ -48,13 +43,10 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds through the public function."""
+    """Through the public function, with autograd."""
 
-    forward: float  # median
-    forward_p95: float
-    backward: float  # median
-    backward_p95: float
-    repeats: int
+    forward: Time
+    backward: Time
 
 
 @dataclass(frozen=True)
@@ -76,24 +68,8 @@ class Truth(NamedTuple):
 Draw = Callable[..., Rendering]
 
 
-def available_simd() -> list[str]:
-    """The instruction sets that this build and this processor have, slowest first."""
-    found = []
-    for name in SIMD:
-        try:
-            draw(Variant("cpu", 1, 8, 1, name), head_shell(1), 8)
-        except ValueError:
-            continue
-        found.append(name)
-    return found
-
-
 def all_variants(
-    sizes: Sequence[int] = (128, 256, 512, 1024),
-    counts: Sequence[int] = (1_000, 5_000, HEAD_SPLATS, 50_000, 200_000),
-    *,
-    count: int = HEAD_SPLATS,
-    size: int = 512,
+    sizes: Sequence[int], counts: Sequence[int], *, count: int = HEAD_SPLATS, size: int = 512
 ) -> list[Variant]:
     """Every size with `count` splats and every count at `size`, with one thread and with all, with the best instruction
     set; the other sets and the plain-torch reference once each at (`count`, `size`)."""
@@ -167,67 +143,42 @@ def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, fu
 def time_in_turns(
     variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int, function: Draw = splat
 ) -> list[Timing]:
-    """One unmeasured round, then `repeats` rounds; the reference, seconds long, has three of its own after them."""
-    times: dict[Variant, list[tuple[float, float]]] = {variant: [] for variant in variants}
+    """All variants in turns; the reference, seconds long, has three rounds of its own after them."""
     fast = [v for v in variants if v.backend == "cpu"]
     slow = [v for v in variants if v.backend == "reference"]
+    times: dict[tuple[Variant, str], Time] = {}
     for group, rounds in ((fast, repeats), (slow, min(repeats, 3))):
-        for turn in range(-1, rounds):
-            for variant in group:
-                measured = time_once(variant, gaussians, size, function)
-                if turn >= 0:
-                    times[variant].append(measured)
-    return [timing_of(times[variant]) for variant in variants]
+        functions = {
+            (variant, name): part
+            for variant in group
+            for name, part in passes_of(variant, gaussians, size, function).items()
+        }
+        times |= paired_medians(functions, rounds)
+    return [Timing(times[variant, "forward"], times[variant, "backward"]) for variant in variants]
 
 
-def time_once(variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat) -> tuple[float, float]:
-    """Milliseconds of one forward and of one backward pass."""
+def passes_of(
+    variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat
+) -> dict[str, Callable[[], object]]:
+    """The forward pass, and the backward pass of the drawing that the forward pass made last."""
     leaves, cotangent = Gaussians(*(t.clone().requires_grad_() for t in gaussians)), torch.ones(size, size, 3)
-    with threads_of(variant):
-        begin = time.perf_counter()
-        rendering = draw(variant, leaves, size, function)
-        middle = time.perf_counter()
-        torch.autograd.grad(rendering.image, leaves, cotangent)
-        end = time.perf_counter()
-    return 1e3 * (middle - begin), 1e3 * (end - middle)
+    drawn: list[Rendering] = []
 
+    def forward() -> None:
+        drawn[:] = [draw(variant, leaves, size, function)]
 
-def timing_of(times: Sequence[tuple[float, float]]) -> Timing:
-    forward, backward = (sorted(column) for column in zip(*times, strict=True))
-    p95 = round(0.95 * (len(times) - 1))
-    return Timing(statistics.median(forward), forward[p95], statistics.median(backward), backward[p95], len(times))
+    def backward() -> object:
+        with limited_to(threads=variant.threads, simd=variant.simd):
+            return torch.autograd.grad(drawn.pop().image, leaves, cotangent)
+
+    return {"forward": forward, "backward": backward}
 
 
 def draw(variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat) -> Rendering:
-    with threads_of(variant):
+    with limited_to(threads=variant.threads, simd=variant.simd):
         return function(gaussians, head_camera(size), torch.zeros(3), backend=variant.backend)
-
-
-@contextmanager
-def threads_of(variant: Variant) -> Iterator[None]:
-    """Let torch and the kernel work as `variant` says, and as before afterwards."""
-    names, threads = ("AVATAR_THREADS", "AVATAR_SIMD"), torch.get_num_threads()
-    before = {name: os.environ.get(name) for name in names}
-    torch.set_num_threads(variant.threads)
-    os.environ.update(AVATAR_THREADS=str(variant.threads), AVATAR_SIMD=variant.simd)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def as_json(rows: Sequence[Row]) -> dict[str, Any]:
     """All figures, with the machine that they belong to; milliseconds."""
-    machine = {
-        "avatar": avatar.__version__,
-        "torch": torch.__version__,
-        "system": f"{platform.system()} {platform.machine()}",
-        "processors": os.cpu_count(),
-        "simd": available_simd(),
-    }
-    return {"machine": machine, "rows": [asdict(row) for row in rows]}
+    return {"machine": describe_machine(), "rows": [asdict(row) for row in rows]}

@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from avatar.bench.scenes import HEAD_SPLATS
 from avatar.bench.splat import Row, all_variants, as_json, measure
-from avatar.errors import UserError
 
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
+USUAL_SIZES, USUAL_COUNTS = (256, 512), (HEAD_SPLATS, 50_000)
+FULL_SIZES, FULL_COUNTS = (128, 256, 512, 1024), (1_000, 5_000, HEAD_SPLATS, 50_000, 200_000)
 
 
-def bench_splat(out: Path, *, quick: bool = False, say: Callable[[str], None] = print) -> list[Row]:
-    """Measure, print and write; `quick` is a check of the benchmark itself, on scenes too small to say anything."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{out} cannot be made ({error.strerror}); choose another --out") from error
+def run(out: Path, *, quick: bool, full: bool) -> None:
+    """Measure, print and write; `quick` takes scenes too small to say anything."""
     if quick:
         variants = all_variants(QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE)
-        rows = measure(variants, repeats=3, validation_size=QUICK_SIZE, say=say)
+        rows = measure(variants, repeats=3, validation_size=QUICK_SIZE)
     else:
-        rows = measure(all_variants(), repeats=21, validation_size=512, say=say)
+        sizes, counts = (FULL_SIZES, FULL_COUNTS) if full else (USUAL_SIZES, USUAL_COUNTS)
+        rows = measure(all_variants(sizes, counts), repeats=21, validation_size=512)
     for line in table(rows):
-        say(line)
+        print(line)
     figures, plot = out / "bench_splat.json", out / "bench_splat.png"
     figures.write_text(json.dumps(as_json(rows), indent=1) + "\n", encoding="utf-8")
     write_plot(rows, plot)
-    say(f"\nFigures  {figures}\nPlot     {plot}")
-    return rows
+    print(f"\nFigures  {figures}\nPlot     {plot}")
 
 
 def table(rows: Iterable[Row]) -> list[str]:
@@ -40,12 +38,12 @@ def table(rows: Iterable[Row]) -> list[str]:
     ]
     for row in rows:
         variant, accuracy, timing = row.variant, row.accuracy, row.timing
-        forward = f"{timing.forward:.2f} ({timing.forward_p95:.2f})"
-        backward = f"{timing.backward:.2f} ({timing.backward_p95:.2f})"
+        forward = f"{timing.forward.median:.2f} ({timing.forward.p95:.2f})"
+        backward = f"{timing.backward.median:.2f} ({timing.backward.p95:.2f})"
         errors = f"{accuracy.image:11.1e} {accuracy.gradient:14.1e}" if accuracy else f"{'is the truth':>26}"
         lines.append(
             f"{label(row):>18} {variant.count:7,} {variant.size:5} {variant.threads:7} {forward:>17} {backward:>17} "
-            f"{timing.forward + timing.backward:8.2f} {errors}"
+            f"{total(row):8.2f} {errors}"
         )
     return lines
 
@@ -96,4 +94,4 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def total(row: Row) -> float:
-    return row.timing.forward + row.timing.backward
+    return row.timing.forward.median + row.timing.backward.median
