@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from avatar.data.images import IMAGE_SUFFIXES
-from avatar.errors import UserError
+from avatar.errors import UserError, refuse
 
 
 @dataclass(frozen=True)
@@ -33,46 +34,52 @@ class FrameFiles:
         }
 
 
-def find_frame_files(folder: Path, tracking: Path | None = None) -> FrameFiles:
+def find_frame_files(
+    folder: Path, tracking: Path | None = None, complain: Callable[[str], object] = refuse
+) -> FrameFiles:
     """List `folder` (imgs/, alpha/, parsing/, checkpoint/) and the tracking folder, if that is another one.
 
-    Raises UserError when images or tracking are missing, a file has no number or two have the same one.
+    Raises UserError when there is no folder. Calls `complain`, which raises too by default, when images or tracking are
+    missing, a file has no number or two have the same one; if it returns, the listing goes on without that file.
     """
     folder = Path(folder)
     if folder.is_file():
         raise UserError(f"{folder} is a file; give the folder that holds imgs/ (the frames of the video)")
     if not folder.is_dir():
         raise UserError(f"the folder {folder} does not exist")
-    images = _numbered(folder / "imgs", IMAGE_SUFFIXES)
+    images = _numbered(folder / "imgs", IMAGE_SUFFIXES, complain)
     if not images:
-        raise UserError(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
+        complain(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
     return FrameFiles(
         folder=folder,
         images=images,
-        alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES),
-        head_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, "_neckhead"),
-        mouth_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, "_mouth"),
-        tracking=_find_tracking(folder, tracking),
+        alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES, complain),
+        head_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_neckhead"),
+        mouth_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_mouth"),
+        tracking=_find_tracking(folder, tracking, complain),
     )
 
 
-def _find_tracking(folder: Path, given: Path | None) -> dict[int, Path]:
+def _find_tracking(folder: Path, given: Path | None, complain: Callable[[str], object]) -> dict[int, Path]:
     if given is None:
-        found = _numbered(folder / "checkpoint", (".frame",))
+        found = _numbered(folder / "checkpoint", (".frame",), complain)
         if not found:
-            raise UserError(
-                f"{folder / 'checkpoint'} holds no .frame files of metrical-tracker; give --tracking their folder"
-            )
+            complain(f"{folder / 'checkpoint'} holds no .frame files of metrical-tracker; give --tracking their folder")
         return found
     if not Path(given).is_dir():
-        raise UserError(f"the tracking folder {given} does not exist")
-    found = _numbered(Path(given) / "checkpoint", (".frame",)) or _numbered(Path(given), (".frame",))
+        complain(f"the tracking folder {given} does not exist")
+        return {}
+    found = _numbered(Path(given) / "checkpoint", (".frame",), complain) or _numbered(
+        Path(given), (".frame",), complain
+    )
     if not found:
-        raise UserError(f"neither {given} nor {Path(given) / 'checkpoint'} holds .frame files of metrical-tracker")
+        complain(f"neither {given} nor {Path(given) / 'checkpoint'} holds .frame files of metrical-tracker")
     return found
 
 
-def _numbered(folder: Path, suffixes: tuple[str, ...], tag: str = "") -> dict[int, Path]:
+def _numbered(
+    folder: Path, suffixes: tuple[str, ...], complain: Callable[[str], object], tag: str = ""
+) -> dict[int, Path]:
     """Files `<anything><number><tag><suffix>` (any case) by number, in the order of the numbers."""
     if not folder.is_dir():
         return {}
@@ -86,10 +93,12 @@ def _numbered(folder: Path, suffixes: tuple[str, ...], tag: str = "") -> dict[in
                 continue
             digits = re.search(r"([0-9]+)$", stem[: len(stem) - len(tag)])
             if digits is None:
-                raise UserError(f"{entry.path} has no frame number at the end of its name; rename or remove it")
+                complain(f"{entry.path} has no frame number at the end of its name; rename or remove it")
+                continue
             number = int(digits[1])
             if number in found:
-                raise UserError(f"{found[number]} and {entry.path} are both frame {number}; remove one of them")
+                complain(f"{found[number]} and {entry.path} are both frame {number}; remove one of them")
+                continue
             found[number] = Path(entry.path)
     return dict(sorted(found.items()))
 

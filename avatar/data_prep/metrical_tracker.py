@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from avatar.data_prep.safe_pickle import UnsafeFileError, load_torch_pickle
-from avatar.errors import UserError
+from avatar.errors import UserError, refuse
 from avatar.types import IDENTITY_6D
 
 ROTATION_TOLERANCE = 1e-2  # float16 and rounding; larger errors are not a rotation
@@ -48,10 +49,11 @@ class _BadFrame(Exception):
     pass
 
 
-def read_tracking(paths: dict[int, Path]) -> Tracking:
+def read_tracking(paths: dict[int, Path], complain: Callable[[str], object] = refuse) -> Tracking:
     """Read every file; damaged, zero and non-finite ones end up in `bad` with the reason.
 
-    Raises UserError for a file that holds code, for intrinsics or image sizes that change, and for mixed-up files.
+    Calls `complain`, which raises UserError by default, for a file that holds code, for intrinsics or image sizes that
+    change, and for mixed-up files.
     """
     frames: dict[int, FrameTrack] = {}
     bad: dict[int, str] = {}
@@ -60,6 +62,9 @@ def read_tracking(paths: dict[int, Path]) -> Tracking:
             frames[number] = _read_frame(path)
         except _BadFrame as error:
             bad[number] = str(error)
+        except UnsafeFileError as error:
+            complain(str(error))
+            bad[number] = "it holds more than data"
     notes: list[str] = []
     if frames:
         first = next(iter(frames))
@@ -69,8 +74,8 @@ def read_tracking(paths: dict[int, Path]) -> Tracking:
                 if here != there:
                     bad[number] = f"{here} {field} coefficients where {paths[first].name} has {there}"
                     frames.pop(number, None)
-        _check_camera(frames, paths, notes)
-        _check_frame_ids(frames, paths, notes)
+        _check_camera(frames, paths, notes, complain)
+        _check_frame_ids(frames, paths, notes, complain)
     return Tracking(frames, dict(sorted(bad.items())), notes, paths)
 
 
@@ -157,15 +162,18 @@ def _frame_id(value: Any) -> int | None:
     return int(text) if text.isascii() and text.isdigit() and len(text) < 12 else None
 
 
-def _check_camera(frames: dict[int, FrameTrack], paths: dict[int, Path], notes: list[str]) -> None:
+def _check_camera(
+    frames: dict[int, FrameTrack], paths: dict[int, Path], notes: list[str], complain: Callable[[str], object]
+) -> None:
     first_number, first = next(iter(frames.items()))
     worst, worst_number = 0.0, first_number
     for number, frame in frames.items():
         if frame.size != first.size:
-            raise UserError(
+            complain(
                 f"{paths[number]} was tracked on {frame.size[0]}x{frame.size[1]} images but {paths[first_number].name} "
                 f"on {first.size[0]}x{first.size[1]}; track the whole video at one size"
             )
+            break
         change = float(np.abs(frame.intrinsics - first.intrinsics).max() / first.intrinsics[:2].max())
         if change > worst:
             worst, worst_number = change, number
@@ -175,11 +183,14 @@ def _check_camera(frames: dict[int, FrameTrack], paths: dict[int, Path], notes: 
             for n in (first_number, worst_number)
         )
         if worst > INTRINSICS_ERROR:
-            raise UserError(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
-        notes.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")
+            complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
+        else:
+            notes.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")
 
 
-def _check_frame_ids(frames: dict[int, FrameTrack], paths: dict[int, Path], notes: list[str]) -> None:
+def _check_frame_ids(
+    frames: dict[int, FrameTrack], paths: dict[int, Path], notes: list[str], complain: Callable[[str], object]
+) -> None:
     """The tracker's own number must agree with the file name, up to one shift of the whole clip."""
     shifts = {number: frame.frame_id - number for number, frame in frames.items() if frame.frame_id is not None}
     if not shifts:
@@ -187,10 +198,11 @@ def _check_frame_ids(frames: dict[int, FrameTrack], paths: dict[int, Path], note
     first_number, usual = next(iter(shifts.items()))
     for number, shift in shifts.items():
         if shift != usual:
-            raise UserError(
+            complain(
                 f"{paths[number]} says inside that it is frame {number + shift}, while {paths[first_number].name} says "
                 f"{first_number + usual}: files were renamed or mixed up; copy the tracker's output again"
             )
+            return
     if usual:
         notes.append(f"the .frame files were renumbered: {paths[first_number].name} says it is {first_number + usual}")
 
