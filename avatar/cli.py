@@ -59,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_source(train)
     train.add_argument("--out", type=Path, metavar="RUN", help="where the run goes (default: runs/NAME)")
     train.add_argument("--size", type=int, help="width of the training images in pixels (default: the video's)")
-    train.add_argument("--iterations", type=int, help="optimizer steps (default: 30000, the paper's)")
+    train.add_argument("--iterations", type=int, help="optimizer steps (default: the preset's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on from RUN's newest checkpoint")
     train.add_argument("overrides", nargs="*", metavar="key=value", help="configuration, such as model=flashavatar")

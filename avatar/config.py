@@ -1,8 +1,8 @@
 """The configuration: YAML files under configs/ and `key=value` overrides in, typed dataclasses out.
 
-Hydra composes (groups `data`, `model`, `trainer`, `experiment`); the defaults and what each key means stand in the YAML
-files, the dataclasses below are the schema: an unknown key, a wrong type or a value outside its range is refused with a
-sentence that names the key and the nearest one that exists.
+Hydra composes (groups `data`, `model`, `trainer`, `preset`, `experiment`); the defaults and what each key means stand in
+the YAML files, the dataclasses below are the schema: an unknown key, a wrong type or a value outside its range is refused
+with a sentence that names the key and the nearest one that exists.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class ModelConfig:
     name: str
     uv_size: int
     latent_dim: int
+    latent_grid: int | None
     mlp_width: int
     mlp_layers: int
     frequencies: int
@@ -70,7 +71,10 @@ class TrainerConfig:
     iterations: int
     seed: int
     learning_rates: LearningRates
+    lr_warmup: int
+    lr_final: float
     adam_eps: float
+    initial_colours: str
     sh_interval: int
     huber_delta: float
     mouth_weight: float
@@ -79,6 +83,8 @@ class TrainerConfig:
     dssim_weight: float
     perceptual_start: float
     lpips_net: str
+    lpips_every: int
+    lpips_crop: int | None
     log_every: int
     preview_every: int
     checkpoint_every: int
@@ -101,6 +107,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "model.name": ("hypergaussians", "flashavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
     "trainer.lpips_net": ("vgg", "alex", "squeeze"),
+    "trainer.initial_colours": ("grey", "frames"),
 }
 RANGES: dict[str, tuple[float, float]] = {
     "data.size": (16, 8192),
@@ -110,6 +117,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "data.workers": (1, 64),
     "model.uv_size": (2, 2048),
     "model.latent_dim": (1, 4096),
+    "model.latent_grid": (1, 2048),
     "model.mlp_width": (1, 65536),
     "model.mlp_layers": (1, 1000),
     "model.frequencies": (0, 30),
@@ -117,6 +125,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "model.initial_opacity": (1e-6, 1 - 1e-6),
     "trainer.iterations": (1, math.inf),
     "trainer.seed": (0, 2**31 - 1),
+    "trainer.lr_warmup": (0, math.inf),
+    "trainer.lr_final": (0, 1),
     "trainer.adam_eps": (0, 1),
     "trainer.sh_interval": (1, math.inf),
     "trainer.huber_delta": (1e-6, math.inf),
@@ -124,6 +134,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.perceptual_weight": (0, math.inf),
     "trainer.dssim_weight": (0, math.inf),
     "trainer.perceptual_start": (0, 1),
+    "trainer.lpips_every": (1, math.inf),
+    "trainer.lpips_crop": (32, 8192),
     "trainer.log_every": (1, math.inf),
     "trainer.preview_every": (1, math.inf),
     "trainer.checkpoint_every": (1, math.inf),

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -97,6 +98,30 @@ def dssim(
     similarity = ssim_map(image[rows, columns] * weight, target[rows, columns] * weight)
     windows = (height - 2 * SSIM_RADIUS) * (width - 2 * SSIM_RADIUS)
     return (1.0 - similarity).sum() / (2.0 * similarity.shape[-1] * windows)
+
+
+def on_crop(perceptual: Perceptual, size: int, generator: np.random.Generator) -> Perceptual:
+    """`perceptual` of a random square of at most `size` pixels out of the mask's bounding box, in place of the whole frame.
+
+    Squares lie anywhere in the box with the same probability; the value is scaled by the box's share of the frame, so that
+    on average it weighs what the mean over the whole frame does. Networks see less around the pixels at a square's rim.
+    """
+
+    def cropped(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+        box = bounding_box(mask)
+        if box is None:
+            return (image * 0.0).sum()
+        crop, share = [], 1.0
+        for side, length in zip(box, mask.shape, strict=True):
+            extent = min(size, length)
+            low, high = min(side.start, length - extent), max(side.stop - extent, side.start)
+            start = int(generator.integers(low, min(high, length - extent) + 1))
+            crop.append(slice(start, start + extent))
+            share *= max(side.stop - side.start, extent) / length
+        rows, columns = crop
+        return share * perceptual(image[rows, columns], target[rows, columns], mask[rows, columns])
+
+    return cropped
 
 
 def masked_lpips(lpips: Callable[[Tensor, Tensor], Tensor]) -> Perceptual:

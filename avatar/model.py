@@ -12,6 +12,7 @@ from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size, positional_encoding
 from avatar.gaussians.hyper import HyperHeads
+from avatar.gaussians.latent_grid import LatentGrid, latent_grid
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
@@ -23,8 +24,9 @@ CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coeffic
 class Avatar(nn.Module):
     """One person's avatar, bound to the UV map of a head model.
 
-    `name = "hypergaussians"`: the network gives each Gaussian a latent, its HyperGaussians turn that into offsets.
-    `name = "flashavatar"`: the network gives the offsets itself.
+    `name = "hypergaussians"`: the network gives each Gaussian a latent, its HyperGaussians turn that into offsets. With
+    `latent_grid` the network is evaluated on that grid over the UV map and its latents are interpolated to the Gaussians.
+    `name = "flashavatar"`: the network gives the offsets itself; they are not smooth over the map, so no grid is used.
     """
 
     code: Tensor
@@ -36,9 +38,13 @@ class Avatar(nn.Module):
         self.embedding = Embedding(assets, uv_texels(assets, config.uv_size))
         N = len(self.embedding)
         neutral = self.embedding.points(self.head.neutral_vertices())
-        self.register_buffer("code", positional_encoding(neutral, config.frequencies), persistent=False)
-
         is_hyper = config.name == "hypergaussians"
+        self.grid: LatentGrid | None = None
+        if is_hyper and config.latent_grid is not None:
+            self.grid = latent_grid(assets, self.embedding.texels, config.uv_size, neutral, config.latent_grid)
+        places = neutral if self.grid is None else self.grid.places
+        self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
+
         self.deformation = DeformationMLP(
             code_size=encoded_size(config.frequencies),
             condition_size=assets.num_expressions + CONDITION_EXTRAS,
@@ -61,9 +67,12 @@ class Avatar(nn.Module):
         """The number of Gaussians."""
         return len(self.embedding)
 
-    def forward(self, params: HeadParams) -> Gaussians:
-        points = self.embedding.points(self.head.vertices(params))
+    def forward(self, params: HeadParams, vertices: Float[Tensor, "V 3"] | None = None) -> Gaussians:
+        """The Gaussians of one frame, world space. `vertices`: the head posed by `params` already, metres."""
+        points = self.embedding.points(self.head.vertices(params) if vertices is None else vertices)
         raw = self.deformation(self.code, self._condition(params))
+        if self.grid is not None:
+            raw = self.grid.interpolate(raw)
         if self.hyper is not None:
             raw = self.hyper(raw)
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)

@@ -6,8 +6,12 @@ from avatar.config import config_from_dict, load_config
 from avatar.errors import UserError
 
 
-def test_the_default_is_the_papers_recipe() -> None:
-    config = load_config()
+@pytest.mark.parametrize("overrides", [["preset=paper"], ["experiment=paper"]])
+def test_the_papers_recipe(overrides: list[str]) -> None:
+    config = load_config(overrides)
+    assert (config.model.latent_grid, config.trainer.initial_colours) == (None, "grey")
+    assert (config.trainer.lr_warmup, config.trainer.lr_final) == (0, 1.0)
+    assert (config.trainer.lpips_every, config.trainer.lpips_crop) == (1, None)
     assert (config.model.name, config.model.latent_dim, config.model.uv_size) == ("hypergaussians", 8, 128)
     assert (config.model.mlp_width, config.model.mlp_layers, config.model.frequencies) == (256, 6, 8)
     rates = config.trainer.learning_rates
@@ -15,6 +19,14 @@ def test_the_default_is_the_papers_recipe() -> None:
     assert (rates.scale, rates.rotation, rates.mlp, rates.hyper) == (5e-3, 1e-3, 1e-4, 1e-4)
     assert (config.trainer.iterations, config.trainer.perceptual_start, config.trainer.lpips_net) == (30000, 0.5, "vgg")
     assert config.data.background == (1.0, 1.0, 1.0)
+
+
+def test_the_default_is_the_fast_preset_of_the_papers_model() -> None:
+    config, paper = load_config(), load_config(["preset=paper"])
+    assert config == load_config(["preset=fast"])
+    assert config.model.latent_grid == 16 and config.trainer.initial_colours == "frames"
+    assert (config.model.latent_dim, config.model.uv_size) == (paper.model.latent_dim, paper.model.uv_size)
+    assert load_config(["preset=fast", "model.latent_grid=null"]).model.latent_grid is None
 
 
 def test_later_overrides_win_and_survive_a_round_trip() -> None:
@@ -54,7 +66,7 @@ def test_every_key_in_the_yaml_files_has_a_comment() -> None:
     from avatar.config import config_dir
 
     for file in sorted(config_dir().glob("*/*.yaml")):
-        if file.parent.name == "experiment" or file.stem == "flashavatar":
+        if file.parent.name in ("experiment", "preset") or file.stem == "flashavatar":
             continue
         for line in file.read_text().splitlines():
             assert line.startswith(("#", "name: hyper")) or " # " in line, f"{file.name}: {line}"

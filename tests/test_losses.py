@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from avatar.losses import dssim, masked_huber, masked_lpips, photometric_loss
+from avatar.losses import dssim, masked_huber, masked_lpips, on_crop, photometric_loss
 from avatar.metrics import ssim
 
 
@@ -84,3 +85,36 @@ def test_sizes_that_disagree_are_named() -> None:
     image, target, mouth, head = sample()
     with pytest.raises(ValueError, match=r"mouth_mask has H = 20, but image has H = 24"):
         photometric_loss(image, target, mouth[:20], head)
+
+
+def test_random_squares_weigh_on_average_what_the_whole_frame_does() -> None:
+    """A perceptual term that is a mean over pixels, of an error that is the same everywhere in the mask's box."""
+    mask = torch.zeros(40, 60)
+    mask[5:35, 10:50] = 1.0
+    image, target = torch.full((40, 60, 3), 0.75), torch.full((40, 60, 3), 0.25)
+
+    def mean_error(a, b, m):
+        assert a.shape == (16, 16, 3)
+        return ((a - b) * m[..., None]).mean()
+
+    generator = np.random.default_rng(0)
+    values = [float(on_crop(mean_error, 16, generator)(image, target, mask)) for _ in range(20)]
+    whole = float(((image - target) * mask[..., None]).mean())
+    assert max(abs(v - whole) for v in values) < 1e-6
+
+
+def test_a_square_larger_than_head_or_frame_is_cut_to_the_frame_and_no_mask_gives_no_loss() -> None:
+    image = torch.rand(20, 30, 3)
+    mask = torch.zeros(20, 30)
+    mask[18:, 28:] = 1.0
+    shapes = []
+
+    def note(a, b, m):
+        shapes.append(tuple(a.shape))
+        assert m.any(), "the square misses the head"
+        return a.mean()
+
+    for seed in range(5):
+        on_crop(note, 24, np.random.default_rng(seed))(image, image, mask)
+    assert shapes == [(20, 24, 3)] * 5
+    assert float(on_crop(note, 24, np.random.default_rng(0))(image, image, torch.zeros(20, 30))) == 0.0

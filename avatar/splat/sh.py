@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 MAX_DEGREE = 3
+C0 = sqrt(1 / (4 * pi))  # the constant basis function
 
 
 def sh_degree_of(coefficients: int) -> int:
@@ -26,7 +27,7 @@ def sh_degree_of(coefficients: int) -> int:
 def sh_basis(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N K"]:
     """The K = (degree + 1)^2 basis functions at unit vectors."""
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, sqrt(1 / (4 * pi)))]
+    basis = [torch.full_like(x, C0)]
     if degree >= 1:
         c = sqrt(3 / (4 * pi))
         basis += [-c * y, c * z, -c * x]

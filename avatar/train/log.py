@@ -13,6 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from avatar.losses import PhotometricLoss
+from avatar.metrics import psnr
 
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
 
@@ -34,18 +35,17 @@ class TrainingLog:
         self._bar.close()
         self._writer.close()
 
-    def step(self, step: int, loss: PhotometricLoss, psnr: float) -> None:
-        """Record the values of one step; `step` counts from 1."""
-        total = float(loss.total.detach())
-        first = math.isnan(self._loss)
-        self._loss = total if first else SMOOTHING * self._loss + (1 - SMOOTHING) * total
-        self._psnr = psnr if first else SMOOTHING * self._psnr + (1 - SMOOTHING) * psnr
+    def step(self, step: int, loss: PhotometricLoss, render: Tensor, truth: Tensor) -> None:
+        """Record one step; `step` counts from 1. The PSNR is computed only for the steps that are logged."""
+        self._loss = smoothed(self._loss, float(loss.total.detach()), 1)
         self._bar.update(1)
-        self._bar.set_postfix(loss=f"{self._loss:.5f}", psnr=f"{self._psnr:.2f}", refresh=False)
         if step % self._every == 0:
-            for name, value in loss._asdict().items():
-                self._writer.add_scalar(f"loss/{name}", float(value.detach()), step)
-            self._writer.add_scalar("train/psnr", psnr, step)
+            value = float(psnr(render, truth))
+            self._psnr = smoothed(self._psnr, value, self._every)
+            for name, term in loss._asdict().items():
+                self._writer.add_scalar(f"loss/{name}", float(term.detach()), step)
+            self._writer.add_scalar("train/psnr", value, step)
+        self._bar.set_postfix(loss=f"{self._loss:.5f}", psnr=f"{self._psnr:.2f}", refresh=False)
 
     def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""
@@ -54,3 +54,9 @@ class TrainingLog:
         self._previews.mkdir(parents=True, exist_ok=True)
         iio.imwrite(self._previews / f"step_{step:08d}.png", image)
         self._writer.add_image("preview", image, step, dataformats="HWC")
+
+
+def smoothed(mean: float, value: float, steps: int) -> float:
+    """The running mean after a value that stands for `steps` steps; the first value stands for itself."""
+    keep = SMOOTHING**steps
+    return value if math.isnan(mean) else keep * mean + (1 - keep) * value

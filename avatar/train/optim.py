@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +17,7 @@ from avatar.model import Avatar
 def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     """Adam with the paper's groups: colour, opacity, scale, rotation, deformation network, HyperGaussian heads."""
     rates = config.learning_rates
-    groups = [
+    groups: list[dict[str, Any]] = [
         {"params": [avatar.sh_dc], "lr": rates.sh_dc},
         {"params": [avatar.sh_rest], "lr": rates.sh_rest},
         {"params": [avatar.opacity_logits], "lr": rates.opacity},
@@ -25,7 +27,26 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     ]
     if avatar.hyper is not None:
         groups.append({"params": list(avatar.hyper.parameters()), "lr": rates.hyper})
+    for group in groups:
+        group["full_lr"] = group["lr"]
     return torch.optim.Adam(groups, eps=config.adam_eps, fused=True)
+
+
+def schedule(step: int, config: TrainerConfig) -> float:
+    """The share of the learning rates that step `step` (from 0) uses.
+
+    Rises linearly to 1 over the first `lr_warmup` steps, times half a cosine from 1 at the first step to `lr_final` at the
+    last. A pure function of the step, so that a resumed run goes on as an uninterrupted one.
+    """
+    rise = min((step + 1) / config.lr_warmup, 1.0) if config.lr_warmup else 1.0
+    fall = 0.5 * (1.0 + math.cos(math.pi * step / max(config.iterations - 1, 1)))
+    return rise * (config.lr_final + (1.0 - config.lr_final) * fall)
+
+
+def set_rates(optimizer: torch.optim.Adam, share: float) -> None:
+    """Give every group this share of the learning rate that it was made with."""
+    for group in optimizer.param_groups:
+        group["lr"] = group["full_lr"] * share
 
 
 def optimizer_tensors(optimizer: torch.optim.Adam, avatar: Avatar) -> dict[str, Tensor]:

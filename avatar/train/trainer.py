@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,14 +21,15 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.losses import Perceptual, PhotometricLoss, dssim, masked_lpips, photometric_loss
+from avatar.losses import Perceptual, PhotometricLoss, dssim, masked_lpips, on_crop, photometric_loss
 from avatar.lpips import Net, load_lpips
-from avatar.metrics import psnr
 from avatar.model import Avatar
 from avatar.splat import splat
+from avatar.train.colours import colour_from_frames
 from avatar.train.log import TrainingLog
-from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
+from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors, schedule, set_rates
 from avatar.train.order import frame_order
+from avatar.train.posed import PosedMeshes
 from avatar.types import Frame
 
 
@@ -38,6 +40,17 @@ class PerceptualTerm:
     function: Perceptual | None
     weight: float
     name: str
+    every: int = 1  # takes part in every so many-th step, with so many times the weight
+    crop: int | None = None  # pixels; of a random square of the head in place of the frame
+
+    def at(self, step: int, start: int, seed: int) -> tuple[Perceptual | None, float]:
+        """Function and weight of step `step` (from 0) when the term takes part from step `start` on."""
+        if self.function is None or step < start or (step - start) % self.every:
+            return None, 0.0
+        function = self.function
+        if self.crop is not None:
+            function = on_crop(function, self.crop, np.random.default_rng([seed, step]))
+        return function, self.weight * self.every
 
 
 def train(
@@ -63,6 +76,9 @@ def train(
         load_module(avatar, resume, run)
         load_optimizer(optimizer, avatar, resume.tensors)
         start = resume.step
+    elif trainer.initial_colours == "frames":
+        colour_from_frames(avatar, subject, config.data.size)
+    meshes = PosedMeshes(avatar.head)
     background = torch.tensor(config.data.background)
     perceptual_from = round(trainer.perceptual_start * trainer.iterations)
     meta = {
@@ -87,24 +103,27 @@ def train(
         for frame in loader.frames(order):
             target = frame.composite(background)
             degree = min(step // trainer.sh_interval, avatar.config.sh_degree)
-            rendering = splat(avatar(frame.params), frame.camera, background, sh_degree=degree)
+            gaussians = avatar(frame.params, meshes.vertices(frame))
+            rendering = splat(gaussians, frame.camera, background, sh_degree=degree)
+            function, weight = perceptual.at(step, perceptual_from, trainer.seed)
             loss = photometric_loss(
                 rendering.image,
                 target,
                 frame.mouth_mask,
                 frame.head_mask,
-                perceptual=perceptual.function if step >= perceptual_from else None,
-                perceptual_weight=perceptual.weight,
+                perceptual=function,
+                perceptual_weight=weight,
                 mouth_weight=trainer.mouth_weight,
                 delta=trainer.huber_delta,
             )
             optimizer.zero_grad()
             loss.total.backward()
             check_step(step, frame, loss, avatar)
+            set_rates(optimizer, schedule(step, trainer))
             optimizer.step()
 
             step += 1
-            log.step(step, loss, float(psnr(rendering.image.detach(), target)))
+            log.step(step, loss, rendering.image.detach(), target)
             if step % trainer.preview_every == 0 or step == trainer.iterations:
                 log.preview(step, *render_held_out(avatar, loader, subject, background))
             if step % trainer.checkpoint_every == 0 or step == trainer.iterations:
@@ -127,7 +146,10 @@ def choose_perceptual(config: TrainerConfig, say: Callable[[str], None]) -> Perc
     if config.perceptual in ("lpips", "auto"):
         try:
             lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
-            return PerceptualTerm(masked_lpips(lpips), config.perceptual_weight, f"lpips-{config.lpips_net}")
+            name = f"lpips-{config.lpips_net}"
+            return PerceptualTerm(
+                masked_lpips(lpips), config.perceptual_weight, name, config.lpips_every, config.lpips_crop
+            )
         except UserError as error:
             if config.perceptual == "lpips":
                 raise
@@ -138,8 +160,8 @@ def choose_perceptual(config: TrainerConfig, say: Callable[[str], None]) -> Perc
 def check_step(step: int, frame: Frame, loss: PhotometricLoss, avatar: Avatar) -> None:
     """Stop before the optimizer when the loss or a gradient is not finite, naming the step, the frame and the tensor."""
     gradients: dict[str, Tensor] = {n: p.grad for n, p in avatar.named_parameters() if p.grad is not None}
-    norms = torch.stack([loss.total.detach(), *(g.norm() for g in gradients.values())])
-    if bool(torch.isfinite(norms).all()):
+    norm = torch.nn.utils.get_total_norm(gradients.values())
+    if bool(torch.isfinite(norm + loss.total.detach())):
         return
     suspects = {f"the loss term {n}": v for n, v in loss._asdict().items()}
     suspects |= {f"the gradient of {n}": g for n, g in gradients.items()}

@@ -11,17 +11,18 @@ from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.errors import UserError
+from avatar.metrics import psnr
 from avatar.train import trainer as trainer_module
-from avatar.train.trainer import choose_perceptual, interruption, train
+from avatar.train.trainer import PerceptualTerm, choose_perceptual, interruption, train
 
 
 def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_path: Path) -> None:
     scores: list[float] = []
     log_step = trainer_module.TrainingLog.step
 
-    def record(self, step, loss, psnr) -> None:
-        scores.append(psnr)
-        log_step(self, step, loss, psnr)
+    def record(self, step, loss, render, truth) -> None:
+        scores.append(float(psnr(render, truth)))
+        log_step(self, step, loss, render, truth)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer_module.TrainingLog, "step", record)
@@ -56,6 +57,25 @@ def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(tracked_folder: Path
     assert not differing
 
 
+def test_a_resumed_run_of_the_papers_recipe_has_the_bits_too(tracked_folder: Path, tmp_path: Path) -> None:
+    """Without grid and schedules, which the other runs have from the default preset."""
+    train_small(tracked_folder, tmp_path / "whole", ["preset=paper"])
+    train_small(tracked_folder, tmp_path / "broken", ["preset=paper"])
+    list_checkpoints(tmp_path / "broken" / "checkpoints")[-1].unlink()
+    halfway = newest_checkpoint(tmp_path / "broken")
+    train_small(tracked_folder, tmp_path / "broken", ["preset=paper"], resume=halfway)
+    whole, broken = newest_checkpoint(tmp_path / "whole"), newest_checkpoint(tmp_path / "broken")
+    assert not [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])]
+
+
+def test_a_sparse_perceptual_term_keeps_its_weight_on_average() -> None:
+    term = PerceptualTerm(lambda image, target, mask: image.sum(), 0.05, "test", every=4)
+    weights = [term.at(step, 10, 0) for step in range(10, 22)]
+    assert [w for _, w in weights] == [0.2, 0, 0, 0] * 3
+    assert [f is None for f, _ in weights] == [False, True, True, True] * 3
+    assert term.at(6, 10, 0) == (None, 0.0)
+
+
 def test_another_seed_is_another_avatar(tracked_folder: Path, tmp_path: Path) -> None:
     a, _ = train_small(tracked_folder, tmp_path / "a", ["trainer.seed=1"])
     b, _ = train_small(tracked_folder, tmp_path / "b", ["trainer.seed=2"])
@@ -75,8 +95,8 @@ def test_an_interruption_saves_the_state_and_stops(tracked_folder: Path, tmp_pat
     run = tmp_path / "run"
     log_step = trainer_module.TrainingLog.step
 
-    def press_ctrl_c(self, step, loss, psnr) -> None:
-        log_step(self, step, loss, psnr)
+    def press_ctrl_c(self, step, loss, render, truth) -> None:
+        log_step(self, step, loss, render, truth)
         if step == 6:
             os.kill(os.getpid(), signal.SIGINT)
 

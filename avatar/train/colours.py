@@ -1,0 +1,70 @@
+"""First colours: what the training frames show where each Gaussian is."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.data.subject import Subject
+from avatar.head.rasterize import rasterize_mesh
+from avatar.model import Avatar
+from avatar.splat.sh import C0
+from avatar.types import Frame
+
+FRAMES = 16  # evenly spread over the training frames: enough for every head turn to take part
+DEPTH_TOLERANCE = 0.003  # metres behind the nearest surface at which a point still counts as seen
+
+
+@torch.no_grad()
+def colour_from_frames(avatar: Avatar, subject: Subject, size: int | None, frames: int = FRAMES) -> int:
+    """Set the base colour of each Gaussian to the mean that `frames` training frames show at its place.
+
+    A frame counts by the cosine between the surface's normal and the line of sight, squared, times the matte, and not at
+    all where the mesh hides the place. Gaussians that no frame shows keep their colour. Returns how many were coloured.
+    """
+    train = subject.split.train
+    chosen = [train[i] for i in np.linspace(0, len(train) - 1, min(frames, len(train))).round().astype(int)]
+    total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar))
+    for index in dict.fromkeys(chosen):
+        colours, seen = seen_colours(avatar, subject.frame(index, size))
+        total += colours * seen[:, None]
+        weight += seen
+    coloured = weight > 1e-3
+    mean = total[coloured] / weight[coloured, None]
+    avatar.sh_dc[coloured, 0] = (mean - 0.5) / C0
+    return int(coloured.sum())
+
+
+def seen_colours(avatar: Avatar, frame: Frame) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
+    """The frame's colour at each Gaussian's place on the mesh, and how far the frame shows that place, in [0, 1]."""
+    vertices = avatar.head.vertices(frame.params)
+    points = avatar.embedding.points(vertices)
+    camera = frame.camera
+    screen = camera.project(points)
+    corners = vertices[avatar.embedding.corners]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    eye = -camera.R_cam_world.T @ camera.t_cam_world
+    facing = torch.nn.functional.cosine_similarity(normals, eye - points, dim=-1).clamp(min=0)
+
+    raster = rasterize_mesh(camera.project(vertices).numpy(), avatar.head.faces.numpy(), camera.height, camera.width)
+    surface = torch.from_numpy(raster.depth).where(torch.from_numpy(raster.face_id) >= 0, torch.inf)
+    nearest = sample(surface[..., None], screen, "nearest")[:, 0]  # 0 outside the image: nothing is seen there
+    in_front = (screen[:, 2] > 0) & (screen[:, 2] <= nearest + DEPTH_TOLERANCE)
+    matte = (frame.alpha * frame.head_mask)[..., None]
+    pixels = sample(torch.cat((frame.image, matte), dim=-1), screen, "bilinear")
+    return pixels[:, :3], facing.square() * pixels[:, 3] * in_front
+
+
+def sample(image: Float[Tensor, "H W C"], screen: Float[Tensor, "N 3"], mode: str) -> Float[Tensor, "N C"]:
+    """The image's values at points (x pixel, y pixel, depth); zero outside the image."""
+    height, width = image.shape[:2]
+    grid = screen[:, :2] * torch.tensor([2 / width, 2 / height]) - 1
+    grid = grid.nan_to_num(nan=-9.0, posinf=9.0, neginf=-9.0).clamp(
+        -9, 9
+    )  # a point in the camera's plane is not in the image
+    picked = torch.nn.functional.grid_sample(
+        image.permute(2, 0, 1)[None], grid[None, :, None], mode=mode, padding_mode="zeros", align_corners=False
+    )
+    return picked[0, :, :, 0].T
