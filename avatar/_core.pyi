@@ -27,6 +27,7 @@ def splat_forward(
     blur: float,
     near: float,
     antialiased: bool,
+    region: Sequence[int],  # left, top, right, bottom
     simd: str,
     threads: int,
     image: Tensor,

@@ -12,6 +12,7 @@ from torch import Tensor
 from avatar.check import check_finite, check_shapes
 from avatar.splat.cpu import splat_cpu
 from avatar.splat.reference import splat_reference
+from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.types import Camera, Gaussians, Rendering
 
@@ -33,6 +34,7 @@ def splat(
     blur: float = 0.3,
     near: float = 0.01,
     antialiased: bool = False,
+    region: tuple[slice, slice] | None = None,
 ) -> Rendering:
     """Draw 3D Gaussians over a background; differentiable in all five fields of `gaussians` and in `background`.
 
@@ -45,6 +47,10 @@ def splat(
     blur         pixels^2 added to both variances of a projected splat, so that none falls between pixels; >= 0
     near         splats whose centre is nearer than this along the optical axis are left out; metres, > 0
     antialiased  multiply the opacity by sqrt(det / det with blur), so that the blur adds no light (Mip-Splatting)
+
+    region       draw only these rows and columns of the image, each a slice of consecutive pixels within it; None: all.
+                 Inside, every bit is that of the whole drawing; outside, the image shows the background and alpha is 0,
+                 so that those pixels have a gradient in `background` alone. Time is spent on the region only
 
     Splats are drawn by depth of the centre and, at equal depth, by index; pixel centres are at + 0.5; every pixel in
     which a splat reaches alpha_min is drawn. Colour is max(SH + 0.5, 0) along the direction from the camera to the mean.
@@ -82,6 +88,7 @@ def splat(
         raise ValueError(f"blur must be finite and not negative, got {blur}")
     if not (near > 0 and math.isfinite(near)):
         raise ValueError(f"near must be finite and above 0, got {near}")
+    pixels = check_region(region, camera.width, camera.height)
 
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
     alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, t_min], dtype=torch.float32).tolist()
@@ -101,6 +108,7 @@ def splat(
         blur=blur,
         near=near,
         antialiased=antialiased,
+        region=pixels,
     )
 
 

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from avatar import _core
 from avatar.check import check_finite
 from avatar.native import instruction_set, thread_count
+from avatar.splat.region import Region
 from avatar.types import Camera, Gaussians, Rendering
 
 
@@ -27,6 +28,7 @@ def splat_cpu(
     blur: float,
     near: float,
     antialiased: bool,
+    region: Region,
 ) -> Rendering:
     """`avatar.splat.splat` without its checks of shape and type; float32 tensors on the CPU."""
     settings = {
@@ -38,6 +40,7 @@ def splat_cpu(
         "blur": blur,
         "near": near,
         "antialiased": antialiased,
+        "region": region,
         "simd": instruction_set(),
         "threads": thread_count(),
     }

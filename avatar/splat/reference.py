@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from avatar.splat.region import Region
 from avatar.splat.sh import sh_colours
 from avatar.types import Camera, Gaussians, Rendering
 
@@ -47,13 +48,17 @@ def splat_reference(
     blur: float,
     near: float,
     antialiased: bool,
+    region: Region | None = None,
     block: int = 16,
 ) -> Rendering:
     """`avatar.splat.splat` without its checks, computed in float64 on the tensors' device, returned in their dtype.
 
-    `block` is the side of the squares of pixels that are evaluated at once; the result does not depend on it.
+    `block` is the side of the squares of pixels that are evaluated at once; the result does not depend on it. The squares
+    lie alike in every region (None: the image), so that a pixel gets the same bits in all of them.
     """
     dtype = gaussians.means.dtype
+    region = region or Region(0, 0, camera.width, camera.height)
+    first_column, first_row = region.left // block * block, region.top // block * block
     splats = project(
         Gaussians(*(t.double() for t in gaussians)),
         camera,
@@ -64,9 +69,9 @@ def splat_reference(
         antialiased=antialiased,
     )
     image_rows, alpha_rows = [], []
-    for top in range(0, camera.height, block):
+    for top in range(first_row, region.bottom, block):
         images, alphas = [], []
-        for left in range(0, camera.width, block):
+        for left in range(first_column, region.right, block):
             bottom, right = min(top + block, camera.height), min(left + block, camera.width)
             pixels = _pixel_centres(left, top, right, bottom, splats.means)
             inside = _reaches(splats, left, top, right, bottom)
@@ -76,7 +81,16 @@ def splat_reference(
             alphas.append(1 - transmittance.reshape(bottom - top, right - left))
         image_rows.append(torch.cat(images, dim=1))
         alpha_rows.append(torch.cat(alphas, dim=1))
-    return Rendering(torch.cat(image_rows).to(dtype), torch.cat(alpha_rows).to(dtype))
+    # The blocks reach over the region's edges; all around it is background.
+    inside = slice(region.top, region.bottom), slice(region.left, region.right)
+    drawn = (
+        slice(region.top - first_row, region.bottom - first_row),
+        slice(region.left - first_column, region.right - first_column),
+    )
+    image = background.double().repeat(camera.height, camera.width, 1)
+    alpha = image.new_zeros(camera.height, camera.width)
+    image[inside], alpha[inside] = torch.cat(image_rows)[drawn], torch.cat(alpha_rows)[drawn]
+    return Rendering(image.to(dtype), alpha.to(dtype))
 
 
 def project(

@@ -177,6 +177,7 @@ def test_no_output_memory_is_left_uninitialised() -> None:
         blur=0.3,
         near=0.01,
         antialiased=False,
+        region=(0, 0, 83, 57),
         simd="",
         threads=2,
         image=image,

@@ -13,27 +13,28 @@
 namespace avatar::splat {
 namespace {
 
-// The first and last pixel whose centre lies in [low, high], within [0, size); first > last where there is none.
+// The first and last pixel whose centre lies in [low, high], within [begin, end); first > last where there is none.
 struct PixelRange {
     int first, last;
 };
 
-PixelRange pixels_between(double low, double high, int size) {
+PixelRange pixels_between(double low, double high, int begin, int end) {
     const double first = std::ceil(low - 0.5), last = std::floor(high - 0.5);
-    return {first > 0.0 ? int(std::min(first, double(size))) : 0,
-            last < size - 1.0 ? int(std::max(last, -1.0)) : size - 1};
+    return {first > begin ? int(std::min(first, double(end))) : begin,
+            last < end - 1.0 ? int(std::max(last, begin - 1.0)) : end - 1};
 }
 
-// Calls visit(tile_y, first tile_x, last tile_x) for the rows of tiles that the splat's ellipse meets.
+// Calls visit(first tile, last tile) for the rows of tiles that the splat's ellipse meets.
 template <typename Visit>
-void for_each_tile_row(const Splat& s, int width, int height, const Visit& visit) {
+void for_each_tile_row(const Splat& s, const TileGrid& grid, const Visit& visit) {
+    const Region& region = grid.region;
     const double reach = s.reach;
     if (!std::isfinite(reach)) {
-        for (int ty = 0; ty <= (height - 1) / kTileHeight; ++ty) visit(ty, 0, (width - 1) / kTileWidth);
+        for (std::int64_t tile = 0; tile < grid.count(); tile += grid.count_x) visit(tile, tile + grid.count_x - 1);
         return;
     }
     const double radius = std::sqrt(reach), skew = s.b / s.c;  // in whitened coordinates, u = a d_x + skew v
-    const PixelRange rows = pixels_between(s.y - radius / s.c, s.y + radius / s.c, height);
+    const PixelRange rows = pixels_between(s.y - radius / s.c, s.y + radius / s.c, region.top, region.bottom);
     if (rows.first > rows.last) return;
     // The ellipse's rightmost point has v = -extreme, its leftmost v = +extreme.
     const double extreme = skew * radius / std::sqrt(1.0 + skew * skew), inv_a = 1.0 / s.a;
@@ -45,9 +46,11 @@ void for_each_tile_row(const Splat& s, int width, int height, const Visit& visit
         const double v_left = std::clamp(extreme, v0, v1), v_right = std::clamp(-extreme, v0, v1);
         const double half_left = std::sqrt(std::max(reach - v_left * v_left, 0.0));
         const double half_right = std::sqrt(std::max(reach - v_right * v_right, 0.0));
-        const PixelRange columns = pixels_between(s.x - (skew * v_left + half_left) * inv_a,
-                                                  s.x - (skew * v_right - half_right) * inv_a, width);
-        if (columns.first <= columns.last) visit(ty, columns.first / kTileWidth, columns.last / kTileWidth);
+        const double leftmost = s.x - (skew * v_left + half_left) * inv_a;
+        const double rightmost = s.x - (skew * v_right - half_right) * inv_a;
+        const PixelRange columns = pixels_between(leftmost, rightmost, region.left, region.right);
+        const std::int64_t row = std::int64_t{ty - grid.first_y} * grid.count_x - grid.first_x;
+        if (columns.first <= columns.last) visit(row + columns.first / kTileWidth, row + columns.last / kTileWidth);
     }
 }
 
@@ -90,12 +93,10 @@ std::vector<std::uint32_t> depth_order(const std::vector<double>& depths) {
     return order;
 }
 
-TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, int height, std::int64_t max_pairs,
+TileLists build_tile_lists(const Splat* splats, std::int64_t count, const TileGrid& grid, std::int64_t max_pairs,
                            int threads) {
     TileLists lists;
-    lists.tiles_x = (width + kTileWidth - 1) / kTileWidth;
-    lists.tiles_y = (height + kTileHeight - 1) / kTileHeight;
-    const std::int64_t tiles = std::int64_t{lists.tiles_x} * lists.tiles_y;
+    const std::int64_t tiles = grid.count();
 
     // A stable counting sort by tile. The splats are cut into one chunk a thread; each chunk counts its pairs for every
     // splat and every tile, and then knows where its own begin. The result does not depend on the number of chunks.
@@ -112,10 +113,10 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, i
         std::int64_t total = 0;
         for (std::int64_t i = begin; i < end; ++i) {
             const std::int64_t before = total;
-            for_each_tile_row(splats[i], width, height, [&](int ty, int first, int last) {
+            for_each_tile_row(splats[i], grid, [&](std::int64_t first, std::int64_t last) {
                 total += last - first + 1;
                 if (total > max_pairs) return;  // refused below: only the number still matters
-                for (int tx = first; tx <= last; ++tx) ++counts[std::int64_t{ty} * lists.tiles_x + tx];
+                for (std::int64_t tile = first; tile <= last; ++tile) ++counts[tile];
             });
             lists.slot_begin[i + 1] = total - before;
         }
@@ -150,10 +151,9 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, i
         const auto [begin, end] = splats_of(chunk);
         for (std::int64_t i = begin; i < end; ++i) {
             std::uint32_t slot = static_cast<std::uint32_t>(lists.slot_begin[i]);
-            for_each_tile_row(splats[i], width, height, [&](int ty, int first, int last) {
-                for (int tx = first; tx <= last; ++tx)
-                    lists.pairs[position[std::int64_t{ty} * lists.tiles_x + tx]++] = {static_cast<std::uint32_t>(i),
-                                                                                    slot++};
+            for_each_tile_row(splats[i], grid, [&](std::int64_t first, std::int64_t last) {
+                for (std::int64_t tile = first; tile <= last; ++tile)
+                    lists.pairs[position[tile]++] = {static_cast<std::uint32_t>(i), slot++};
             });
         }
     });

@@ -9,7 +9,6 @@
 namespace avatar::splat {
 
 struct TileLists {
-    int tiles_x = 0, tiles_y = 0;
     std::vector<std::int64_t> tile_begin;   // [tiles + 1] into `pairs`; a tile's pairs are front to back
     std::vector<std::uint32_t> tile_order;  // [tiles] the tiles with most pairs first, so that threads end together
     std::vector<std::int64_t> slot_begin;   // [splats + 1]: the slots of a splat
@@ -22,7 +21,7 @@ std::vector<std::uint32_t> depth_order(const std::vector<double>& depths);
 
 // The tiles in which each of the sorted splats has a pixel centre that its ellipse of alpha >= alpha_min may contain.
 // Throws std::length_error, naming the number and the limit, for more than `max_pairs` pairs.
-TileLists build_tile_lists(const Splat* splats, std::int64_t count, int width, int height, std::int64_t max_pairs,
+TileLists build_tile_lists(const Splat* splats, std::int64_t count, const TileGrid& grid, std::int64_t max_pairs,
                            int threads);
 
 }  // namespace avatar::splat

@@ -32,7 +32,8 @@ void bind_splat(nb::module_& m) {
         [](ConstFloats means, ConstFloats quats, ConstFloats scales, ConstFloats opacities, ConstFloats sh,
            ConstFloats background, std::array<double, 9> rotation, std::array<double, 3> translation,
            std::array<double, 4> intrinsics, int sh_degree, std::array<float, 3> cutoffs, double blur, double near,
-           bool antialiased, const std::string& simd, int threads, Floats image, Floats alpha) {
+           bool antialiased, std::array<int, 4> region, const std::string& simd, int threads, Floats image,
+           Floats alpha) {
             Camera camera{{}, {}, intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3],
                           static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0))};
             for (int k = 0; k < 9; ++k) camera.rotation[k] = rotation[k];
@@ -40,14 +41,15 @@ void bind_splat(nb::module_& m) {
             const Settings settings{sh_degree, cutoffs[0], cutoffs[1], cutoffs[2], blur, near, antialiased};
             const Kernels& kernels = select_kernels(simd.c_str());
             const nb::gil_scoped_release unlocked;
-            return forward(gaussians_of(means, quats, scales, opacities, sh), camera, settings, background.data(),
-                           kernels, threads, image.data(), alpha.data());
+            return forward(gaussians_of(means, quats, scales, opacities, sh), camera, settings,
+                           {region[0], region[1], region[2], region[3]}, background.data(), kernels, threads,
+                           image.data(), alpha.data());
         },
         nb::arg("means").noconvert(), nb::arg("quats").noconvert(), nb::arg("scales").noconvert(),
         nb::arg("opacities").noconvert(), nb::arg("sh").noconvert(), nb::arg("background").noconvert(),
         nb::arg("rotation"), nb::arg("translation"), nb::arg("intrinsics"), nb::arg("sh_degree"), nb::arg("cutoffs"),
-        nb::arg("blur"), nb::arg("near"), nb::arg("antialiased"), nb::arg("simd"), nb::arg("threads"),
-        nb::arg("image").noconvert(), nb::arg("alpha").noconvert());
+        nb::arg("blur"), nb::arg("near"), nb::arg("antialiased"), nb::arg("region"), nb::arg("simd"),
+        nb::arg("threads"), nb::arg("image").noconvert(), nb::arg("alpha").noconvert());
 
     m.def(
         "splat_backward",

@@ -146,7 +146,8 @@ void covariance_backward(const View& view, const Geometry& g, const double grad_
 
 }  // namespace
 
-View::View(const Camera& camera_, const Settings& settings_) : camera(camera_), settings(settings_) {
+View::View(const Camera& camera_, const Settings& settings_, const Region& region_)
+    : camera(camera_), settings(settings_), region(region_) {
     const double* R = camera.rotation;
     const double* t = camera.translation;
     for (int k = 0; k < 3; ++k) centre[k] = -(R[k] * t[0] + R[3 + k] * t[1] + R[6 + k] * t[2]);
@@ -181,8 +182,9 @@ Visibility project(const View& view, const Gaussians& gaussians, std::int64_t i,
         const double reach = std::log2(double(splat.opacity) / settings.alpha_min) + kReachMargin;
         splat.reach = float(reach);
         const double half_x = std::sqrt(reach * g.xx / kHalfLog2E), half_y = std::sqrt(reach * g.yy / kHalfLog2E);
-        if (splat.x + half_x < 0.0 || splat.x - half_x > camera.width || splat.y + half_y < 0.0 ||
-            splat.y - half_y > camera.height)
+        const Region& region = view.region;
+        if (splat.x + half_x < region.left || splat.x - half_x > region.right || splat.y + half_y < region.top ||
+            splat.y - half_y > region.bottom)
             return Visibility::kHidden;
     }
 

@@ -8,19 +8,20 @@ namespace avatar::splat {
 
 // What is the same for all Gaussians of one call.
 struct View {
-    View(const Camera& camera, const Settings& settings);
+    View(const Camera& camera, const Settings& settings, const Region& region);
 
     Camera camera;
     Settings settings;
-    double centre[3];                           // of the camera, world
-    double slope_x[2], slope_y[2];              // range to which x / z and y / z are clamped in the Jacobian
+    Region region;
+    double centre[3];               // of the camera, world
+    double slope_x[2], slope_y[2];  // range to which x / z and y / z are clamped in the Jacobian
 };
 
 // Why a Gaussian is not drawn, or that it is.
 enum class Visibility { kVisible, kHidden, kColourOverflow };
 
 // Fills `splat` (all but `index`) and the depth of the centre. Hidden: nearer than `near`, opacity below alpha_min, no
-// pixel of the image where alpha can reach alpha_min, or no area on the image plane.
+// pixel of the region where alpha can reach alpha_min, or no area on the image plane.
 Visibility project(const View& view, const Gaussians& gaussians, std::int64_t i, Splat& splat, double& depth);
 
 // Writes (does not add) the gradients of Gaussian i, from the moments of its splat summed over all tiles.

@@ -12,12 +12,13 @@ struct Raster {
     const Splat* splats;
     const Pair* pairs;
     const std::int64_t* tile_begin;
-    int tiles_x;
-    int width, height;
+    TileGrid grid;
+    int width;  // of the image
     float alpha_min, alpha_max, t_min;
     float background[3];
 };
 
+// Written at the pixels of the region only.
 struct ForwardTarget {
     float* image;              // [height * width * 3]
     float* alpha;              // [height * width]

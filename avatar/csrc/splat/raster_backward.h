@@ -18,9 +18,9 @@ void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& sou
 
     double* grad_background = target.grad_background + 3 * tile;
     grad_background[0] = grad_background[1] = grad_background[2] = 0.0;
-    for (int row = 0; row < area.rows; ++row) {
+    for (int row = area.first_row; row < area.end_row; ++row) {
         const std::int64_t first = std::int64_t{area.top + row} * r.width + area.left;
-        for (int column = 0; column < area.columns; ++column) {
+        for (int column = area.first_column; column < area.end_column; ++column) {
             const int i = row * kTileWidth + column;
             const std::int64_t pixel = first + column;
             const float t = source.transmittance[pixel];

@@ -36,9 +36,9 @@ void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& targe
     }
     target.processed[tile] = static_cast<std::uint32_t>(at - begin);
 
-    for (int row = 0; row < area.rows; ++row) {
+    for (int row = area.first_row; row < area.end_row; ++row) {
         const std::int64_t first = std::int64_t{area.top + row} * r.width + area.left;
-        for (int column = 0; column < area.columns; ++column) {
+        for (int column = area.first_column; column < area.end_column; ++column) {
             const int i = row * kTileWidth + column;
             const float t = __builtin_fabsf(transmittance[i]);
             float* pixel = target.image + 3 * (first + column);

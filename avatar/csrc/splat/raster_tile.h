@@ -16,11 +16,16 @@ inline int vector_at(int row, int strip) { return row * kTileWidth + strip * kLa
 
 struct TileArea {
     TileArea(const Raster& r, std::int64_t tile)
-        : left(static_cast<int>(tile % r.tiles_x) * kTileWidth), top(static_cast<int>(tile / r.tiles_x) * kTileHeight) {
-        columns = r.width - left < kTileWidth ? r.width - left : kTileWidth;
-        rows = r.height - top < kTileHeight ? r.height - top : kTileHeight;
+        : left((r.grid.first_x + static_cast<int>(tile % r.grid.count_x)) * kTileWidth),
+          top((r.grid.first_y + static_cast<int>(tile / r.grid.count_x)) * kTileHeight) {
+        const Region& region = r.grid.region;
+        first_column = region.left > left ? region.left - left : 0;
+        first_row = region.top > top ? region.top - top : 0;
+        end_column = region.right - left < kTileWidth ? region.right - left : kTileWidth;
+        end_row = region.bottom - top < kTileHeight ? region.bottom - top : kTileHeight;
     }
-    int left, top, columns, rows;  // the part of the tile inside the image
+    int left, top;                                     // of the tile in the image
+    int first_column, first_row, end_column, end_row;  // the part of the tile inside the region
 };
 
 // One splat as seen from one tile.
@@ -65,7 +70,7 @@ struct SplatInTile {
 inline unsigned first_bit(unsigned bits) { return static_cast<unsigned>(__builtin_ctz(bits)); }
 
 // Whether splats are skipped, drawn or end a pixel, and the transmittance behind them. A pixel that has stopped, or
-// that is outside the image, is marked by the sign bit of its transmittance; nothing is drawn there any more.
+// that is outside the region, is marked by the sign bit of its transmittance; nothing is drawn there any more.
 struct Step {
     Ints drawn;
     Floats after;
@@ -82,9 +87,15 @@ struct Step {
 inline void clear_transmittance(const TileArea& area, float* transmittance, unsigned alive[kStrips]) {
     for (int row = 0; row < kTileHeight; ++row)
         for (int column = 0; column < kTileWidth; ++column)
-            transmittance[row * kTileWidth + column] = row < area.rows && column < area.columns ? 1.0f : -1.0f;
-    const unsigned rows = (2u << (area.rows - 1)) - 1;
-    for (int strip = 0; strip < kStrips; ++strip) alive[strip] = strip * kLanes < area.columns ? rows : 0;
+            transmittance[row * kTileWidth + column] = row >= area.first_row && row < area.end_row &&
+                                                               column >= area.first_column && column < area.end_column
+                                                           ? 1.0f
+                                                           : -1.0f;
+    const unsigned rows = (2u << (area.end_row - 1)) - (1u << area.first_row);
+    for (int strip = 0; strip < kStrips; ++strip) {
+        const bool inside = strip * kLanes < area.end_column && (strip + 1) * kLanes > area.first_column;
+        alive[strip] = inside ? rows : 0;
+    }
 }
 
 inline bool any_alive(const unsigned alive[kStrips]) {

@@ -30,6 +30,11 @@ struct Camera {
     int width, height;
 };
 
+// The part of the image that is drawn, in pixels: columns left to right - 1, rows top to bottom - 1. Not empty.
+struct Region {
+    int left, top, right, bottom;
+};
+
 struct Settings {
     int sh_degree;
     float alpha_min, alpha_max, t_min;
@@ -68,5 +73,17 @@ enum Moment { kWeight, kU, kUU, kV, kUV, kVV, kRed, kGreen, kBlue, kMoments };
 // 32x16 39 and 19, 16x16 39 and 20, 8x16 43 and 21. Larger tiles repeat less work for a splat; the pixels of one still
 // fit in L1.
 constexpr int kTileWidth = 32, kTileHeight = 32;
+
+// The tiles that meet the region. They lie where those of the whole image do, so that a pixel gets the same bits in any
+// region.
+struct TileGrid {
+    explicit TileGrid(const Region& r)
+        : region(r), first_x(r.left / kTileWidth), first_y(r.top / kTileHeight),
+          count_x((r.right - 1) / kTileWidth - first_x + 1), count_y((r.bottom - 1) / kTileHeight - first_y + 1) {}
+    std::int64_t count() const { return std::int64_t{count_x} * count_y; }
+
+    Region region;
+    int first_x, first_y, count_x, count_y;
+};
 
 }  // namespace avatar::splat

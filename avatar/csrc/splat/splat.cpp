@@ -14,6 +14,7 @@ namespace {
 // 8 bytes a pair in the forward pass and 36 more in the backward pass: 3 GB at most.
 constexpr std::int64_t kMaxPairs = std::int64_t{1} << 26;
 constexpr std::int64_t kGrain = 256;  // Gaussians handed to a thread at a time
+constexpr std::int64_t kRows = 64;    // rows of the image handed to a thread at a time
 
 bool all_finite(const float* values, std::int64_t count) {
     // On the bits, so that it is vectorised and cannot be optimised away.
@@ -34,11 +35,58 @@ bool all_finite(const Gaussians& g, std::int64_t begin, std::int64_t end) {
 }
 
 Raster raster_of(const Drawing& d) {
-    const Camera& camera = d.view.camera;
     const Settings& settings = d.view.settings;
-    return {d.splats.data(), d.lists.pairs.get(), d.lists.tile_begin.data(), d.lists.tiles_x,
-            camera.width,    camera.height,       settings.alpha_min,        settings.alpha_max,
-            settings.t_min,  {d.background[0], d.background[1], d.background[2]}};
+    return {d.splats.data(),
+            d.lists.pairs.get(),
+            d.lists.tile_begin.data(),
+            TileGrid(d.view.region),
+            d.view.camera.width,
+            settings.alpha_min,
+            settings.alpha_max,
+            settings.t_min,
+            {d.background[0], d.background[1], d.background[2]}};
+}
+
+bool is_whole_image(const View& view) {
+    const Region& r = view.region;
+    return r.left == 0 && r.top == 0 && r.right == view.camera.width && r.bottom == view.camera.height;
+}
+
+// Calls visit(first pixel, end pixel) for the parts of the image's rows begin to end - 1 that are outside the region.
+template <typename Visit>
+void for_each_outside(const View& view, std::int64_t begin, std::int64_t end, const Visit& visit) {
+    const std::int64_t width = view.camera.width;
+    const Region& region = view.region;
+    for (std::int64_t row = begin; row < end; ++row) {
+        const bool crosses = row >= region.top && row < region.bottom;
+        visit(row * width, row * width + (crosses ? region.left : width));
+        if (crosses) visit(row * width + region.right, (row + 1) * width);
+    }
+}
+
+void draw_outside(const Drawing& drawing, float* image, float* alpha) {
+    const View& view = drawing.view;
+    parallel_for(drawing.threads, view.camera.height, kRows, [&](std::int64_t first_row, std::int64_t end_row) {
+        for_each_outside(view, first_row, end_row, [&](std::int64_t begin, std::int64_t end) {
+            for (std::int64_t pixel = begin; pixel < end; ++pixel)
+                for (int c = 0; c < 3; ++c) image[3 * pixel + c] = drawing.background[c];
+            std::fill(alpha + begin, alpha + end, 0.0f);
+        });
+    });
+}
+
+// Adds the cotangents of the pixels outside the region, which show the background.
+void add_outside(const Drawing& drawing, const float* grad_image, double grad_background[3]) {
+    const View& view = drawing.view;
+    std::vector<double> rows(3 * view.camera.height, 0.0);  // summed in a fixed order below
+    parallel_for(drawing.threads, view.camera.height, kRows, [&](std::int64_t first_row, std::int64_t end_row) {
+        for (std::int64_t row = first_row; row < end_row; ++row)
+            for_each_outside(view, row, row + 1, [&](std::int64_t begin, std::int64_t end) {
+                for (std::int64_t pixel = begin; pixel < end; ++pixel)
+                    for (int c = 0; c < 3; ++c) rows[3 * row + c] += grad_image[3 * pixel + c];
+            });
+    });
+    for (std::size_t i = 0; i < rows.size(); ++i) grad_background[i % 3] += rows[i];
 }
 
 // Projects all Gaussians and keeps the visible ones in depth order. False when an input is not finite.
@@ -85,16 +133,23 @@ bool project_all(const Gaussians& gaussians, Drawing& drawing) {
 }  // namespace
 
 std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camera, const Settings& settings,
-                                 const float background[3], const Kernels& kernels, int threads, float* image,
-                                 float* alpha) {
-    std::unique_ptr<Drawing> drawing(new Drawing{
-        View(camera, settings), {background[0], background[1], background[2]}, &kernels, threads, {}, {}, {}, {}, {}});
+                                 const Region& region, const float background[3], const Kernels& kernels, int threads,
+                                 float* image, float* alpha) {
+    std::unique_ptr<Drawing> drawing(new Drawing{View(camera, settings, region),
+                                                 {background[0], background[1], background[2]},
+                                                 &kernels,
+                                                 threads,
+                                                 {},
+                                                 {},
+                                                 {},
+                                                 {},
+                                                 {}});
     if (!project_all(gaussians, *drawing)) return nullptr;
     const auto visible = static_cast<std::int64_t>(drawing->splats.size());
-    drawing->lists =
-        build_tile_lists(drawing->splats.data(), visible, camera.width, camera.height, kMaxPairs, threads);
+    const TileGrid grid(region);
+    drawing->lists = build_tile_lists(drawing->splats.data(), visible, grid, kMaxPairs, threads);
 
-    const std::int64_t tiles = std::int64_t{drawing->lists.tiles_x} * drawing->lists.tiles_y;
+    const std::int64_t tiles = grid.count();
     drawing->processed.resize(tiles);
     drawing->transmittance.resize(std::int64_t{camera.width} * camera.height);
     const Raster raster = raster_of(*drawing);
@@ -102,13 +157,14 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t k = begin; k < end; ++k) kernels.forward_tile(raster, drawing->lists.tile_order[k], target);
     });
+    if (!is_whole_image(drawing->view)) draw_outside(*drawing, image, alpha);
     return drawing;
 }
 
 void backward(const Drawing& drawing, const Gaussians& gaussians, const float* image, const float* grad_image,
               const float* grad_alpha, const GaussianGradients& gradients, float grad_background[3]) {
     const TileLists& lists = drawing.lists;
-    const std::int64_t tiles = std::int64_t{lists.tiles_x} * lists.tiles_y;
+    const std::int64_t tiles = TileGrid(drawing.view.region).count();
     const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
     std::vector<double> tile_backgrounds(3 * tiles);
     const Raster raster = raster_of(drawing);
@@ -121,6 +177,7 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* i
     double total[3] = {};
     for (std::int64_t tile = 0; tile < tiles; ++tile)
         for (int c = 0; c < 3; ++c) total[c] += tile_backgrounds[3 * tile + c];
+    if (grad_image != nullptr && !is_whole_image(drawing.view)) add_outside(drawing, grad_image, total);
     for (int c = 0; c < 3; ++c) grad_background[c] = static_cast<float>(total[c]);
 
     const int sh = 3 * gaussians.coefficients;

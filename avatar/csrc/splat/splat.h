@@ -23,11 +23,12 @@ struct Drawing {
     std::vector<float> transmittance;      // [height * width]
 };
 
-// Draws into image [height * width * 3] and alpha [height * width]. Null when an input is not finite. Throws
-// std::invalid_argument for a colour that overflows, std::length_error for too many pairs of tile and splat.
+// Draws the region into image [height * width * 3] and alpha [height * width]; the rest of them shows the background.
+// Null when an input is not finite. Throws std::invalid_argument for a colour that overflows, std::length_error for too
+// many pairs of tile and splat.
 std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camera, const Settings& settings,
-                                 const float background[3], const Kernels& kernels, int threads, float* image,
-                                 float* alpha);
+                                 const Region& region, const float background[3], const Kernels& kernels, int threads,
+                                 float* image, float* alpha);
 
 // Writes all gradients. grad_image or grad_alpha may be null; `image` is what forward drew.
 void backward(const Drawing& drawing, const Gaussians& gaussians, const float* image, const float* grad_image,
