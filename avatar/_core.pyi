@@ -1,4 +1,5 @@
-"""The compiled module. Private: avatar.head.rasterize and avatar.splat check the arguments and document the functions."""
+"""The compiled module. Private: avatar.gaussians.hyper_cpu, avatar.head.rasterize and avatar.splat check the arguments and
+document the functions."""
 
 from collections.abc import Sequence
 
@@ -49,4 +50,8 @@ def splat_backward(
     grad_opacities: Tensor,
     grad_sh: Tensor,
     grad_background: Tensor,
+) -> None: ...
+def interpolate_forward(grid: Tensor, cells: Tensor, weights: Tensor, simd: str, threads: int, out: Tensor) -> None: ...
+def interpolate_backward(
+    grad: Tensor, begins: Tensor, gaussians: Tensor, weights: Tensor, simd: str, threads: int, grad_grid: Tensor
 ) -> None: ...

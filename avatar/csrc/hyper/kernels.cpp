@@ -1,0 +1,9 @@
+// Compiled once for each instruction set; AVATAR_KERNELS says which.
+#include "hyper/interpolate.h"
+
+namespace avatar::hyper {
+
+extern const Kernels AVATAR_KERNELS;
+const Kernels AVATAR_KERNELS = {interpolate, interpolate_backward};
+
+}  // namespace avatar::hyper
