@@ -12,8 +12,10 @@ from small_runs import new_avatar, open_small, small_config, train_small
 from avatar.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.errors import UserError
 from avatar.metrics import psnr
+from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
-from avatar.train.trainer import PerceptualTerm, choose_perceptual, interruption, train
+from avatar.train.step import PerceptualTerm, choose_perceptual
+from avatar.train.trainer import interruption, train
 
 
 def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_path: Path) -> None:
@@ -152,7 +154,7 @@ def test_a_gradient_that_is_not_finite_stops_and_leaves_the_last_checkpoint(
 
 def test_lpips_by_name_without_weights_fails_before_training(tracked_folder: Path, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer_module, "load_lpips", _no_weights)
+        patch.setattr(step_module, "load_lpips", _no_weights)
         with pytest.raises(UserError, match="no weights"):
             train_small(tracked_folder, tmp_path / "run", ["trainer.perceptual=lpips"])
     assert not (tmp_path / "run" / "checkpoints").exists()

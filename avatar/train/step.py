@@ -1,0 +1,143 @@
+"""One step of the optimisation: draw a frame, compare, differentiate, check, move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.check import describe_non_finite
+from avatar.config import TrainerConfig
+from avatar.errors import UserError
+from avatar.losses import Perceptual, PhotometricLoss, dssim, masked_lpips, on_crop, photometric_loss
+from avatar.lpips import Net, load_lpips
+from avatar.model import Avatar
+from avatar.splat import splat
+from avatar.train.optim import schedule, set_rates
+from avatar.types import Frame, Gaussians
+
+
+@dataclass(frozen=True)
+class PerceptualTerm:
+    """What the third term of the loss is in this run."""
+
+    function: Perceptual | None
+    weight: float
+    name: str
+    every: int = 1  # takes part in every so many-th step, with so many times the weight
+    crop: int | None = None  # pixels; of a random square of the head in place of the frame
+
+    def at(self, step: int, start: int, seed: int) -> tuple[Perceptual | None, float]:
+        """Function and weight of step `step` (from 0) when the term takes part from step `start` on."""
+        if self.function is None or step < start or (step - start) % self.every:
+            return None, 0.0
+        function = self.function
+        if self.crop is not None:
+            function = on_crop(function, self.crop, np.random.default_rng([seed, step]))
+        return function, self.weight * self.every
+
+
+class Outcome(NamedTuple):
+    """What a step saw and what it cost, before its update; without a graph, apart from the loss."""
+
+    loss: PhotometricLoss
+    render: Float[Tensor, "H W 3"]
+    target: Float[Tensor, "H W 3"]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a step minimises, for any frame."""
+
+    config: TrainerConfig
+    background: Float[Tensor, 3]
+    perceptual: PerceptualTerm
+
+    def sh_degree(self, step: int, stored: int) -> int:
+        """The degree of the view-dependent colour that takes part in step `step` (from 0)."""
+        return min(step // self.config.sh_interval, stored)
+
+    def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
+        start = round(self.config.perceptual_start * self.config.iterations)
+        function, weight = self.perceptual.at(step, start, self.config.seed)
+        return photometric_loss(
+            image,
+            target,
+            frame.mouth_mask,
+            frame.head_mask,
+            perceptual=function,
+            perceptual_weight=weight,
+            mouth_weight=self.config.mouth_weight,
+            delta=self.config.huber_delta,
+        )
+
+    def draw(self, step: int, frame: Frame, gaussians: Gaussians, stored_degree: int) -> Float[Tensor, "H W 3"]:
+        degree = self.sh_degree(step, stored_degree)
+        return splat(gaussians, frame.camera, self.background, sh_degree=degree).image
+
+
+def training_step(
+    avatar: Avatar,
+    optimizer: torch.optim.Adam,
+    objective: Objective,
+    step: int,
+    frame: Frame,
+    vertices: Float[Tensor, "V 3"],
+) -> Outcome:
+    """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`.
+
+    Raises UserError, leaving the parameters as they were, when the loss or a gradient is not finite.
+    """
+    target = frame.composite(objective.background)
+    image = objective.draw(step, frame, avatar(frame.params, vertices), avatar.config.sh_degree)
+    loss = objective.loss(step, frame, image, target)
+    optimizer.zero_grad()
+    loss.total.backward()
+    check_step(step, frame, loss, avatar)
+    set_rates(optimizer, schedule(step, objective.config))
+    optimizer.step()
+    return Outcome(loss, image.detach(), target)
+
+
+def choose_perceptual(config: TrainerConfig, say: Callable[[str], None]) -> PerceptualTerm:
+    """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
+
+    Raises UserError when LPIPS is asked for by name and cannot be had.
+    """
+    if config.perceptual == "none":
+        return PerceptualTerm(None, 0.0, "none")
+    if config.perceptual in ("lpips", "auto"):
+        try:
+            lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
+            name = f"lpips-{config.lpips_net}"
+            return PerceptualTerm(
+                masked_lpips(lpips), config.perceptual_weight, name, config.lpips_every, config.lpips_crop
+            )
+        except UserError as error:
+            if config.perceptual == "lpips":
+                raise
+            say(f"Training with D-SSIM in place of LPIPS: {error}")
+    return PerceptualTerm(dssim, config.dssim_weight, "dssim")
+
+
+def check_step(step: int, frame: Frame, loss: PhotometricLoss, avatar: Avatar) -> None:
+    """Stop before the optimizer when the loss or a gradient is not finite, naming the step, the frame and the tensor."""
+    gradients: dict[str, Tensor] = {n: p.grad for n, p in avatar.named_parameters() if p.grad is not None}
+    norm = torch.nn.utils.get_total_norm(gradients.values())
+    if bool(torch.isfinite(norm + loss.total.detach())):
+        return
+    suspects = {f"the loss term {n}": v for n, v in loss._asdict().items()}
+    suspects |= {f"the gradient of {n}": g for n, g in gradients.items()}
+    for name, tensor in suspects.items():
+        if message := describe_non_finite(name, tensor.detach()):
+            raise UserError(
+                f"training stopped at step {step + 1}, frame {frame.name}: {message}; the last checkpoint is untouched, "
+                "go on from it with --resume and lower learning rates, or leave the frame out"
+            )
+    # Every value is finite but a norm overflows float32: as useless to Adam as a NaN.
+    raise UserError(f"training stopped at step {step + 1}, frame {frame.name}: a gradient's norm is beyond float32")
