@@ -39,13 +39,26 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser = build_parser()
     arguments, rest = parser.parse_known_args(argv)
     unknown = [word for word in rest if word.startswith("-") or "=" not in word]
-    if arguments.command != "train":
+    if arguments.command not in ("train", "bench"):
         unknown = rest
     if unknown:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if arguments.command == "train":
         arguments.overrides += rest
+    if arguments.command == "bench":
+        words = [*arguments.inputs, *rest]
+        arguments.overrides = [word for word in words if "=" in word]
+        arguments.inputs = [Path(word) for word in words if "=" not in word]
+        check_bench(parser, arguments.part, len(arguments.inputs))
     return arguments
+
+
+def check_bench(parser: argparse.ArgumentParser, part: str, given: int) -> None:
+    """Each part of the benchmark takes a number of folders of its own."""
+    inputs = PARTS[part].inputs
+    fits = given >= 1 if inputs.endswith("...") else given == len(inputs.split())
+    if not fits:
+        parser.error(f"bench {part} takes {inputs or 'no folder'}, {given} given")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -96,6 +109,10 @@ def build_parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure time and error of a part on this machine")
     bench.add_argument("part", choices=tuple(PARTS))
+    wanted = "; ".join(f"{name}: {part.inputs}" for name, part in PARTS.items() if part.inputs)
+    bench.add_argument("inputs", nargs="*", metavar="FOLDER | RUN", help=f"what is measured ({wanted}) and key=value")
+    add_tracking(bench)
+    add_head(bench)
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
     extent = bench.add_mutually_exclusive_group()
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
@@ -109,6 +126,10 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     """The options that name a tracked folder and what belongs to it."""
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
     add_head(parser)
+    add_tracking(parser)
+
+
+def add_tracking(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in FOLDER")
     parser.add_argument("--frame-offset", type=int, metavar="N", help="image number minus .frame number, if known")
 

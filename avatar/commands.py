@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from avatar.bench import PARTS
+from avatar.bench import PARTS, Request
 from avatar.checkpoint import Checkpoint, newest_checkpoint, read_run_info
 from avatar.config import Config, flatten, load_config
 from avatar.data.subject import Subject
@@ -189,8 +189,18 @@ def bench(arguments: Namespace) -> int:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out} cannot be made ({error.strerror}); choose another --out") from error
+    request = Request(
+        out,
+        arguments.quick,
+        arguments.full,
+        tuple(arguments.inputs),
+        tuple(arguments.overrides),
+        arguments.head,
+        arguments.tracking,
+        arguments.frame_offset,
+    )
     # Only the part that is asked for is imported.
-    import_module(PARTS[arguments.part]).run(out, quick=arguments.quick, full=arguments.full)
+    import_module(PARTS[arguments.part].module).run(request)
     return OK
 
 

@@ -1,7 +1,33 @@
 """Measurements of the program's own speed and accuracy: `avatar bench PART`."""
 
-# Each module has run(out: Path, *, quick: bool, full: bool) -> None, which prints a table and writes files into `out`, a
-# folder that exists. `quick` checks the measurement itself in seconds; `full` is the long sweep, where there is one.
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Part(NamedTuple):
+    """`module` has run(request: Request) -> None, which prints a table and writes files into `request.out`."""
+
+    module: str
+    inputs: str = ""  # what stands after the part's name: nothing, FOLDER, RUN or RUN...
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a benchmark."""
+
+    out: Path  # a folder that exists
+    quick: bool = False  # tiny inputs, seconds: does the measurement itself work?
+    full: bool = False  # the long sweep, where there is one
+    inputs: tuple[Path, ...] = ()  # as many as the part names
+    overrides: tuple[str, ...] = ()  # key=value of the configuration, for parts that train
+    head: Path | None = None
+    tracking: Path | None = None
+    frame_offset: int | None = None
+
+
 PARTS = {
-    "splat": "avatar.bench.splat_report",
+    "splat": Part("avatar.bench.splat_report"),
 }

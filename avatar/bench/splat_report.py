@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from avatar.bench import Request
 from avatar.bench.scenes import HEAD_SPLATS
 from avatar.bench.splat import Row, all_variants, as_json, measure
 
@@ -14,13 +15,14 @@ USUAL_SIZES, USUAL_COUNTS = (256, 512), (HEAD_SPLATS, 50_000)
 FULL_SIZES, FULL_COUNTS = (128, 256, 512, 1024), (1_000, 5_000, HEAD_SPLATS, 50_000, 200_000)
 
 
-def run(out: Path, *, quick: bool, full: bool) -> None:
+def run(request: Request) -> None:
     """Measure, print and write; `quick` takes scenes too small to say anything."""
-    if quick:
+    out = request.out
+    if request.quick:
         variants = all_variants(QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE)
         rows = measure(variants, repeats=3, validation_size=QUICK_SIZE)
     else:
-        sizes, counts = (FULL_SIZES, FULL_COUNTS) if full else (USUAL_SIZES, USUAL_COUNTS)
+        sizes, counts = (FULL_SIZES, FULL_COUNTS) if request.full else (USUAL_SIZES, USUAL_COUNTS)
         rows = measure(all_variants(sizes, counts), repeats=21, validation_size=512)
     for line in table(rows):
         print(line)
