@@ -70,7 +70,7 @@ class Avatar(nn.Module):
     def forward(self, params: HeadParams, vertices: Float[Tensor, "V 3"] | None = None) -> Gaussians:
         """The Gaussians of one frame, world space. `vertices`: the head posed by `params` already, metres."""
         points = self.embedding.points(self.head.vertices(params) if vertices is None else vertices)
-        raw = self.deformation(self.code, self._condition(params))
+        raw = self.deformation(self.code, self.condition(params))
         if self.grid is not None:
             raw = self.grid.interpolate(raw)
         if self.hyper is not None:
@@ -78,7 +78,7 @@ class Avatar(nn.Module):
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
         return compose(points, self.quats, self.log_scales, self.opacity_logits, sh, split_offsets(raw))
 
-    def _condition(self, params: HeadParams) -> Float[Tensor, " D"]:
+    def condition(self, params: HeadParams) -> Float[Tensor, " D"]:
         """The network's input, with expression coefficients that the frame does not carry as zeros."""
         condition = params.condition()
         missing = self.deformation.condition_size - len(condition)

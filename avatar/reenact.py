@@ -14,8 +14,8 @@ from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
+from avatar.render import Renderer
 from avatar.run import Run
-from avatar.splat import splat
 from avatar.transfer import Transfer, transfer_motion
 from avatar.types import Camera, HeadParams
 from avatar.video import side_by_side, write_video
@@ -67,16 +67,14 @@ def reenact(
     return out
 
 
-@torch.no_grad()
 def pairs(run: Run, loader: FrameLoader, motion: list[HeadParams], cameras: list[Camera]) -> Iterator[np.ndarray]:
     """The driver's picture beside the avatar's render, frame by frame, uint8."""
-    background = torch.tensor(run.config.data.background)
+    renders = Renderer(run.avatar, torch.tensor(run.config.data.background)).stream(zip(motion, cameras, strict=True))
     frames = tqdm(
         loader.frames(range(len(motion))), total=len(motion), desc="reenact", unit="frame", dynamic_ncols=True
     )
-    for frame, params, camera in zip(frames, motion, cameras, strict=True):
-        render = splat(run.avatar(params), camera, background).image
-        yield side_by_side([frame.image, render], ["driver", run.subject.name])
+    for frame, render in zip(frames, renders, strict=True):
+        yield side_by_side([frame.image, render.image], ["driver", run.subject.name])
 
 
 def warn_of_other_intrinsics(driver: Camera, target: Camera, say: Callable[[str], None]) -> None:

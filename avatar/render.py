@@ -1,0 +1,185 @@
+"""A trained avatar's pictures as fast as possible: what never changes is computed once, and frames are drawn side by side.
+
+`Renderer` gives what `splat(avatar(params), camera, background)` gives, to rounding, without autograd. Computed once: the
+first layer's product with the positional code, the colours, and each HyperGaussian, which for inference is an affine map
+of its latent: n multiply-adds for each of ten offsets remain.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from avatar.gaussians.compose import compose, split_offsets
+from avatar.gaussians.hyper import HyperHead, HyperHeads
+from avatar.model import Avatar
+from avatar.splat import splat
+from avatar.splat.cpu import thread_count
+from avatar.types import Camera, Gaussians, HeadParams, Rendering
+
+AHEAD_PER_WORKER = 2  # frames begun before the first of them is asked for
+
+
+class Renderer:
+    """Renders one avatar over one background. Holds a copy of the parameters: later training does not show.
+
+    Any number of threads may use one renderer.
+    """
+
+    @torch.no_grad()
+    def __init__(self, avatar: Avatar, background: Float[Tensor, " 3"]) -> None:
+        self.background = background.detach().clone()
+        self._avatar = avatar
+        self._network = FoldedNetwork(avatar)
+        self._heads = None if avatar.hyper is None else fold_heads(avatar.hyper)
+        self._base = {
+            name: getattr(avatar, name).detach().clone() for name in ("quats", "log_scales", "opacity_logits")
+        }
+        self._base["sh"] = torch.cat((avatar.sh_dc, avatar.sh_rest), dim=1)
+
+    @torch.no_grad()
+    def gaussians(self, params: HeadParams) -> Gaussians:
+        """What `avatar(params)` gives, to rounding."""
+        return self.place(self.points(params), self.offsets(self.latents(params)))
+
+    @torch.no_grad()
+    def render(self, params: HeadParams, camera: Camera) -> Rendering:
+        """One frame as soon as possible: each step uses all threads."""
+        return splat(self.gaussians(params), camera, self.background)
+
+    def stream(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
+        """Many frames in order, as many per second as possible: each is drawn by one thread, several at a time.
+
+        `frames` may be endless; a few of them are taken ahead. An exception of a frame is raised when its turn comes.
+        """
+        workers = thread_count()
+        if workers == 1:
+            yield from (self.render(*frame) for frame in frames)
+            return
+        source = iter(frames)
+        pending: deque[Future[Rendering]] = deque()
+        with single_threaded_workers(workers) as pool:
+            try:
+                while True:
+                    while len(pending) < AHEAD_PER_WORKER * workers and (frame := next(source, None)) is not None:
+                        pending.append(pool.submit(self.render, *frame))
+                    if not pending:
+                        return
+                    yield pending.popleft().result()
+            finally:
+                for future in pending:
+                    future.cancel()
+
+    # The steps of `gaussians`, apart so that they can be timed; without autograd where their caller is.
+
+    def points(self, params: HeadParams) -> Float[Tensor, "N 3"]:
+        """Where the Gaussians are bound on the posed mesh, metres."""
+        embedding = self._avatar.embedding
+        vertices = self._avatar.head.vertices(params)
+        return embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
+
+    def latents(self, params: HeadParams) -> Float[Tensor, "N n"]:
+        """The network's output for each Gaussian."""
+        latents, grid = self._network(self._avatar.condition(params)), self._avatar.grid
+        if grid is None:
+            return latents
+        return embedding_bag(grid.nodes, latents, mode="sum", per_sample_weights=grid.weights)
+
+    def offsets(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
+        """The ten values of each Gaussian before the tanh; the latents themselves where there is no HyperGaussian."""
+        return latents if self._heads is None else self._heads(latents)
+
+    def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
+        return compose(points, offsets=split_offsets(offsets), **self._base)
+
+
+class FoldedNetwork:
+    """The deformation network with the first layer's product with the code done; `avatar.deformation` to rounding."""
+
+    def __init__(self, avatar: Avatar) -> None:
+        network = avatar.deformation
+        for_code, for_condition = network.input.weight.detach().split((network.code_size, network.condition_size), 1)
+        self._of_code: Float[Tensor, "M width"] = avatar.code @ for_code.T
+        self._for_condition, self._bias = for_condition.clone(), network.input.bias.detach().clone()
+        self._layers = [
+            (layer.get_parameter("weight").detach().T.clone(), layer.get_parameter("bias").detach().clone())
+            for layer in (*network.hidden, network.output)
+        ]
+        self._buffers = threading.local()  # activations are megabytes: fresh memory every frame would cost page faults
+
+    def __call__(self, condition: Float[Tensor, " D"]) -> Float[Tensor, "M n"]:
+        of_frame = torch.addmv(self._bias, self._for_condition, condition)
+        if not hasattr(self._buffers, "pair"):
+            self._buffers.pair = torch.empty_like(self._of_code), torch.empty_like(self._of_code)
+        x, spare = self._buffers.pair
+        torch.add(self._of_code, of_frame, out=x).relu_()
+        for weight, bias in self._layers[:-1]:
+            torch.addmm(bias, x, weight, out=spare).relu_()
+            x, spare = spare, x
+        weight, bias = self._layers[-1]
+        return torch.addmm(bias, x, weight)
+
+
+class AffineHeads(NamedTuple):
+    """The conditional means of all HyperGaussians as offsets = constant + sum_k latent_k columns_k.
+
+    Values of Gaussians lie in rows, so that each multiply-add runs along contiguous memory.
+    """
+
+    columns: Float[Tensor, "n 10 N"]
+    constant: Float[Tensor, "10 N"]
+
+    def __call__(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
+        offsets = self.constant.clone()
+        for column, latent in zip(self.columns, latents.T.contiguous(), strict=True):
+            offsets.addcmul_(column, latent)
+        return offsets.T
+
+
+def fold_heads(heads: HyperHeads) -> AffineHeads:
+    """E[a | z] = (mu_a + B mu_b) - B z with B = L11^-T L21^T, solved once in float64."""
+    columns, constants = [], []
+    for head in (heads.position, heads.rotation, heads.scale):
+        B, mean_a, mean_b = _slope(head)
+        columns.append(-B)
+        constants.append(mean_a + (B @ mean_b[..., None]).squeeze(-1))
+    return AffineHeads(
+        torch.cat(columns, dim=1).permute(2, 1, 0).float().contiguous(),
+        torch.cat(constants, dim=1).T.float().contiguous(),
+    )
+
+
+def _slope(head: HyperHead) -> tuple[Float[Tensor, "N m n"], Float[Tensor, "N m"], Float[Tensor, "N n"]]:
+    factor = head.factor()
+    B = torch.linalg.solve_triangular(factor.L11.double().mT, factor.L21.double().mT, upper=True)
+    mean_a, mean_b = head.mean.double().split((head.attribute_size, head.latent_size), dim=-1)
+    return B, mean_a, mean_b
+
+
+@contextmanager
+def single_threaded_workers(count: int) -> Iterator[ThreadPoolExecutor]:
+    """`count` threads in each of which torch and the splatter use one core; other threads keep theirs."""
+    before = torch.get_num_threads()
+    all_run = threading.Barrier(count + 1)
+
+    def settle() -> None:
+        torch.get_num_threads()  # a thread's first use of torch sets its number to the process's: before, not after
+        torch.set_num_threads(1)
+        all_run.wait()
+
+    with ThreadPoolExecutor(count, thread_name_prefix="render") as pool:
+        for _ in range(count):
+            pool.submit(settle)
+        all_run.wait()
+        # torch sets the number for the calling thread and as the start value of threads to come: put that back.
+        torch.set_num_threads(before)
+        yield pool
