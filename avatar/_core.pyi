@@ -1,5 +1,4 @@
-"""The compiled module. Private: avatar.gaussians.hyper_cpu, avatar.head.rasterize and avatar.splat check the arguments and
-document the functions."""
+"""The compiled module. Private: the Python functions that call it check the arguments and document them."""
 
 from collections.abc import Sequence
 
@@ -51,6 +50,7 @@ def splat_backward(
     grad_sh: Tensor,
     grad_background: Tensor,
 ) -> None: ...
+def dssim(image: Tensor, target: Tensor, mask: Tensor, simd: str, threads: int, gradient: Tensor | None) -> float: ...
 def interpolate_forward(grid: Tensor, cells: Tensor, weights: Tensor, simd: str, threads: int, out: Tensor) -> None: ...
 def interpolate_backward(
     grad: Tensor, begins: Tensor, gaussians: Tensor, weights: Tensor, simd: str, threads: int, grad_grid: Tensor

@@ -6,6 +6,7 @@ namespace nb = nanobind;
 void bind_hyper(nb::module_& m);
 void bind_mesh(nb::module_& m);
 void bind_splat(nb::module_& m);
+void bind_ssim(nb::module_& m);
 
 NB_MODULE(_core, m) {
     // A rendered tensor that is alive when the interpreter ends keeps its autograd graph, and so a Drawing, alive with it.
@@ -13,4 +14,5 @@ NB_MODULE(_core, m) {
     bind_hyper(m);
     bind_mesh(m);
     bind_splat(m);
+    bind_ssim(m);
 }

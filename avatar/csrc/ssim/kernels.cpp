@@ -1,0 +1,117 @@
+// Compiled once for each instruction set; AVATAR_KERNELS says which. Products and sums may be fused here: nothing has to
+// round like anything else.
+#include "ssim/ssim.h"
+
+namespace avatar::ssim {
+namespace {
+
+#if defined(__AVX512F__)
+constexpr int kLanes = 8;
+#elif defined(__AVX2__)
+constexpr int kLanes = 4;
+#else
+constexpr int kLanes = 2;
+#endif
+static_assert(kLanes <= kMaxLanes);
+
+typedef double Doubles __attribute__((vector_size(kLanes * sizeof(double)), aligned(sizeof(double)), may_alias));
+
+inline Doubles load(const double* p) { return *reinterpret_cast<const Doubles*>(p); }
+inline void store(double* p, Doubles v) { *reinterpret_cast<Doubles*>(p) = v; }
+
+constexpr double kC1 = 0.01 * 0.01, kC2 = 0.03 * 0.03;
+
+// exp(-k^2 / (2 sigma^2)) with sigma = 1.5, divided by their sum.
+constexpr double kGaussian[kTaps] = {
+    0.00102838008447911, 0.007598758135239185, 0.03600077212843083,  0.10936068950970002,
+    0.2130055377112537,  0.26601172486179436,  0.2130055377112537,   0.10936068950970002,
+    0.03600077212843083, 0.007598758135239185, 0.00102838008447911};
+
+double window_row(const Rows& rows, int row, double* scratch, double* coefficients) {
+    const std::ptrdiff_t stride = rows.stride, part = stride + kPadding;
+    const int values = rows.values, windows = values - kReach;
+    double *mean_u = scratch, *mean_v = mean_u + part, *square_u = mean_v + part, *square_v = square_u + part;
+    double *by_one = square_v + part, *by_u = by_one + part, *by_v = by_u + part;
+
+    for (int i = 0; i < values; i += kLanes) {
+        Doubles mu{}, mv{}, uu{}, vv{};
+        for (int k = 0; k < kTaps; ++k) {
+            const std::ptrdiff_t at = (row + k) * stride + i;
+            const Doubles u = load(rows.sum + at), v = load(rows.difference + at);
+            const Doubles gu = kGaussian[k] * u, gv = kGaussian[k] * v;
+            mu += gu;
+            mv += gv;
+            uu += gu * u;
+            vv += gv * v;
+        }
+        store(mean_u + i, mu);
+        store(mean_v + i, mv);
+        store(square_u + i, uu);
+        store(square_v + i, vv);
+    }
+
+    Doubles total{};
+    double rest = 0;
+    for (int i = 0; i < windows; i += kLanes) {
+        Doubles mu{}, mv{}, uu{}, vv{};
+        for (int k = 0; k < kTaps; ++k) {
+            const int at = i + kChannels * k;
+            mu += kGaussian[k] * load(mean_u + at);
+            mv += kGaussian[k] * load(mean_v + at);
+            uu += kGaussian[k] * load(square_u + at);
+            vv += kGaussian[k] * load(square_v + at);
+        }
+        const Doubles variance_u = uu - mu * mu, variance_v = vv - mv * mv;
+        const Doubles p = 1.0 / (0.5 * (mu * mu + mv * mv) + kC1), q = 1.0 / (0.5 * (variance_u + variance_v) + kC2);
+        const Doubles a = mv * mv * p, b = variance_v * q;
+        const Doubles dissimilarity = a + b - a * b;
+        if (i + kLanes <= windows)
+            total += dissimilarity;
+        else
+            for (int lane = 0; lane < windows - i; ++lane) rest += dissimilarity[lane];
+        if (coefficients == nullptr) continue;
+        // By the means at fixed mean squares, and by the mean squares; m_u and m_v have the same derivative by x.
+        const Doubles by_uu = (a - 1.0) * b * q, by_vv = (1.0 - a) * (2.0 - b) * q;
+        store(by_u + kReach + i, by_uu);
+        store(by_v + kReach + i, by_vv);
+        store(by_one + kReach + i, ((2.0 - a) * mv - a * mu) * (1.0 - b) * p - by_uu * mu - by_vv * mv);
+    }
+    for (int lane = 0; lane < kLanes; ++lane) rest += total[lane];
+    if (coefficients == nullptr) return rest;
+
+    double* const sources[3] = {by_one, by_u, by_v};
+    for (int c = 0; c < 3; ++c) {
+        // Windows beyond the last one are not: the vectors may have reached over the end.
+        for (int i = 0; i < kReach + kLanes; ++i) sources[c][kReach + windows + i] = 0.0;
+        for (int i = 0; i < values; i += kLanes) {
+            Doubles sum{};
+            for (int k = 0; k < kTaps; ++k) sum += kGaussian[k] * load(sources[c] + i + kChannels * k);
+            store(coefficients + c * stride + i, sum);
+        }
+    }
+    return rest;
+}
+
+void gradient_row(const Rows& rows, int row, const double* coefficients, int windows, double* gradient) {
+    const std::ptrdiff_t stride = rows.stride;
+    const int first = row < kTaps ? 0 : row - kTaps + 1, last = row < windows ? row : windows - 1;
+    for (int i = 0; i < rows.values; i += kLanes) {
+        Doubles by_one{}, by_u{}, by_v{};
+        for (int window = first; window <= last; ++window) {
+            const double* source = coefficients + window * 3 * stride + i;
+            const double weight = kGaussian[row - window];
+            by_one += weight * load(source);
+            by_u += weight * load(source + stride);
+            by_v += weight * load(source + 2 * stride);
+        }
+        const Doubles u = load(rows.sum + row * stride + i), v = load(rows.difference + row * stride + i);
+        store(gradient + i, by_one + u * by_u + v * by_v);
+    }
+}
+
+}  // namespace
+
+extern const Kernels AVATAR_KERNELS;
+const Kernels AVATAR_KERNELS = {window_row, gradient_row};
+
+}  // namespace avatar::ssim
