@@ -32,6 +32,8 @@ def splat_forward(
     threads: int,
     image: Tensor,
     alpha: Tensor,
+    counts: Tensor | None = None,  # int64 [16], the fields of avatar.splat.Counters
+    everywhere: bool = False,
 ) -> Drawing | None: ...
 def splat_backward(
     drawing: Drawing,

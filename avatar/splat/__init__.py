@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avatar.check import check_finite, check_shapes
-from avatar.splat.cpu import splat_cpu
+from avatar.splat.counters import Counters
+from avatar.splat.cpu import count_cpu, splat_cpu
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["splat"]
+__all__ = ["Counters", "counters", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 
@@ -61,6 +62,51 @@ def splat(
     Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device, for non-finite values
     (with count and first index), for colours that overflow, and for scenes beyond the kernel's stated limits.
     """
+    options = _checked_options(
+        gaussians,
+        camera,
+        background,
+        backend=backend,
+        sh_degree=sh_degree,
+        alpha_min=alpha_min,
+        alpha_max=alpha_max,
+        t_min=t_min,
+        blur=blur,
+        near=near,
+        antialiased=antialiased,
+        region=region,
+    )
+    if backend == "reference":
+        check_finite(**gaussians._asdict(), background=background)
+        return splat_reference(gaussians, camera, background, **options)
+    return splat_cpu(gaussians, camera, background, **options)
+
+
+def counters(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Counters:
+    """What the "cpu" backend does and skips to draw `splat(gaussians, camera, background, **options)`.
+
+    The scene is drawn once more to be counted; drawing without counting costs nothing for it.
+    """
+    checked = _checked_options(gaussians, camera, background, **{**(splat.__kwdefaults__ or {}), **options})
+    return count_cpu(gaussians, camera, background, **checked)[1]
+
+
+def _checked_options(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor,
+    *,
+    backend: str,
+    sh_degree: int | None,
+    alpha_min: float,
+    alpha_max: float,
+    t_min: float,
+    blur: float,
+    near: float,
+    antialiased: bool,
+    region: tuple[slice, slice] | None,
+) -> dict[str, Any]:
+    """Check everything, and give the options of `splat` as the backends take them."""
     sizes = check_shapes(
         means=(gaussians.means, "N 3"),
         quats=(gaussians.quats, "N 4"),
@@ -92,24 +138,16 @@ def splat(
 
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
     alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, t_min], dtype=torch.float32).tolist()
-    if backend == "reference":
-        check_finite(**gaussians._asdict(), background=background)
-        draw = splat_reference
-    else:
-        draw = splat_cpu
-    return draw(
-        gaussians,
-        camera,
-        background,
-        sh_degree=sh_degree,
-        alpha_min=alpha_min,
-        alpha_max=alpha_max,
-        t_min=t_min,
-        blur=blur,
-        near=near,
-        antialiased=antialiased,
-        region=pixels,
-    )
+    return {
+        "sh_degree": sh_degree,
+        "alpha_min": alpha_min,
+        "alpha_max": alpha_max,
+        "t_min": t_min,
+        "blur": blur,
+        "near": near,
+        "antialiased": antialiased,
+        "region": pixels,
+    }
 
 
 def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: str) -> None:

@@ -12,14 +12,32 @@ from torch.autograd.function import once_differentiable
 from avatar import _core
 from avatar.check import check_finite
 from avatar.native import instruction_set, thread_count
+from avatar.splat.counters import Counters
 from avatar.splat.region import Region
 from avatar.types import Camera, Gaussians, Rendering
 
 
-def splat_cpu(
-    gaussians: Gaussians,
+def splat_cpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
+    """`avatar.splat.splat` without its checks of shape and type; float32 tensors on the CPU."""
+    size = camera.height, camera.width
+    image, alpha = _Splat.apply(*gaussians, background, size, _settings(camera, **options))  # pyright: ignore
+    return Rendering(image, alpha)
+
+
+def count_cpu(
+    gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], *, everywhere: bool = False, **options: Any
+) -> tuple[Rendering, Counters]:
+    """Draw without a gradient, and count. `everywhere` looks for every splat at every pixel: the same bits, slowly."""
+    tensors = Gaussians(*(t.detach().contiguous() for t in gaussians))
+    size = camera.height, camera.width
+    counts = torch.empty(len(Counters._fields), dtype=torch.int64)
+    settings = {**_settings(camera, **options), "counts": counts, "everywhere": everywhere}
+    image, alpha, _ = _draw(tensors, background.detach(), size, settings)
+    return Rendering(image, alpha), Counters(*counts.tolist())
+
+
+def _settings(
     camera: Camera,
-    background: Float[Tensor, " 3"],
     *,
     sh_degree: int,
     alpha_min: float,
@@ -29,9 +47,9 @@ def splat_cpu(
     near: float,
     antialiased: bool,
     region: Region,
-) -> Rendering:
-    """`avatar.splat.splat` without its checks of shape and type; float32 tensors on the CPU."""
-    settings = {
+) -> dict[str, Any]:
+    """All arguments of the compiled function that are not tensors."""
+    return {
         "rotation": camera.R_cam_world.flatten().tolist(),
         "translation": camera.t_cam_world.tolist(),
         "intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy),
@@ -44,22 +62,28 @@ def splat_cpu(
         "simd": instruction_set(),
         "threads": thread_count(),
     }
-    image, alpha = _Splat.apply(*gaussians, background, (camera.height, camera.width), settings)  # pyright: ignore
-    return Rendering(image, alpha)
+
+
+def _draw(
+    gaussians: Gaussians, background: Tensor, size: tuple[int, int], settings: dict[str, Any]
+) -> tuple[Tensor, Tensor, _core.Drawing]:
+    image = torch.empty((*size, 3), dtype=torch.float32)
+    alpha = torch.empty(size, dtype=torch.float32)
+    drawing = _core.splat_forward(
+        **gaussians._asdict(), background=background.contiguous(), **settings, image=image, alpha=alpha
+    )
+    if drawing is None:
+        check_finite(**gaussians._asdict(), background=background)
+        raise AssertionError("the kernel found a value that is not finite")
+    return image, alpha, drawing
 
 
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *inputs, (height, width), settings = arguments
-        gaussians, background = Gaussians(*(t.detach().contiguous() for t in inputs[:-1])), inputs[-1].detach()
-        image = torch.empty((height, width, 3), dtype=torch.float32)
-        alpha = torch.empty((height, width), dtype=torch.float32)
-        drawing = _core.splat_forward(
-            **gaussians._asdict(), background=background.contiguous(), **settings, image=image, alpha=alpha
-        )
-        if drawing is None:
-            check_finite(**gaussians._asdict(), background=background)
+        *inputs, background, size, settings = arguments
+        gaussians = Gaussians(*(t.detach().contiguous() for t in inputs))
+        image, alpha, drawing = _draw(gaussians, background.detach(), size, settings)
         ctx.drawing = drawing
         ctx.save_for_backward(*gaussians, image)
         ctx.set_materialize_grads(False)

@@ -24,4 +24,9 @@ std::vector<std::uint32_t> depth_order(const std::vector<double>& depths);
 TileLists build_tile_lists(const Splat* splats, std::int64_t count, const TileGrid& grid, std::int64_t max_pairs,
                            int threads);
 
+// How many tiles other ways of choosing them would take: the box around the ellipse, and the square of three standard
+// deviations of the longer axis.
+std::int64_t tiles_of_box(const Splat& splat, const TileGrid& grid);
+std::int64_t tiles_of_square(const Splat& splat, const TileGrid& grid);
+
 }  // namespace avatar::splat

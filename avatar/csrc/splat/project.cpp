@@ -8,9 +8,8 @@
 namespace avatar::splat {
 namespace {
 
-constexpr double kHalfLog2E = 0.72134752044448170368;      // log2(e) / 2
-constexpr double kWhitening = 0.84932180028801904272;      // its root
-constexpr double kReachMargin = 1e-4;                      // in log2 of alpha; far above float rounding there
+constexpr double kWhitening = 0.84932180028801904272;  // the root of kHalfLog2E
+constexpr double kReachMargin = 1e-4;                  // in log2 of alpha; far above float rounding there
 
 double dot(const double a[3], const double b[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
@@ -162,13 +161,13 @@ Visibility project(const View& view, const Gaussians& gaussians, std::int64_t i,
     const Camera& camera = view.camera;
     const Settings& settings = view.settings;
     const float* mean = gaussians.means + 3 * i;
-    if (gaussians.opacities[i] < settings.alpha_min) return Visibility::kHidden;
+    if (gaussians.opacities[i] < settings.alpha_min) return Visibility::kTransparent;
     Geometry g;
-    if (!transform_centre(view, mean, g.p)) return Visibility::kHidden;
-    if (!project_covariance(view, gaussians, i, g)) return Visibility::kHidden;
+    if (!transform_centre(view, mean, g.p)) return Visibility::kNear;
+    if (!project_covariance(view, gaussians, i, g)) return Visibility::kFlat;
     splat.opacity = gaussians.opacities[i];
     if (settings.antialiased) splat.opacity = float(splat.opacity * g.area / std::sqrt(g.det));
-    if (splat.opacity < settings.alpha_min) return Visibility::kHidden;
+    if (splat.opacity < settings.alpha_min) return Visibility::kTransparent;
 
     depth = g.p[2];
     splat.x = camera.fx * g.p[0] / g.p[2] + camera.cx;
@@ -178,14 +177,14 @@ Visibility project(const View& view, const Gaussians& gaussians, std::int64_t i,
     splat.b = -kWhitening * g.xy / (root * std::sqrt(g.det));
     splat.c = kWhitening / root;
     splat.reach = std::numeric_limits<float>::infinity();
-    if (settings.alpha_min > 0.0f) {
+    if (settings.alpha_min > 0.0f && !settings.everywhere) {
         const double reach = std::log2(double(splat.opacity) / settings.alpha_min) + kReachMargin;
         splat.reach = float(reach);
         const double half_x = std::sqrt(reach * g.xx / kHalfLog2E), half_y = std::sqrt(reach * g.yy / kHalfLog2E);
         const Region& region = view.region;
         if (splat.x + half_x < region.left || splat.x - half_x > region.right || splat.y + half_y < region.top ||
             splat.y - half_y > region.bottom)
-            return Visibility::kHidden;
+            return Visibility::kOutside;
     }
 
     float basis[kMaxCoefficients], colour[3];

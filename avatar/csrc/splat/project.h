@@ -18,10 +18,10 @@ struct View {
 };
 
 // Why a Gaussian is not drawn, or that it is.
-enum class Visibility { kVisible, kHidden, kColourOverflow };
+enum class Visibility { kVisible, kTransparent, kNear, kFlat, kOutside, kColourOverflow };
 
-// Fills `splat` (all but `index`) and the depth of the centre. Hidden: nearer than `near`, opacity below alpha_min, no
-// pixel of the region where alpha can reach alpha_min, or no area on the image plane.
+// Fills `splat` (all but `index`) and the depth of the centre. Hidden, in the order of the enumeration: opacity below
+// alpha_min, nearer than `near`, no area on the image plane, no pixel of the region where alpha can reach alpha_min.
 Visibility project(const View& view, const Gaussians& gaussians, std::int64_t i, Splat& splat, double& depth);
 
 // Writes (does not add) the gradients of Gaussian i, from the moments of its splat summed over all tiles.

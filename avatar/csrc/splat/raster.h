@@ -18,12 +18,20 @@ struct Raster {
     float background[3];
 };
 
+// What drawing one tile took; see Counts in splat.h.
+struct TileCounts {
+    std::int64_t pixels_evaluated, pixels_composited;
+    std::int32_t rows, rows_stopped;
+};
+
 // Written at the pixels of the region only.
 struct ForwardTarget {
     float* image;              // [height * width * 3]
     float* alpha;              // [height * width]
     float* transmittance;      // [height * width]
     std::uint32_t* processed;  // [tiles], pairs that were looked at before all pixels of the tile had stopped
+    TileCounts* counts;         // [tiles]; written by count_tile only, as is the next
+    unsigned char* composited;  // [pairs], by slot: whether any pixel shows the splat
 };
 
 struct BackwardSource {
@@ -41,6 +49,7 @@ struct BackwardTarget {
 
 struct Kernels {
     void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
+    void (*count_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);  // draws as forward_tile and counts
     void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
 };
 

@@ -5,6 +5,6 @@
 namespace avatar::splat {
 
 extern const Kernels AVATAR_KERNELS;
-const Kernels AVATAR_KERNELS = {forward_tile, backward_tile};
+const Kernels AVATAR_KERNELS = {forward_tile<false>, forward_tile<true>, backward_tile};
 
 }  // namespace avatar::splat

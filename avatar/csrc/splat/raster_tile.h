@@ -98,6 +98,12 @@ inline void clear_transmittance(const TileArea& area, float* transmittance, unsi
     }
 }
 
+inline int bits_of(const unsigned alive[kStrips]) {
+    int bits = 0;
+    for (int strip = 0; strip < kStrips; ++strip) bits += __builtin_popcount(alive[strip]);
+    return bits;
+}
+
 inline bool any_alive(const unsigned alive[kStrips]) {
     unsigned any = 0;
     for (int strip = 0; strip < kStrips; ++strip) any |= alive[strip];

@@ -41,12 +41,15 @@ struct Settings {
     double blur;  // pixels^2
     double near;  // metres
     bool antialiased;
+    bool everywhere;  // for tests: look for every splat at every pixel, as if nothing were known of its extent
 };
+
+constexpr double kHalfLog2E = 0.72134752044448170368;  // log2(e) / 2
 
 // A visible Gaussian on the image plane; one cache line.
 //
 // With d = pixel - (x, y), u = a d_x + b d_y and v = c d_y, the splat's alpha is opacity * 2^-(u^2 + v^2): (a, b; 0, c)
-// is the Cholesky-type factor of the inverse covariance, times sqrt(log2(e) / 2). Squares of whitened coordinates do
+// is the Cholesky-type factor of the inverse covariance, times sqrt(kHalfLog2E). Squares of whitened coordinates do
 // not cancel, while the usual quadratic form of the conic loses all digits for long thin splats seen at an angle. The
 // factor is kept in double because (x, y) may lie far outside the image.
 struct Splat {

@@ -89,8 +89,40 @@ void add_outside(const Drawing& drawing, const float* grad_image, double grad_ba
     for (std::size_t i = 0; i < rows.size(); ++i) grad_background[i % 3] += rows[i];
 }
 
+void count_hidden(const std::vector<Visibility>& visibility, Counts& counts) {
+    constexpr Visibility reasons[4] = {Visibility::kTransparent, Visibility::kNear, Visibility::kFlat,
+                                       Visibility::kOutside};
+    for (int k = 0; k < 4; ++k) counts.hidden[k] = std::count(visibility.begin(), visibility.end(), reasons[k]);
+}
+
+void count_drawing(const Drawing& drawing, const std::vector<TileCounts>& tile_counts,
+                   const std::vector<unsigned char>& composited, Counts& counts) {
+    const TileLists& lists = drawing.lists;
+    counts.visible = static_cast<std::int64_t>(drawing.splats.size());
+    for (std::int64_t i = 0; i < counts.visible; ++i) {
+        const auto begin = composited.begin() + lists.slot_begin[i], end = composited.begin() + lists.slot_begin[i + 1];
+        counts.without_effect += std::find(begin, end, 1) == end;
+    }
+    counts.tiles = static_cast<std::int64_t>(tile_counts.size());
+    for (std::int64_t tile = 0; tile < counts.tiles; ++tile) {
+        const TileCounts& t = tile_counts[tile];
+        counts.tiles_stopped += t.rows == t.rows_stopped;
+        counts.rows += t.rows;
+        counts.rows_stopped += t.rows_stopped;
+        counts.pairs_processed += drawing.processed[tile];
+        counts.pixels_evaluated += t.pixels_evaluated;
+        counts.pixels_composited += t.pixels_composited;
+    }
+    counts.pairs = lists.pair_count;
+    const TileGrid grid(drawing.view.region);
+    for (const Splat& splat : drawing.splats) {
+        counts.pairs_in_boxes += tiles_of_box(splat, grid);
+        counts.pairs_in_squares += tiles_of_square(splat, grid);
+    }
+}
+
 // Projects all Gaussians and keeps the visible ones in depth order. False when an input is not finite.
-bool project_all(const Gaussians& gaussians, Drawing& drawing) {
+bool project_all(const Gaussians& gaussians, Drawing& drawing, Counts* counts) {
     const std::int64_t count = gaussians.count;
     const std::unique_ptr<Splat[]> projected(new Splat[count]);
     std::vector<double> depths(count);
@@ -120,6 +152,7 @@ bool project_all(const Gaussians& gaussians, Drawing& drawing) {
         visible.push_back(static_cast<std::uint32_t>(i));
         visible_depths.push_back(depths[i]);
     }
+    if (counts != nullptr) count_hidden(visibility, *counts);
     const std::vector<std::uint32_t> order = depth_order(visible_depths);
     drawing.splats.resize(order.size());
     drawing.rank_of.assign(count, -1);
@@ -134,7 +167,7 @@ bool project_all(const Gaussians& gaussians, Drawing& drawing) {
 
 std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camera, const Settings& settings,
                                  const Region& region, const float background[3], const Kernels& kernels, int threads,
-                                 float* image, float* alpha) {
+                                 float* image, float* alpha, Counts* counts) {
     std::unique_ptr<Drawing> drawing(new Drawing{View(camera, settings, region),
                                                  {background[0], background[1], background[2]},
                                                  &kernels,
@@ -144,7 +177,7 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                                  {},
                                                  {},
                                                  {}});
-    if (!project_all(gaussians, *drawing)) return nullptr;
+    if (!project_all(gaussians, *drawing, counts)) return nullptr;
     const auto visible = static_cast<std::int64_t>(drawing->splats.size());
     const TileGrid grid(region);
     drawing->lists = build_tile_lists(drawing->splats.data(), visible, grid, kMaxPairs, threads);
@@ -153,10 +186,19 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
     drawing->processed.resize(tiles);
     drawing->transmittance.resize(std::int64_t{camera.width} * camera.height);
     const Raster raster = raster_of(*drawing);
-    const ForwardTarget target{image, alpha, drawing->transmittance.data(), drawing->processed.data()};
+    std::vector<TileCounts> tile_counts(counts != nullptr ? tiles : 0);
+    std::vector<unsigned char> composited(counts != nullptr ? drawing->lists.pair_count : 0, 0);
+    const ForwardTarget target{image,
+                               alpha,
+                               drawing->transmittance.data(),
+                               drawing->processed.data(),
+                               tile_counts.data(),
+                               composited.data()};
+    const auto draw_tile = counts != nullptr ? kernels.count_tile : kernels.forward_tile;
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t k = begin; k < end; ++k) kernels.forward_tile(raster, drawing->lists.tile_order[k], target);
+        for (std::int64_t k = begin; k < end; ++k) draw_tile(raster, drawing->lists.tile_order[k], target);
     });
+    if (counts != nullptr) count_drawing(*drawing, tile_counts, composited, *counts);
     if (!is_whole_image(drawing->view)) draw_outside(*drawing, image, alpha);
     return drawing;
 }
@@ -184,7 +226,11 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* i
     parallel_for(drawing.threads, gaussians.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t i = begin; i < end; ++i) {
             const std::int32_t rank = drawing.rank_of[i];
-            if (rank < 0) {
+            double sums[kMoments] = {};
+            if (rank >= 0)
+                for (std::int64_t slot = lists.slot_begin[rank]; slot < lists.slot_begin[rank + 1]; ++slot)
+                    for (int k = 0; k < kMoments; ++k) sums[k] += moments[slot * kMoments + k];
+            if (std::all_of(sums, sums + kMoments, [](double sum) { return sum == 0.0; })) {  // hidden, or behind all
                 std::fill_n(gradients.means + 3 * i, 3, 0.0f);
                 std::fill_n(gradients.quats + 4 * i, 4, 0.0f);
                 std::fill_n(gradients.scales + 3 * i, 3, 0.0f);
@@ -192,9 +238,6 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* i
                 std::fill_n(gradients.sh + sh * i, sh, 0.0f);
                 continue;
             }
-            double sums[kMoments] = {};
-            for (std::int64_t slot = lists.slot_begin[rank]; slot < lists.slot_begin[rank + 1]; ++slot)
-                for (int k = 0; k < kMoments; ++k) sums[k] += moments[slot * kMoments + k];
             project_backward(drawing.view, gaussians, i, sums, gradients);
         }
     });
