@@ -49,7 +49,7 @@ class Renderer:
     @torch.no_grad()
     def gaussians(self, params: HeadParams) -> Gaussians:
         """What `avatar(params)` gives, to rounding."""
-        return self.place(self.points(params), self.offsets(self.latents(params)))
+        return self.place(self.points(self.vertices(params)), self.offsets(self.latents(params)))
 
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
@@ -81,10 +81,13 @@ class Renderer:
 
     # The steps of `gaussians`, apart so that they can be timed; without autograd where their caller is.
 
-    def points(self, params: HeadParams) -> Float[Tensor, "N 3"]:
-        """Where the Gaussians are bound on the posed mesh, metres."""
+    def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
+        """The posed mesh, metres."""
+        return self._avatar.head.vertices(params)
+
+    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
+        """Where the Gaussians are bound on the mesh, metres."""
         embedding = self._avatar.embedding
-        vertices = self._avatar.head.vertices(params)
         return embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
 
     def latents(self, params: HeadParams) -> Float[Tensor, "N n"]:

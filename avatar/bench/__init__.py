@@ -30,4 +30,5 @@ class Request:
 
 PARTS = {
     "splat": Part("avatar.bench.splat_report"),
+    "render": Part("avatar.bench.render", "RUN"),
 }

@@ -1,0 +1,196 @@
+"""How long a trained avatar's frame takes, step by step and as a whole, and that the fast path draws the same picture.
+
+Steps are timed with one thread, so that they add up to the frame that a stream's worker draws; latency (one frame, all
+threads) and the stream (several frames at a time) are timed as they are used. The frames are the run's held-out ones.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import torch
+
+from avatar.bench import Request
+from avatar.bench.clock import Time, paired_medians
+from avatar.bench.machine import describe_machine, limited_to
+from avatar.bench.render_plot import write_plot
+from avatar.errors import UserError
+from avatar.render import Renderer
+from avatar.run import Run, load_run
+from avatar.splat import splat
+from avatar.types import Camera, HeadParams, Rendering
+
+STEPS = ("skinning", "embedding", "network", "heads", "compose", "splat")
+SIZES, QUICK_SIZES = (256, 512), (32,)
+GAUSSIANS_TOLERANCE = 1e-4  # of a field's norm: float32 through a network of some layers
+IMAGE_TOLERANCE = 1e-5  # mean over the pixels; single pixels may differ by 1/255 where a splat is at a cut-off
+
+Input = tuple[HeadParams, Camera]
+
+
+@dataclass(frozen=True)
+class Error:
+    """The renderer against `splat(avatar(params), camera, background)`, the worst of the frames."""
+
+    gaussians: float  # largest of the fields' ||difference|| / ||field||
+    image_mean: float  # mean absolute difference of a channel
+    image_max: float
+
+
+@dataclass(frozen=True)
+class Row:
+    size: int  # pixels, width
+    error: Error
+    steps: dict[str, Time]  # one thread
+    frame: Time  # one thread: what a worker of a stream takes
+    latency: Time  # all threads
+    latency_of_avatar: Time  # all threads: splat(avatar(params), camera, background) without autograd
+    stream_fps: float  # all threads; the median of the repeats
+
+
+def run(request: Request) -> None:
+    trained = load_run(request.inputs[0], request.head)
+    rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
+    for line in table(rows, describe(trained)):
+        print(line)
+    figures, plot = request.out / "bench_render.json", request.out / "bench_render.png"
+    content = {"machine": describe_machine(), "avatar": describe(trained), "rows": [asdict(row) for row in rows]}
+    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_plot(rows, plot)
+    print(f"\nFigures  {figures}\nPlot     {plot}")
+
+
+def describe(trained: Run) -> dict[str, Any]:
+    model = trained.config.model
+    return {
+        "subject": trained.subject.name,
+        "step": trained.step,
+        "gaussians": len(trained.avatar),
+        "model": model.name,
+        "latent_dim": model.latent_dim,
+        "latent_grid": model.latent_grid,
+        "mlp_width": model.mlp_width,
+    }
+
+
+def measure(trained: Run, sizes: Sequence[int], *, repeats: int) -> list[Row]:
+    """Compare, then time. Raises UserError when the renderer draws another picture: its time would say nothing."""
+    renderer = Renderer(trained.avatar, torch.tensor(trained.config.data.background))
+    rows = []
+    for size in sizes:
+        frames = inputs(trained, size, count=repeats)
+        error = compare(trained, renderer, frames[:5])
+        with torch.no_grad():
+            with limited_to(threads=1):
+                alone = {name: next_of(calls) for name, calls in steps(renderer, frames).items()}
+                alone["frame"] = next_of([partial(renderer.render, *frame) for frame in frames])
+                times = paired_medians(alone, repeats, warm_up=3)
+            together = {
+                "renderer": next_of([partial(renderer.render, *frame) for frame in frames]),
+                "avatar": next_of([partial(draw_unfolded, trained, *frame) for frame in frames]),
+            }
+            latency = paired_medians(together, repeats, warm_up=3)
+        rates = [stream_rate(renderer, frames) for _ in range(3)]
+        rows.append(
+            Row(
+                size,
+                error,
+                {name: times[name] for name in STEPS},
+                times["frame"],
+                latency["renderer"],
+                latency["avatar"],
+                statistics.median(rates),
+            )
+        )
+    return rows
+
+
+def inputs(trained: Run, size: int, count: int) -> list[Input]:
+    """Held-out frames, spread evenly over the test part, seen `size` pixels wide."""
+    subject, test = trained.subject, trained.subject.split.test
+    chosen = [test[i * len(test) // count] for i in range(count)]
+    return [(subject.params(i), subject.camera(i, size)) for i in chosen]
+
+
+@torch.no_grad()
+def compare(trained: Run, renderer: Renderer, frames: Sequence[Input]) -> Error:
+    """Raises UserError, with the figures, above the tolerances."""
+    gaussians = mean = largest = 0.0
+    for params, camera in frames:
+        truth, found = trained.avatar(params), renderer.gaussians(params)
+        gaussians = max(gaussians, *(float((a - b).norm() / b.norm()) for a, b in zip(found, truth, strict=True)))
+        difference = (renderer.render(params, camera).image - draw_unfolded(trained, params, camera).image).abs()
+        mean, largest = max(mean, float(difference.mean())), max(largest, float(difference.max()))
+    if not (gaussians <= GAUSSIANS_TOLERANCE and mean <= IMAGE_TOLERANCE):  # not: a NaN is wrong too
+        raise UserError(
+            f"the renderer is wrong, so it is not timed: its Gaussians are off by {gaussians:.1e} of their size (at most "
+            f"{GAUSSIANS_TOLERANCE:.0e}) and its image by {mean:.1e} on average (at most {IMAGE_TOLERANCE:.0e})"
+        )
+    return Error(gaussians, mean, largest)
+
+
+def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callable[[], object]]]:
+    """For each step one call per frame, on what the steps before it gave."""
+    calls: dict[str, list[Callable[[], object]]] = {name: [] for name in STEPS}
+    for params, camera in frames:
+        vertices = renderer.vertices(params)
+        points, latents = renderer.points(vertices), renderer.latents(params)
+        offsets = renderer.offsets(latents)
+        gaussians = renderer.place(points, offsets)
+        calls["skinning"].append(partial(renderer.vertices, params))
+        calls["embedding"].append(partial(renderer.points, vertices))
+        calls["network"].append(partial(renderer.latents, params))
+        calls["heads"].append(partial(renderer.offsets, latents))
+        calls["compose"].append(partial(renderer.place, points, offsets))
+        calls["splat"].append(partial(splat, gaussians, camera, renderer.background))
+    return calls
+
+
+def draw_unfolded(trained: Run, params: HeadParams, camera: Camera) -> Rendering:
+    return splat(trained.avatar(params), camera, torch.tensor(trained.config.data.background))
+
+
+def next_of(calls: Sequence[Callable[[], object]]) -> Callable[[], object]:
+    """A function that makes one call after the other, round and round."""
+    turn: Iterator[Callable[[], object]] = itertools.cycle(calls)
+    return lambda: next(turn)()
+
+
+def stream_rate(renderer: Renderer, frames: Sequence[Input]) -> float:
+    """Frames per second of a stream, its start and end included."""
+    many = list(itertools.islice(itertools.cycle(frames), max(4 * len(frames), 100)))
+    begin = time.perf_counter()
+    count = sum(1 for _ in renderer.stream(many))
+    return count / (time.perf_counter() - begin)
+
+
+def table(rows: Sequence[Row], avatar: dict[str, Any]) -> list[str]:
+    threads = torch.get_num_threads()
+    grid = f", latents on {avatar['latent_grid']}x{avatar['latent_grid']} cells" if avatar["latent_grid"] else ""
+    lines: dict[str, list[str]] = {"image width": [f"{row.size} px" for row in rows]}
+    lines |= {f"{step}, 1 thread": [show(row.steps[step]) for row in rows] for step in STEPS}
+    lines |= {
+        "whole frame, 1 thread": [show(row.frame) for row in rows],
+        f"whole frame, {threads} threads": [show(row.latency) for row in rows],
+        "   the same unfolded": [show(row.latency_of_avatar) for row in rows],
+        f"stream, {threads} frames at a time": [f"{row.stream_fps:.0f} fps" for row in rows],
+        "image error, mean": [f"{row.error.image_mean:.1e}" for row in rows],
+        "image error, largest": [f"{row.error.image_max:.1e}" for row in rows],
+    }
+    return [
+        f"{avatar['subject']}, step {avatar['step']}: {avatar['gaussians']:,} Gaussians ({avatar['model']}{grid}, "
+        f"network {avatar['mlp_width']} wide)",
+        "Milliseconds, median (95th percentile). Unfolded: the avatar itself, without autograd; errors are against it.",
+        *(f"{name:>30} " + " ".join(f"{cell:>16}" for cell in cells) for name, cells in lines.items()),
+    ]
+
+
+def show(span: Time) -> str:
+    return f"{span.median:.2f} ({span.p95:.2f})"

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from small_runs import train_small
+
+from avatar.bench.render import STEPS, compare, inputs, measure, next_of
+from avatar.cli import main
+from avatar.errors import UserError
+from avatar.render import Renderer
+from avatar.run import Run, load_run
+
+
+@pytest.fixture(scope="module")
+def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    train_small(tracked_folder, run)
+    return run
+
+
+def test_quick_run_prints_a_table_and_writes_figures_and_plot(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "render", str(trained), "--quick", "--out", str(tmp_path)]) == 0
+    written = json.loads((tmp_path / "bench_render.json").read_text())
+    assert written["avatar"]["step"] == 12 and written["machine"]["threads"] == torch.get_num_threads()
+    (row,) = written["rows"]
+    assert tuple(row["steps"]) == STEPS
+    for span in (*row["steps"].values(), row["frame"], row["latency"], row["latency_of_avatar"]):
+        assert 0 < span["median"] <= span["p95"] and span["repeats"] == 3
+    assert row["stream_fps"] > 0
+    assert row["error"]["gaussians"] <= 1e-4 and row["error"]["image_mean"] <= 1e-5
+    assert (tmp_path / "bench_render.png").read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out
+    assert f"{row['stream_fps']:.0f} fps" in printed and f"{row['latency']['median']:.2f}" in printed
+
+
+def test_a_renderer_that_draws_another_picture_is_not_timed(trained: Path) -> None:
+    run = load_run(trained, say=lambda _: None)
+    frames = inputs(run, 32, count=2)
+    background = torch.tensor(run.config.data.background)
+    compare(run, Renderer(run.avatar, background), frames)
+    stale = Renderer(run.avatar, background)
+    with torch.no_grad():
+        run.avatar.opacity_logits += 0.01
+    with pytest.raises(UserError, match="the renderer is wrong, so it is not timed"):
+        compare(run, stale, frames)
+
+
+def test_the_frames_are_held_out_and_of_the_size_that_is_asked_for(trained: Path) -> None:
+    run: Run = load_run(trained, say=lambda _: None)
+    frames = inputs(run, 24, count=4)
+    assert len(frames) == 4 and {camera.width for _, camera in frames} == {24}
+    first = run.subject.split.test[0]
+    assert torch.equal(frames[0][0].expression, run.subject.params(first).expression)
+    one_frame = replace(run, subject=replace(run.subject, manifest=replace(run.subject.manifest, test=(first,))))
+    assert len(measure(one_frame, (16,), repeats=2)) == 1
+
+
+def test_calls_take_turns() -> None:
+    call = next_of([lambda: 1, lambda: 2])
+    assert [call() for _ in range(5)] == [1, 2, 1, 2, 1]
