@@ -79,7 +79,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
     add_run(evaluate)
-    evaluate.add_argument("--protocol", action="append", metavar="NAME", help="only this protocol; may be repeated")
+    evaluate.add_argument(
+        "--protocol",
+        action="append",
+        metavar="NAME",
+        help="only this protocol, by name or as FILE.yaml; may be repeated",
+    )
     evaluate.add_argument("--frames", action="store_true", help="write every render, truth and mask as PNG too")
 
     reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")

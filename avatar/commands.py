@@ -17,7 +17,7 @@ from avatar.data_prep.prepare import prepare as prepare_folder
 from avatar.demo import make_subject
 from avatar.doctor import report
 from avatar.errors import UserError
-from avatar.evaluate import evaluate
+from avatar.evaluation.evaluate import evaluate
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
 from avatar.reenact import reenact as drive

@@ -103,6 +103,8 @@ class Config:
         return dataclasses.asdict(self)
 
 
+PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
+
 CHOICES: dict[str, tuple[str, ...]] = {
     "model.name": ("hypergaussians", "flashavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
@@ -196,7 +198,11 @@ def _check_values(config: Config) -> None:
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
-    groups = {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in config_dir().iterdir() if p.is_dir()}
+    groups = {
+        p.name: sorted(f.stem for f in p.glob("*.yaml"))
+        for p in config_dir().iterdir()
+        if p.is_dir() and p.name != PROTOCOLS
+    }
     keys = _known_keys()
     for override in overrides:
         key, separator, value = override.partition("=")

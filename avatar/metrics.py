@@ -33,8 +33,12 @@ def psnr(
     Infinite for equal images, NaN for a mask without a pixel. Raises ValueError for sizes that disagree.
     """
     check_shapes(image=(image, "H W 3"), target=(target, "H W 3"), **({} if mask is None else {"mask": (mask, "H W")}))
-    error = (image.double() - target.double()).square().mean(dim=-1)
-    return -10.0 * torch.log10(_mean(error, mask))
+    return -10.0 * torch.log10(weighted_mean(squared_error(image, target), mask))
+
+
+def squared_error(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Squared error of each pixel, the mean of its channels, in float64."""
+    return (image.double() - target.double()).square().mean(dim=-1)
 
 
 def ssim(
@@ -52,7 +56,7 @@ def ssim(
         crop = tuple(slice(max(side.start - 2 * SSIM_RADIUS, 0), side.stop + 2 * SSIM_RADIUS) for side in box)
         image, target, mask = image[crop], target[crop], mask[crop][_INSIDE, _INSIDE]
     # float64: the variance is a difference of two nearly equal numbers, and a figure has to agree with other programs
-    return _mean(ssim_map(image.double(), target.double()).mean(dim=-1), mask)
+    return weighted_mean(ssim_map(image.double(), target.double()).mean(dim=-1), mask)
 
 
 def ssim_map(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H-10 W-10 3"]:
@@ -78,7 +82,8 @@ def bounding_box(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def _mean(values: Float[Tensor, "H W"], mask: Float[Tensor, "H W"] | None) -> Float[Tensor, ""]:
+def weighted_mean(values: Float[Tensor, "H W"], mask: Float[Tensor, "H W"] | None) -> Float[Tensor, ""]:
+    """Mean over the mask's weights, over all for None; NaN for a mask of zeros."""
     if mask is None:
         return values.mean()
     weight = mask.to(values)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from avatar.config import config_from_dict, load_config
+from avatar.config import config_dir, config_from_dict, load_config
 from avatar.errors import UserError
 
 
@@ -52,6 +52,7 @@ def test_later_overrides_win_and_survive_a_round_trip() -> None:
         ("model.latent_dim=0", "model.latent_dim=0 is out of range"),
         ("data.background=[1,2,3]", "three values from 0 to 1"),
         ("data.background=[1,2]", "data.background"),
+        ("protocol=strict", "no configuration key 'protocol'"),
         ("size", "'size' is not of the form key=value"),
         ("trainer.iterations=[1", "cannot be composed"),
     ],
@@ -63,10 +64,8 @@ def test_a_wrong_override_gets_a_sentence(override: str, message: str) -> None:
 
 
 def test_every_key_in_the_yaml_files_has_a_comment() -> None:
-    from avatar.config import config_dir
-
     for file in sorted(config_dir().glob("*/*.yaml")):
-        if file.parent.name in ("experiment", "preset") or file.stem == "flashavatar":
+        if file.parent.name in ("experiment", "preset", "protocol") or file.stem == "flashavatar":
             continue
         for line in file.read_text().splitlines():
             assert line.startswith(("#", "name: hyper")) or " # " in line, f"{file.name}: {line}"

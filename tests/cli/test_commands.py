@@ -70,7 +70,7 @@ def test_what_training_was_made_from_is_recorded(trained: Path, tracked_folder: 
 def test_eval_prints_the_table_and_writes_what_it_says(trained: Path) -> None:
     output = avatar("eval", trained, "--frames")
     results = json.loads((trained / "eval" / "results.json").read_text())
-    for name in ("hypergaussians", "flashavatar", "insta350"):
+    for name in ("hypergaussians", "flashavatar", "insta350", "rgbavatar", "strict"):
         assert name in output
         entry = results["protocols"][name]
         assert f"{entry['means']['psnr']:.2f}" in output

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,10 +19,12 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, FrameRecord, Manifest
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.evaluate import COLUMNS, evaluate
+from avatar.evaluation import evaluate as evaluate_module
+from avatar.evaluation import measure as measure_module
+from avatar.evaluation.evaluate import evaluate
+from avatar.evaluation.protocol import MEASURES, builtin_protocols, choose_protocols
 from avatar.lpips import lpips_folder, save_lpips
 from avatar.lpips_network import Lpips
-from avatar.protocols import PROTOCOLS
 from avatar.types import Gaussians, HeadParams
 
 SIZE, COUNT, TEST = 72, 10, (7, 8, 9)
@@ -91,12 +92,18 @@ def subject(tmp_path: Path) -> Subject:
     return Subject.open(prepared)
 
 
+# the corners of two eyeballs: with a focal length of SIZE at 1 m, pixels 18 to 30 and 42 to 54 across, 24 to 32 down
+EYES = torch.tensor([[18.0, 24.0], [30.0, 32.0], [42.0, 24.0], [54.0, 32.0]]).sub(SIZE / 2).div(SIZE)
+EYES = torch.cat((EYES, torch.zeros(4, 1)), dim=1)
+
+
 class Blob:
     """Stands in for a trained avatar: Gaussians on a disc whose colour follows the first expression coefficient."""
 
-    head = SimpleNamespace(assets=SimpleNamespace(fingerprint="ab" * 32))
-
-    def __init__(self) -> None:
+    def __init__(self, eyeballs: bool = True) -> None:
+        regions = {"left_eyeball": torch.tensor([0, 1]), "right_eyeball": torch.tensor([2, 3])} if eyeballs else {}
+        assets = SimpleNamespace(fingerprint="ab" * 32, regions=regions)
+        self.head = SimpleNamespace(assets=assets, vertices=lambda _: EYES)
         self.seen: list[float] = []
         generator = torch.Generator().manual_seed(1)
         self.means = torch.cat((torch.rand(400, 2, generator=generator) * 0.6 - 0.3, torch.zeros(400, 1)), dim=1)
@@ -128,7 +135,8 @@ def test_every_figure_can_be_recomputed_from_the_pictures(tmp_path: Path, subjec
     said: list[str] = []
     results = json.loads(evaluate(run, write_frames=True, say=said.append).read_text())
     assert run.avatar.seen == pytest.approx([7 / 9, 8 / 9, 1.0])  # the held-out frames, each once
-    for name, protocol in PROTOCOLS.items():
+    for protocol in choose_protocols(None):
+        name = protocol.name
         folder = run.path / "eval" / name
         rows = list(csv.DictReader((folder / "frames.csv").open()))
         assert [(row["frame"], row["name"]) for row in rows] == [("7", "00008"), ("8", "00009"), ("9", "00010")]
@@ -137,12 +145,12 @@ def test_every_figure_can_be_recomputed_from_the_pictures(tmp_path: Path, subjec
             render, truth, head, mouth = (
                 read_png(folder / kind / file).astype(float) for kind in ("renders", "gt", "masks", "mouth_masks")
             )
-            weight = head[..., None] / 255.0 if protocol.multiply else 1.0
+            weight = head[..., None] / 255.0 if protocol.mask == "multiply" else 1.0
             a, b = render * weight, truth * weight
             assert float(row["psnr"]) == pytest.approx(peak_signal_noise_ratio(b, a, data_range=255), abs=1e-6)
             assert float(row["ssim"]) == pytest.approx(structural_similarity(a, b, **SKIMAGE), abs=1e-6)
             error = ((render - truth) ** 2).mean(axis=2) / 255.0**2
-            assert float(row["psnr_masked"]) == pytest.approx(-10 * np.log10(np.average(error, weights=head)), abs=1e-6)
+            assert float(row["psnr_head"]) == pytest.approx(-10 * np.log10(np.average(error, weights=head)), abs=1e-6)
             if row["name"] == "00009":
                 assert row["psnr_mouth"] == "nan" and not mouth.any()
             else:
@@ -152,6 +160,73 @@ def test_every_figure_can_be_recomputed_from_the_pictures(tmp_path: Path, subjec
         assert means["psnr"] == pytest.approx(np.mean([float(row["psnr"]) for row in rows]), abs=1e-6)
         mouth_rows = [float(row["ssim_mouth"]) for row in rows if row["ssim_mouth"] != "nan"]
         assert means["ssim_mouth"] == pytest.approx(np.mean(mouth_rows), abs=1e-6) and len(mouth_rows) == 2
+
+
+def test_regions_divide_the_head(tmp_path: Path, subject: Subject) -> None:
+    """Eyes, rest and mouth of the strict protocol: the boxes about the projected eyeballs, the head without them."""
+    run = make_run(tmp_path / "run", subject)
+    evaluate(run, ["strict"], write_frames=True, say=lambda _: None)
+    folder = run.path / "eval" / "strict"
+    rows = {row["name"]: row for row in csv.DictReader((folder / "frames.csv").open())}
+    for name, row in rows.items():
+        file = f"{int(row['frame']):05d}.png"
+        kinds = ("renders", "gt", "masks", "mouth_masks", "eyes_masks", "rest_masks")
+        render, truth, head, mouth, eyes, rest = (read_png(folder / kind / file).astype(float) for kind in kinds)
+        columns, lines = np.arange(SIZE) + 0.5, np.arange(SIZE)[:, None] + 0.5
+        left, right = (abs(columns - middle) <= 6 * 1.5 for middle in (24, 48))  # a quarter of 12 more on either side
+        box = (left | right) & (abs(lines - 28) <= 4 * 1.5)
+        assert (eyes == head * box * (mouth == 0)).all() and (rest == head * ~box * (mouth == 0)).all()
+        error = ((render - truth) ** 2).mean(axis=2) / 255.0**2
+        _, similarity = structural_similarity(render, truth, full=True, **SKIMAGE)
+        inside = (slice(5, -5), slice(5, -5))
+        for region, mask in (("eyes", eyes), ("rest", rest)):
+            expected = -10 * np.log10(np.average(error, weights=mask))
+            assert float(row[f"psnr_{region}"]) == pytest.approx(expected, abs=1e-6), name
+            expected = np.average(similarity.mean(axis=2)[inside], weights=mask[inside])
+            assert float(row[f"ssim_{region}"]) == pytest.approx(expected, abs=1e-6), name
+
+
+def test_a_head_model_without_eyeballs_has_no_figure_for_eyes(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    run.avatar = Blob(eyeballs=False)
+    results = json.loads(evaluate(run, ["strict"], say=lambda _: None).read_text())
+    entry = results["protocols"]["strict"]
+    assert all(entry["means"][f"{measure}_{region}"] is None for measure in MEASURES for region in ("eyes", "rest"))
+    assert entry["means"]["psnr_head"] > 0
+    assert "strict: eyes and rest not measured, because the head model names no left_eyeball" in results["notes"][0]
+
+
+def test_protocols_measure_what_they_share_once(
+    tmp_path: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five protocols over three backgrounds: three renderings and, with one masked pair, four SSIM maps a frame."""
+    calls: list[str] = []
+    for module, name in ((evaluate_module, "splat"), (measure_module, "ssim_map")):
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, real=real, name=name: (calls.append(name), real(*a))[1])
+    evaluate(make_run(tmp_path / "run", subject), say=lambda _: None)
+    assert (calls.count("splat"), calls.count("ssim_map")) == (3 * len(TEST), 4 * len(TEST))
+
+
+def test_a_protocol_of_ones_own_is_measured_as_it_says(tmp_path: Path, subject: Subject) -> None:
+    """Grey background, truncated levels, figures of the head alone."""
+    path = tmp_path / "mine.yaml"
+    text = builtin_protocols()["strict"].read_text()
+    changes = (
+        ("background: white", "background: [0.5, 0.5, 0.5]"),
+        ("mask: none", "mask: only"),
+        ("levels: round", "levels: truncate"),
+    )
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    path.write_text(text)
+    run = make_run(tmp_path / "run", subject)
+    results = json.loads(evaluate(run, [str(path)], write_frames=True, say=lambda _: None).read_text())
+    means = results["protocols"]["mine"]["means"]
+    assert means["psnr"] == means["psnr_head"] and means["ssim"] == means["ssim_head"]
+    truth = read_png(run.path / "eval" / "mine" / "gt" / "00009.png")
+    assert (truth[0, 0] == 127).all()  # 127.5 cut, not rounded
 
 
 def test_truth_is_the_composite_of_the_data_over_the_background_of_the_protocol(
@@ -180,29 +255,26 @@ def test_results_name_every_choice(tmp_path: Path, subject: Subject) -> None:
     assert results["data_hash"] == "ef" * 32 and results["head_fingerprint"] == "ab" * 32 and results["step"] == 1500
     assert results["config"] == {"data": {"size": None}}
     assert results["versions"]["torch"] == torch.__version__
-    assert set(results["shared_choices"]) >= {"truth", "render", "masks", "psnr", "ssim", "lpips", "means"}
-    for name, protocol in PROTOCOLS.items():
-        entry = results["protocols"][name]
-        assert set(entry["choices"]) >= {f.name for f in dataclasses.fields(protocol)} - {
-            "name",
-            "last",
-            "multiply",
-            "lpips_net",
-        }
+    assert set(results["shared_choices"]) >= {"truth", "render", "regions", "psnr", "ssim", "lpips", "means"}
+    for protocol in choose_protocols(None):
+        entry = results["protocols"][protocol.name]
+        assert {"background", "mask", "levels", "regions", "lpips_scale", "source"} < set(entry["choices"])
+        assert entry["choices"] == json.loads(json.dumps(protocol.choices()))
         assert entry["frames"] == ["00008", "00009", "00010"]
         assert entry["frames_with_a_figure"]["psnr_mouth"] == 2
-        assert set(entry["means"]) == set(COLUMNS)
+        assert set(entry["means"]) == set(protocol.columns)
         # no weights on this machine: said, and no figure made up
         assert entry["means"]["lpips"] is None and entry["lpips"]["network"] is None
         assert "not measured (no LPIPS weights for 'vgg'" in entry["lpips"]["note"]
-        assert not (run.path / "eval" / name / "renders").exists()
-    (note,) = results["notes"]  # trained over white
-    assert note.startswith("flashavatar draws over green, the avatar was trained over (1.0, 1.0, 1.0): ")
+        assert not (run.path / "eval" / protocol.name / "renders").exists()
+    green, black = results["notes"]
+    assert green.startswith("flashavatar: drawn over green, trained over white; ")
+    assert black.startswith("rgbavatar: drawn over black, trained over white; ")
     table, places = said
-    assert f"Note: {note}" in table
+    assert f"Note: {green}" in table and f"Note: {black}" in table
     assert str(run.path / "eval" / "results.json") in places and "truth_render_error.mp4" in places
     assert table.count("not measured") == 1
-    for name in PROTOCOLS:
+    for name in builtin_protocols():
         assert f"\n{name}" in table and f"{results['protocols'][name]['means']['psnr']:.2f}" in table
 
 

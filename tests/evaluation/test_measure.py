@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from avatar.data.split import Split
-from avatar.errors import UserError
+from avatar.evaluation.measure import LPIPS_CROP, Figures, FrameMeasurer, Pair, as_seen, lpips_crop, to_8_bit
+from avatar.evaluation.protocol import Look, Protocol, choose_protocols
 from avatar.lpips_network import Lpips
-from avatar.protocols import LPIPS_CROP, PROTOCOLS, choose_protocols, lpips_crop, measure, to_8_bit
 
+PROTOCOLS = {protocol.name: protocol for protocol in choose_protocols(None)}
 SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255, "channel_axis": 2}
 
 
@@ -29,11 +31,16 @@ def pictures(height: int = 90, width: int = 100) -> tuple[torch.Tensor, ...]:
     return render, truth, head, mouth
 
 
+def measure(protocol: Protocol, render: Any, truth: Any, head: Any, mouth: Any, lpips: Lpips | None = None) -> Figures:
+    masks = {"head": head, "mouth": mouth}
+    return FrameMeasurer({protocol.look: Pair(render, truth)}, masks, {protocol.lpips_net: lpips}).measure(protocol)
+
+
 @pytest.mark.parametrize("name", PROTOCOLS)
-def test_full_frame_figures_are_those_of_scikit_image(name: str) -> None:
+def test_main_figures_are_those_of_scikit_image(name: str) -> None:
     render, truth, head, mouth = pictures()
-    figures = measure(PROTOCOLS[name], render, truth, head, mouth, None)
-    weight = head.numpy()[..., None] / 255.0 if PROTOCOLS[name].multiply else 1.0
+    figures = measure(PROTOCOLS[name], render, truth, head, mouth)
+    weight = head.numpy()[..., None] / 255.0 if PROTOCOLS[name].mask == "multiply" else 1.0
     a, b = render.numpy() * weight, truth.numpy() * weight
     assert figures["psnr"] == pytest.approx(peak_signal_noise_ratio(b, a, data_range=255), abs=1e-9)
     assert figures["ssim"] == pytest.approx(structural_similarity(a, b, **SKIMAGE), abs=1e-7)
@@ -43,10 +50,10 @@ def test_full_frame_figures_are_those_of_scikit_image(name: str) -> None:
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_region_figures_are_means_over_the_mask(name: str) -> None:
     render, truth, head, mouth = pictures()
-    figures = measure(PROTOCOLS[name], render, truth, head, mouth, None)
+    figures = measure(PROTOCOLS[name], render, truth, head, mouth)
     a, b = render.numpy().astype(float), truth.numpy().astype(float)
     _, ssim_map = structural_similarity(a, b, full=True, **SKIMAGE)
-    for region, mask in (("masked", head.numpy()), ("mouth", mouth.numpy())):
+    for region, mask in (("head", head.numpy()), ("mouth", mouth.numpy())):
         error = np.average(((a - b) ** 2).mean(axis=2), weights=mask) / 255.0**2
         assert figures[f"psnr_{region}"] == pytest.approx(-10 * np.log10(error), abs=1e-9)
         expected = np.average(ssim_map.mean(axis=2)[5:-5, 5:-5], weights=mask[5:-5, 5:-5])
@@ -57,8 +64,15 @@ def test_multiplying_by_the_mask_raises_psnr_by_the_share_of_the_mask() -> None:
     render, truth, _, mouth = pictures()
     head = torch.zeros(90, 100, dtype=torch.uint8)
     head[:45, :50] = 255
-    figures = measure(PROTOCOLS["hypergaussians"], render, truth, head, mouth, None)
-    assert figures["psnr"] == pytest.approx(figures["psnr_masked"] + 10 * math.log10(4), abs=1e-9)
+    figures = measure(PROTOCOLS["hypergaussians"], render, truth, head, mouth)
+    assert figures["psnr"] == pytest.approx(figures["psnr_head"] + 10 * math.log10(4), abs=1e-9)
+
+
+def test_mask_only_makes_the_main_figures_those_of_the_head() -> None:
+    only = dataclasses.replace(PROTOCOLS["flashavatar"], mask="only", lpips_net="squeeze")
+    figures = measure(only, *pictures(), Lpips("squeeze"))
+    for name in ("psnr", "ssim", "lpips"):
+        assert figures[name] == figures[f"{name}_head"] != figures[f"{name}_mouth"]
 
 
 def test_lpips_of_regions_is_of_the_masked_crop() -> None:
@@ -68,12 +82,21 @@ def test_lpips_of_regions_is_of_the_masked_crop() -> None:
     weight = (head / 255.0)[..., None]
     a, b = render / 255.0 * weight, truth / 255.0 * weight
     assert figures["lpips"] == pytest.approx(lpips(a, b).item(), rel=1e-5)
-    assert figures["lpips_masked"] == pytest.approx(lpips(a[9:80, 20:90], b[9:80, 20:90]).item(), rel=1e-5)
+    assert figures["lpips_head"] == pytest.approx(lpips(a[9:80, 20:90], b[9:80, 20:90]).item(), rel=1e-5)
     box = lpips_crop(mouth)
     assert box == (slice(23, 87), slice(18, 82))
     weight = (mouth / 255.0)[..., None]
     expected = lpips((render / 255.0 * weight)[box], (truth / 255.0 * weight)[box]).item()
     assert figures["lpips_mouth"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_lpips_is_scaled_as_the_protocol_says() -> None:
+    given, lpips = pictures(), Lpips("squeeze")
+    plain = measure(PROTOCOLS["flashavatar"], *given, lpips)
+    scaled = measure(dataclasses.replace(PROTOCOLS["flashavatar"], lpips_scale=0.05), *given, lpips)
+    for name in ("lpips", "lpips_head", "lpips_mouth"):
+        assert scaled[name] == pytest.approx(0.05 * plain[name], rel=1e-12) and plain[name] > 0
+    assert scaled["psnr"] == plain["psnr"]
 
 
 @pytest.mark.parametrize("size", [20, LPIPS_CROP, 200])
@@ -90,26 +113,27 @@ def test_a_hidden_mouth_has_no_figure() -> None:
     render, truth, head, mouth = pictures()
     figures = measure(PROTOCOLS["flashavatar"], render, truth, head, torch.zeros_like(mouth), Lpips("squeeze"))
     assert all(math.isnan(figures[f"{name}_mouth"]) for name in ("psnr", "ssim", "lpips"))
-    assert all(math.isfinite(figures[name]) for name in ("psnr", "ssim", "lpips", "psnr_masked", "lpips_masked"))
+    assert all(math.isfinite(figures[name]) for name in ("psnr", "ssim", "lpips", "psnr_head", "lpips_head"))
 
 
-def test_eight_bits_are_clamped_and_rounded() -> None:
+def test_levels_are_rounded_or_cut_and_floats_stay() -> None:
     values = torch.tensor([-0.2, 0.0, 0.49 / 255, 0.51 / 255, 99.4 / 255, 99.6 / 255, 1.0, 1.7])
     assert to_8_bit(values).tolist() == [0, 0, 0, 1, 99, 100, 255, 255]
+    assert to_8_bit(values, "truncate").tolist() == [0, 0, 0, 0, 99, 99, 255, 255]
+    white = (1.0, 1.0, 1.0)
+    assert torch.equal(as_seen(values, Look(white, True, "round")), to_8_bit(values))
+    assert torch.equal(as_seen(values, Look(white, True, "float")), values.clamp(0, 1))
+    assert torch.equal(as_seen(values, Look(white, False, "float")), values)
 
 
-def test_frames_are_never_those_of_the_training() -> None:
-    long = Split(tuple(range(500, 2500)), tuple(range(2500, 3000)))
-    assert PROTOCOLS["hypergaussians"].frames(3000, long) == long.test
-    assert PROTOCOLS["insta350"].frames(3000, long) == tuple(range(2650, 3000))
-    short = Split(tuple(range(800)), tuple(range(800, 1000)))
-    assert PROTOCOLS["insta350"].frames(1000, short) == short.test
-    tiny = Split((0,), (1,))
-    assert PROTOCOLS["insta350"].frames(2, tiny) == (1,)
+def test_truncation_keeps_the_levels_of_8_bit_files() -> None:
+    levels = torch.arange(256)
+    assert torch.equal(to_8_bit(levels.float() / 255.0, "truncate").long(), levels)
 
 
-def test_unknown_protocols_are_refused_and_repeated_ones_run_once() -> None:
-    assert [protocol.name for protocol in choose_protocols(None)] == ["hypergaussians", "flashavatar", "insta350"]
-    assert [protocol.name for protocol in choose_protocols(["insta350", "insta350"])] == ["insta350"]
-    with pytest.raises(UserError, match="no protocol 'hyper'; choose from hypergaussians, flashavatar, insta350"):
-        choose_protocols(["hyper"])
+def test_unclamped_floats_are_measured_as_they_are() -> None:
+    protocol = dataclasses.replace(PROTOCOLS["flashavatar"], clamp=False, levels="float")
+    _, _, head, mouth = pictures()
+    truth = torch.zeros(90, 100, 3)
+    render = torch.full_like(truth, -0.1)
+    assert measure(protocol, render, truth, head, mouth)["psnr"] == pytest.approx(20.0, abs=1e-6)

@@ -1,0 +1,132 @@
+"""The figures of one frame by one or several protocols; what protocols have in common is computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avatar.evaluation.protocol import Levels, Look, Protocol, Region, column
+from avatar.lpips_network import MIN_SIZE, Lpips, Net
+from avatar.metrics import SSIM_RADIUS, bounding_box, squared_error, ssim_map, weighted_mean
+
+LPIPS_CROP = 64  # pixels; a region is given at least so much context
+INSIDE = slice(SSIM_RADIUS, -SSIM_RADIUS)  # where SSIM's windows have their centres
+
+Figures = dict[str, float]  # by `Protocol.columns`
+
+
+class Pair(NamedTuple):
+    """What is compared: uint8 for 8-bit levels, else float32."""
+
+    render: Tensor  # [H, W, 3]
+    truth: Tensor  # [H, W, 3]
+
+
+def as_seen(image: Float[Tensor, "..."], look: Look) -> Tensor:
+    """An image as a protocol compares it: uint8 after rounding or truncation, or float32."""
+    if look.clamp:
+        image = image.clamp(0.0, 1.0)
+    return image if look.levels == "float" else to_8_bit(image, look.levels)
+
+
+def to_8_bit(image: Float[Tensor, "..."], levels: Levels = "round") -> UInt8[Tensor, "..."]:
+    """256 levels of the values clamped to [0, 1]: the nearest one, or the one below with "truncate"."""
+    scaled = image.clamp(0.0, 1.0) * 255.0
+    return (scaled.floor() if levels == "truncate" else scaled.round()).to(torch.uint8)
+
+
+class FrameMeasurer:
+    """Figures of one frame. Maps of squared error and SSIM, which take the time, are shared between protocols."""
+
+    def __init__(
+        self,
+        pairs: Mapping[Look, Pair],
+        masks: Mapping[Region, UInt8[Tensor, "H W"]],
+        networks: Mapping[Net, Lpips | None],
+    ) -> None:
+        """`masks` lacks a region that the head model cannot show; "head" is there always."""
+        self._pairs = {look: tuple(_as_values(image) for image in pair) for look, pair in pairs.items()}
+        self._masks = {region: mask.double() / 255.0 for region, mask in masks.items()}
+        self._networks = networks
+        self._maps: dict[tuple[Look, bool], tuple[Tensor, Tensor]] = {}
+        self._lpips: dict[tuple[Look, str, Net], float] = {}
+
+    def measure(self, protocol: Protocol) -> Figures:
+        """All figures of the protocol. NaN: undefined (a region without a pixel) or not measured."""
+        figures: Figures = {}
+        for region in (None, *protocol.regions):
+            mask = None
+            if region is not None or protocol.mask == "only":
+                mask = self._masks.get(region or "head")
+                if mask is None:
+                    figures |= {name: float("nan") for name in protocol.columns if name.endswith(f"_{region}")}
+                    continue
+            multiply = region is None and protocol.mask == "multiply"
+            error, similarity = self._maps_of(protocol.look, multiply)
+            inside = None if mask is None else mask[INSIDE, INSIDE]
+            figures[column("psnr", region)] = -10.0 * torch.log10(weighted_mean(error, mask)).item()
+            figures[column("ssim", region)] = weighted_mean(similarity, inside).item()
+            what = region or ("head" if protocol.mask == "only" else protocol.mask)
+            figures[column("lpips", region)] = protocol.lpips_scale * self._lpips_of(protocol, what)
+        return figures
+
+    def _images(self, look: Look, multiply: bool) -> tuple[Tensor, Tensor]:
+        render, truth = self._pairs[look]
+        if not multiply:
+            return render, truth
+        weight = self._masks["head"][..., None]
+        return render * weight, truth * weight
+
+    def _maps_of(self, look: Look, multiply: bool) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H-10 W-10"]]:
+        key = (look, multiply)
+        if key not in self._maps:
+            images = self._images(look, multiply)
+            self._maps[key] = squared_error(*images), ssim_map(*images).mean(dim=-1)
+        return self._maps[key]
+
+    def _lpips_of(self, protocol: Protocol, what: str) -> float:
+        """LPIPS before scaling; `what` is a region, or "multiply" or "none" for the whole frame."""
+        key = (protocol.look, what, protocol.lpips_net)
+        if key not in self._lpips:
+            network = self._networks[protocol.lpips_net]
+            images = self._images(protocol.look, what == "multiply")
+            if what in self._masks:
+                images = _masked_crop(images, self._masks[what])
+            self._lpips[key] = _lpips(network, *images) if images else float("nan")
+        return self._lpips[key]
+
+
+def lpips_crop(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
+    """The mask's bounding box, each side grown about its middle to `LPIPS_CROP` pixels where the image has them."""
+    box = bounding_box(mask)
+    if box is None:
+        return None
+    sides = []
+    for side, size in zip(box, mask.shape, strict=True):
+        length = min(max(side.stop - side.start, LPIPS_CROP), size)
+        start = min(max((side.start + side.stop - length) // 2, 0), size - length)
+        sides.append(slice(start, start + length))
+    return sides[0], sides[1]
+
+
+def _masked_crop(images: tuple[Tensor, Tensor], mask: Float[Tensor, "H W"]) -> tuple[Tensor, Tensor] | None:
+    crop = lpips_crop(mask)
+    if crop is None:
+        return None
+    inside = mask[crop][..., None]
+    return images[0][crop] * inside, images[1][crop] * inside
+
+
+def _lpips(network: Lpips | None, image: Tensor, target: Tensor) -> float:
+    if network is None or min(image.shape[:2]) < MIN_SIZE:
+        return float("nan")
+    return network(image.float(), target.float()).item()
+
+
+def _as_values(image: Tensor) -> Float[Tensor, "H W 3"]:
+    """float64: the variance in SSIM is a difference of two nearly equal numbers."""
+    return image.double() / 255.0 if image.dtype == torch.uint8 else image.double()

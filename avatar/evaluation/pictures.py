@@ -1,0 +1,52 @@
+"""The pictures of an evaluation as PNG files, so that anyone can compute the figures again."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from avatar.errors import UserError
+from avatar.evaluation.measure import Pair, to_8_bit
+from avatar.evaluation.protocol import Region
+
+FOLDERS = ("renders", "gt", "masks", "mouth_masks", "eyes_masks", "rest_masks")
+MASK_FOLDERS: dict[Region, str] = {
+    "head": "masks",
+    "mouth": "mouth_masks",
+    "eyes": "eyes_masks",
+    "rest": "rest_masks",
+}
+
+
+def encode_pictures(pair: Pair, masks: Mapping[Region, UInt8[Tensor, "H W"]]) -> dict[str, bytes]:
+    """PNG files by the name of their folder. A pair of floats is rounded to 8 bits: for looking, not what was measured."""
+    images = {"renders": pair.render, "gt": pair.truth} | {MASK_FOLDERS[region]: mask for region, mask in masks.items()}
+    return {folder: _png(image) for folder, image in images.items()}
+
+
+def write_pictures(folder: Path, index: int, encoded: Mapping[str, bytes]) -> None:
+    """folder/{renders,gt,masks,...}/<index>.png; UserError when the disk refuses."""
+    for name, data in encoded.items():
+        path = folder / name / f"{index:05d}.png"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        except OSError as error:
+            raise UserError(f"{path} cannot be written ({error.strerror})") from error
+
+
+def clear_pictures(folder: Path) -> None:
+    """Remove the pictures of an earlier evaluation, so that the folders hold one evaluation's frames."""
+    for name in FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def _png(image: Tensor) -> bytes:
+    pixels = (image if image.dtype == torch.uint8 else to_8_bit(image)).numpy()
+    return cv2.imencode(".png", pixels[..., ::-1] if pixels.ndim == 3 else pixels)[1].tobytes()

@@ -1,0 +1,255 @@
+"""Evaluation protocols: what exactly is measured, written down, because published figures differ in every one of these.
+
+A protocol is a small YAML file: those of configs/protocol/ go by their names, anybody's own by its path. The choices in
+which protocols differ are the fields of `Protocol`; those that all of them share are in `SHARED_CHOICES`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import yaml
+
+from avatar.config import config_dir
+from avatar.data.split import Split
+from avatar.errors import UserError
+from avatar.lpips_network import Net
+
+Region = str  # one of REGIONS
+Mask = Literal["multiply", "none", "only"]
+Levels = Literal["round", "truncate", "float"]
+Colour = tuple[float, float, float]
+
+MEASURES = ("psnr", "ssim", "lpips")
+REGIONS: tuple[Region, ...] = ("head", "mouth", "eyes", "rest")
+COLOURS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "green": (0.0, 1.0, 0.0), "black": (0.0, 0.0, 0.0)}
+HELD_OUT = "held-out"
+MAX_BYTES = 1 << 16  # of a protocol file: those that come with the program have 2 KB
+
+SHARED_CHOICES = {
+    "truth": "image * (alpha * head mask) + background * (1 - alpha * head mask), then clamped and brought to levels as "
+    "the render",
+    "render": "drawn over the same background",
+    "regions": "head: the data's head mask; mouth: the data's mouth mask; eyes: two boxes about the projected eyeballs of "
+    "the head model, times the head mask, without the mouth; rest: the head mask without mouth and eyes; all rounded to "
+    "8 bits and used as weights in [0, 1]",
+    "psnr": "10 log10(1 / mean square error over pixels and channels) of values in [0, 1], in dB",
+    "ssim": "11x11 Gaussian window, sigma 1.5, K 0.01 and 0.03, population covariance, whole windows only, mean of the "
+    "channels; as scikit-image's structural_similarity with gaussian_weights=True, use_sample_covariance=False",
+    "lpips": "version 0.1, images brought to [-1, 1], times the protocol's lpips_scale",
+    "of_a_region": "weighted mean over the region alone of squared error and of the SSIM map; LPIPS of both images times "
+    "the mask, cropped to its bounding box grown to at least 64 pixels",
+    "means": "over frames, of the figures of each frame; a frame without a pixel in a region has no figure there",
+}
+
+
+class Look(NamedTuple):
+    """How render and truth become the pictures that are compared; protocols that agree in it share the pictures."""
+
+    background: Colour
+    clamp: bool
+    levels: Levels
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """One way to evaluate. A file gives every field but the name, which is the file's."""
+
+    name: str
+    summary: str  # one sentence for people
+    source: str  # where the choices come from; what is known of it and what is a reading
+    frames: Literal["held-out"] | int  # held out in training; or of the last so many those not trained on
+    background: Colour  # under render and truth
+    mask: (
+        Mask  # main figures: of images x head mask ("multiply") or as they are ("none"), both over the whole frame; or
+    )
+    # of the head mask alone ("only")
+    clamp: bool  # to [0, 1] before anything is measured
+    levels: Levels  # 8 bits by rounding or by truncation, or floats as they are
+    regions: tuple[Region, ...]  # measured each by itself, beside the main figures
+    lpips_net: Net
+    lpips_scale: float  # factor on LPIPS
+
+    @property
+    def look(self) -> Look:
+        return Look(self.background, self.clamp, self.levels)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the figures of each frame: `psnr`, `ssim`, `lpips`, then each with `_REGION`."""
+        return tuple(column(measure, region) for region in (None, *self.regions) for measure in MEASURES)
+
+    def choices(self) -> dict[str, Any]:
+        """Every choice by name, for results files."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "name"}
+
+    def select(self, count: int, split: Split) -> tuple[int, ...]:
+        """Indices of the frames evaluated out of `count`: never one that was trained on."""
+        if self.frames == HELD_OUT:
+            return split.test
+        trained = set(split.train)
+        return tuple(index for index in range(max(count - self.frames, 0), count) if index not in trained)
+
+
+def column(measure: str, region: Region | None) -> str:
+    """The name of a figure; region None: the protocol's main figure."""
+    return measure if region is None else f"{measure}_{region}"
+
+
+def builtin_protocols() -> dict[str, Path]:
+    """The files that come with the program, by name, in the order of the table."""
+    order = ("hypergaussians", "flashavatar", "insta350", "rgbavatar", "strict")
+    return {name: config_dir() / "protocol" / f"{name}.yaml" for name in order}
+
+
+def choose_protocols(given: Sequence[str] | None) -> list[Protocol]:
+    """Protocols by name or by path of a YAML file, each once; all that come with the program for None.
+
+    Raises UserError for an unknown name, a file that is not a protocol, or two protocols of one name.
+    """
+    builtin = builtin_protocols()
+    chosen: dict[str, Protocol] = {}
+    for word in given or builtin:
+        if word in builtin:
+            protocol = read_protocol(builtin[word])
+        elif word.endswith((".yaml", ".yml")):
+            protocol = read_protocol(Path(word))
+            if protocol.name in builtin or chosen.get(protocol.name, protocol) != protocol:
+                raise UserError(
+                    f"{word}: there is another protocol {protocol.name!r} already; give the file another name"
+                )
+        else:
+            raise UserError(
+                f"there is no protocol {word!r}; choose from {', '.join(builtin)}, or give the path of a .yaml file"
+            )
+        chosen[protocol.name] = protocol
+    return list(chosen.values())
+
+
+def read_protocol(path: Path) -> Protocol:
+    """The protocol of a file. Raises UserError naming the file and the key for anything that is not as it should be."""
+    values = _read_yaml(path)
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", path.stem):
+        raise UserError(f"{path}: the file's name names the protocol and a folder; use letters, digits, - and _ only")
+    keys = [field.name for field in dataclasses.fields(Protocol) if field.name != "name"]
+    for key in values:
+        if key not in keys:
+            near = difflib.get_close_matches(str(key), keys, n=1)
+            raise UserError(f"{path}: there is no key {key!r}" + (f"; the nearest is {near[0]!r}" if near else ""))
+    missing = [key for key in keys if key not in values]
+    if missing:
+        raise UserError(f"{path}: {', '.join(missing)} missing; a protocol names every choice")
+    checked = {key: _CHECKS[key](path, key, values[key]) for key in keys}
+    protocol = Protocol(name=path.stem, **checked)
+    if not protocol.clamp and protocol.levels != "float":
+        raise UserError(f"{path}: clamp: false needs levels: float, because 8 bits hold nothing outside [0, 1]")
+    return protocol
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML's plain values only: no object of Python, no alias (a small file could stand for gigabytes), no key twice."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases (*name) are not allowed")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value]
+        if twice := next((key for key in keys if keys.count(key) > 1), None):
+            raise yaml.YAMLError(f"{twice!r} stands there twice")
+        return super().construct_mapping(node, deep)
+
+
+def _read_yaml(path: Path) -> dict[Any, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UserError(f"{path} is larger than a protocol can be ({MAX_BYTES >> 10} KB)")
+        values = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not a YAML file ({_one_line(error)})") from None
+    if not isinstance(values, dict):
+        raise UserError(f"{path} is not a protocol: it has to hold lines of the form key: value")
+    return values
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _text(path: Path, key: str, value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise _wrong(path, key, value, "a sentence")
+    return value.strip()
+
+
+def _frames(path: Path, key: str, value: Any) -> str | int:
+    if value == HELD_OUT or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
+        return value
+    raise _wrong(path, key, value, f"{HELD_OUT}, or how many frames at the end of the video")
+
+
+def _colour(path: Path, key: str, value: Any) -> Colour:
+    if isinstance(value, str) and value in COLOURS:
+        return COLOURS[value]
+    if isinstance(value, list) and len(value) == 3 and all(_is_number(v) and 0 <= v <= 1 for v in value):
+        return float(value[0]), float(value[1]), float(value[2])
+    raise _wrong(path, key, value, f"{', '.join(COLOURS)}, or three numbers from 0 to 1")
+
+
+def _flag(path: Path, key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise _wrong(path, key, value, "true or false")
+    return value
+
+
+def _regions(path: Path, key: str, value: Any) -> tuple[Region, ...]:
+    if isinstance(value, list) and len(set(map(str, value))) == len(value) and all(v in REGIONS for v in value):
+        return tuple(region for region in REGIONS if region in value)
+    raise _wrong(path, key, value, f"a list of some of {', '.join(REGIONS)}, each once")
+
+
+def _scale(path: Path, key: str, value: Any) -> float:
+    if not _is_number(value) or not 0 < value <= 1:
+        raise _wrong(path, key, value, "a number above 0, at most 1")
+    return float(value)
+
+
+def _one_of(*choices: str) -> Any:
+    def check(path: Path, key: str, value: Any) -> str:
+        if value not in choices:
+            raise _wrong(path, key, value, f"one of {', '.join(choices)}")
+        return value
+
+    return check
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _wrong(path: Path, key: str, value: Any, expected: str) -> UserError:
+    shown = repr(value)
+    return UserError(f"{path}: {key} is {shown[:60]}{'...' if len(shown) > 60 else ''}, and has to be {expected}")
+
+
+_CHECKS = {
+    "summary": _text,
+    "source": _text,
+    "frames": _frames,
+    "background": _colour,
+    "mask": _one_of(*get_args(Mask)),
+    "clamp": _flag,
+    "levels": _one_of(*get_args(Levels)),
+    "regions": _regions,
+    "lpips_net": _one_of(*get_args(Net)),
+    "lpips_scale": _scale,
+}
