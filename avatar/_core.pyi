@@ -57,3 +57,33 @@ def interpolate_forward(grid: Tensor, cells: Tensor, weights: Tensor, simd: str,
 def interpolate_backward(
     grad: Tensor, begins: Tensor, gaussians: Tensor, weights: Tensor, simd: str, threads: int, grad_grid: Tensor
 ) -> None: ...
+def compose_forward(
+    points: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    raw: Tensor,
+    simd: str,
+    threads: int,
+    means: Tensor,
+    out_quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+) -> None: ...
+def compose_backward(
+    quats: Tensor,
+    log_scales: Tensor,
+    raw: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    by_means: Tensor,
+    by_quats: Tensor,
+    by_scales: Tensor,
+    by_opacities: Tensor,
+    simd: str,
+    threads: int,
+    grad_quats: Tensor,
+    grad_log_scales: Tensor,
+    grad_opacity_logits: Tensor,
+    grad_raw: Tensor,
+) -> None: ...

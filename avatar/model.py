@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.config import ModelConfig
-from avatar.gaussians.compose import compose, split_offsets
+from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size, positional_encoding
@@ -76,7 +76,7 @@ class Avatar(nn.Module):
         if self.hyper is not None:
             raw = self.hyper(raw)
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
-        return compose(points, self.quats, self.log_scales, self.opacity_logits, sh, split_offsets(raw))
+        return compose_raw(points, self.quats, self.log_scales, self.opacity_logits, sh, raw)
 
     def condition(self, params: HeadParams) -> Float[Tensor, " D"]:
         """The network's input, with expression coefficients that the frame does not carry as zeros."""

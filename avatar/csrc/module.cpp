@@ -3,6 +3,7 @@
 
 namespace nb = nanobind;
 
+void bind_compose(nb::module_& m);
 void bind_hyper(nb::module_& m);
 void bind_mesh(nb::module_& m);
 void bind_splat(nb::module_& m);
@@ -11,6 +12,7 @@ void bind_ssim(nb::module_& m);
 NB_MODULE(_core, m) {
     // A rendered tensor that is alive when the interpreter ends keeps its autograd graph, and so a Drawing, alive with it.
     nb::set_leak_warnings(false);
+    bind_compose(m);
     bind_hyper(m);
     bind_mesh(m);
     bind_splat(m);

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.check import check_shapes
+from avatar.gaussians.compose_cpu import compose_cpu
 from avatar.types import Gaussians, Offsets
 
 
@@ -52,3 +54,29 @@ def compose(
         opacities=torch.sigmoid(opacity_logits),
         sh=sh,
     )
+
+
+def compose_raw(
+    points: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    log_scales: Float[Tensor, "N 3"],
+    opacity_logits: Float[Tensor, " N"],
+    sh: Float[Tensor, "N K 3"],
+    raw: Float[Tensor, "N 10"],
+) -> Gaussians:
+    """`compose` with `split_offsets(raw)`; float32 tensors on the CPU take the compiled kernel, which does both at once.
+
+    Raises ValueError for tensors whose sizes disagree.
+    """
+    check_shapes(
+        points=(points, "N 3"),
+        quats=(quats, "N 4"),
+        log_scales=(log_scales, "N 3"),
+        opacity_logits=(opacity_logits, "N"),
+        sh=(sh, "N _ 3"),
+        raw=(raw, "N 10"),
+    )
+    tensors = (points, quats, log_scales, opacity_logits, raw)
+    if all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors):
+        return Gaussians(*compose_cpu(*tensors), sh)
+    return compose(points, quats, log_scales, opacity_logits, sh, split_offsets(raw))
