@@ -53,6 +53,25 @@ def splat_backward(
     grad_background: Tensor,
 ) -> None: ...
 def dssim(image: Tensor, target: Tensor, mask: Tensor, simd: str, threads: int, gradient: Tensor | None) -> float: ...
+def hyper_forward(
+    parameters: Sequence[Tensor],  # mean, lower and cross of position, rotation and scale
+    latents: Tensor,
+    simd: str,
+    threads: int,
+    offsets: Tensor,
+    solved: Tensor | None,
+) -> None: ...
+def hyper_backward(
+    parameters: Sequence[Tensor],
+    latents: Tensor,
+    solved: Tensor,
+    grad_offsets: Tensor,
+    simd: str,
+    threads: int,
+    gradients: Sequence[Tensor] | None,
+    grad_latents: Tensor | None,
+) -> None: ...
+def hyper_apply(matrix: Tensor, bias: Tensor, latents: Tensor, simd: str, threads: int, offsets: Tensor) -> None: ...
 def interpolate_forward(grid: Tensor, cells: Tensor, weights: Tensor, simd: str, threads: int, out: Tensor) -> None: ...
 def interpolate_backward(
     grad: Tensor, begins: Tensor, gaussians: Tensor, weights: Tensor, simd: str, threads: int, grad_grid: Tensor

@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from avatar.gaussians.hyper_cpu import condition
+
 
 class Factor(NamedTuple):
     """The first m columns of the Cholesky factor of the precision matrix."""
@@ -87,6 +89,11 @@ class HyperHeads(nn.Module):
         self.scale = HyperHead(num_gaussians, 3, latent_size)
 
     def forward(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
+        """The raw offsets. Float32 on the CPU goes through one compiled operator, all else through torch's own."""
+        heads = self.position, self.rotation, self.scale
+        parameters = [tensor for head in heads for tensor in (head.mean, head.lower, head.cross)]
+        if all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (latents, *parameters)):
+            return condition(latents, parameters)
         return torch.cat((self.position(latents), self.rotation(latents), self.scale(latents)), dim=-1)
 
     def uncertainty(self) -> Float[Tensor, " N"]:

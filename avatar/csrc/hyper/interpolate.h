@@ -1,11 +1,10 @@
 #pragma once
 // Included only by kernels.cpp, as is all that has internal linkage here.
+#include "hyper/four.h"
 #include "hyper/kernels.h"
 
 namespace avatar::hyper {
 namespace {
-
-constexpr int kStrip = 8;  // values of a row whose sums stay in registers
 
 void interpolate(const Corners& corners, const float* grid, std::int64_t n, std::int64_t begin, std::int64_t end,
                  float* out) {
@@ -26,7 +25,7 @@ void interpolate_backward(const Touching& touching, const float* grad, std::int6
         float* __restrict__ row = grad_grid + cell * n;
         std::int64_t k = 0;
         for (; k + kStrip <= n; k += kStrip) {
-            float sums[kStrip] = {};
+            float sums[kStrip] = {};  // in registers
             for (std::int64_t i = first; i < last; ++i) {
                 const float weight = touching.weights[i];
                 const float* from = grad + touching.gaussians[i] * n + k;

@@ -18,7 +18,31 @@ struct Touching {
     const float* weights;           // [gaussians * 4]
 };
 
+// The heads of position, rotation and scale; avatar/gaussians/hyper.py says what the arrays hold.
+constexpr int kHeads = 3, kAttributeSizes[kHeads] = {3, 4, 3}, kOffsets = 10;
+
+struct Head {  // of m attribute values, on n latent dimensions
+    const float* mean;   // [gaussians, m + n]
+    const float* lower;  // [gaussians, m, m]
+    const float* cross;  // [gaussians, n, m]
+};
+
+struct HeadGradient {
+    float *mean, *lower, *cross;
+};
+
 struct Kernels {
+    // offsets [gaussians, 10] from latents [gaussians, n]; solved [gaussians, 10], which may be null, is what the
+    // backward pass needs of them: the means of the attributes minus the offsets.
+    void (*forward)(const Head heads[kHeads], const float* latents, std::int64_t n, std::int64_t begin,
+                    std::int64_t end, float* offsets, float* solved);
+    // Every value of the gradients is written; `gradients` or `grad_latents` [gaussians, n] may be null.
+    void (*backward)(const Head heads[kHeads], const float* latents, const float* solved, const float* grad_offsets,
+                     std::int64_t n, std::int64_t begin, std::int64_t end, const HeadGradient* gradients,
+                     float* grad_latents);
+    // out [gaussians, 10] = bias [gaussians, 10] + latents [gaussians, n] times matrix [gaussians, n, 10]
+    void (*apply)(const float* matrix, const float* bias, const float* latents, std::int64_t n, std::int64_t begin,
+                  std::int64_t end, float* out);
     // out [gaussians, n] = the weighted sum of four rows of grid [nodes, n]
     void (*interpolate)(const Corners&, const float* grid, std::int64_t n, std::int64_t begin, std::int64_t end,
                         float* out);
