@@ -1,4 +1,4 @@
-"""The command line: `avatar train | eval | reenact | prepare | demo-data | demo | bench | doctor`."""
+"""The command line: `avatar train | eval | reenact | check | prepare | demo-data | demo | bench | doctor`."""
 
 from __future__ import annotations
 
@@ -101,6 +101,10 @@ def build_parser() -> argparse.ArgumentParser:
     prepare = commands.add_parser("prepare", help="check and import a tracked folder; train does it by itself")
     add_source(prepare)
     prepare.add_argument("--out", type=Path, metavar="DIR", help="where the prepared subject goes (default: the cache)")
+
+    check = commands.add_parser("check", help="say everything that is wrong with a tracked folder, before training")
+    add_source(check)
+    check.add_argument("--json", action="store_true", help="print the findings as JSON, and nothing else, to stdout")
 
     demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
     demo_data.add_argument("out", type=Path, metavar="OUT")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import time
 from argparse import Namespace
 from importlib import import_module
 from pathlib import Path
 
 import torch
+from tqdm import tqdm
 
 from avatar.bench import PARTS, Request
 from avatar.checkpoint import Checkpoint, newest_checkpoint, read_run_info
@@ -20,6 +22,7 @@ from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
+from avatar.quality.folder import as_text, check_folder
 from avatar.reenact import reenact as drive
 from avatar.run import Run, Source, check_same, find_head, load_run, open_subject, read_source, start_run
 from avatar.train.trainer import train as run_training
@@ -153,6 +156,19 @@ def prepare(arguments: Namespace) -> int:
     )
     print(f"Prepared in {prepared}")
     return OK
+
+
+def check(arguments: Namespace) -> int:
+    """Exit status 0: fine, 1: warnings, 2: errors."""
+    outcome = check_folder(
+        arguments.folder,
+        lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
+        tracking=arguments.tracking,
+        frame_offset=arguments.frame_offset,
+        progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False),
+    )
+    print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))
+    return outcome.status
 
 
 def demo_data(arguments: Namespace) -> int:

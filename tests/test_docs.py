@@ -11,6 +11,7 @@ import pytest
 from avatar.cli import parse
 from avatar.config import load_config
 
+COMMANDS = ("train", "eval", "reenact", "check", "prepare", "demo-data", "demo", "bench")
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 
@@ -28,7 +29,7 @@ def test_documented_commands_parse(page: Path) -> None:
         if command.split()[1].isupper() or "|" in command:
             continue  # a pattern, not a command
         words = shlex.split(command)[1:]
-        if len(words) == 1 and words[0] in ("train", "eval", "reenact", "prepare", "demo-data", "demo", "bench"):
+        if len(words) == 1 and words[0] in COMMANDS:
             words.append("--help")  # a mention of the command itself
         try:
             arguments = parse(words)

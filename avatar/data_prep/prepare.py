@@ -78,7 +78,7 @@ def prepare(
             f"{inspection.width}x{inspection.height}; resize the images or track them again"
         )
     notes = list(tracks.notes)
-    coefficients = _coefficients(tracks, head, notes)
+    coefficients = fitted_coefficients(tracks, head, notes)
     model = HeadModel(head, torch.from_numpy(coefficients["shape"]))
     if frame_offset is None:
         images, heads, mouths = (
@@ -167,7 +167,7 @@ def _is_current(target: Path, input_hash: str, is_chosen: bool) -> bool:
         return False
 
 
-def _coefficients(tracks: Tracking, head: HeadAssets, notes: list[str]) -> dict[str, np.ndarray]:
+def fitted_coefficients(tracks: Tracking, head: HeadAssets, notes: list[str]) -> dict[str, np.ndarray]:
     """Identity [300] of the first frame and expressions [n, E] of all, fitted to the head model's number of directions."""
     expression = np.stack([track.expression for track in tracks.frames.values()])
     shape = next(iter(tracks.frames.values())).shape[None]

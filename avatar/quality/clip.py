@@ -1,0 +1,164 @@
+"""A tracked folder, read once from end to end; what does not work is gathered instead of raised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import torch
+
+from avatar.data_prep.frame_files import FrameFiles, find_frame_files
+from avatar.data_prep.frame_offset import OffsetEstimate, detect_offset
+from avatar.data_prep.metrical_tracker import FrameTrack, Tracking, read_tracking
+from avatar.data_prep.prepare import fitted_coefficients
+from avatar.errors import UserError
+from avatar.head.assets import HeadAssets
+from avatar.head.model import HeadModel
+from avatar.quality.fit import Fit, MeshProjector, fit_of_files
+from avatar.quality.view import IMAGE, View, look_at
+
+MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
+GIVEN = "given with --frame-offset"
+T = TypeVar("T")
+
+
+class Progress(Protocol):
+    """Passes items through, of which there will be `total`, and shows how far it is."""
+
+    def __call__(self, items: Iterable[T], total: int, what: str) -> Iterable[T]: ...
+
+
+def silent(items: Iterable[T], total: int, what: str) -> Iterable[T]:
+    return items
+
+
+@dataclass(frozen=True)
+class Clip:
+    files: FrameFiles
+    tracking: Tracking
+    complaints: tuple[tuple[str, str], ...]  # (which check, sentence): what stops `prepare` while reading
+    head: HeadModel | None
+    offset: int | None  # image number - tracking number; None where it could not be found
+    offset_evidence: str  # how it was found, or why it was not
+    part_offsets: tuple[int, int] | None  # of the first and the last third, where both are clear
+    views: dict[int, View] = field(default_factory=dict)  # by image number
+    fits: dict[int, Fit] = field(default_factory=dict)  # by image number
+    steps: dict[int, float] = field(default_factory=dict)  # image number -> mean grey-level change since the one before
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """(image number, tracking number) of everything that has a partner, usable or not."""
+        if self.offset is None:
+            return []
+        numbers = {*self.tracking.frames, *self.tracking.bad}
+        return [(n + self.offset, n) for n in sorted(numbers) if n + self.offset in self.files.images]
+
+    def tracked(self) -> Iterator[tuple[int, FrameTrack]]:
+        """(image number, track) of the pairs whose tracking can be read."""
+        for image, number in self.pairs():
+            if number in self.tracking.frames:
+                yield image, self.tracking.frames[number]
+
+    def is_whole(self, image: int) -> bool:
+        """Whether the image and its masks can be read and have one size."""
+        view = self.views.get(image)
+        return view is not None and not view.problems and len(set(view.sizes.values())) == 1
+
+    def size(self) -> tuple[int, int] | None:
+        """(width, height) of the first image that can be read."""
+        return next((view.sizes[IMAGE] for view in self.views.values() if IMAGE in view.sizes), None)
+
+
+def read_clip(
+    folder: Path,
+    assets: HeadAssets | None,
+    tracking: Path | None,
+    frame_offset: int | None,
+    progress: Progress = silent,
+) -> Clip:
+    """Read everything. Raises UserError only when there is no folder."""
+    complaints: list[tuple[str, str]] = []
+    files = find_frame_files(folder, tracking, lambda message: complaints.append(("layout", message)))
+    tracks = read_tracking(files.tracking, lambda message: complaints.append(("tracking", message)))
+    head = None
+    if assets is not None and tracks.frames:
+        try:
+            head = HeadModel(assets, torch.from_numpy(fitted_coefficients(tracks, assets, [])["shape"]))
+        except UserError as error:
+            complaints.append(("head-model", str(error)))
+    clip = Clip(files, tracks, tuple(complaints), head, frame_offset, GIVEN, None)
+    views, steps = _read_views(files, progress)
+    clip = replace(clip, views=views, steps=steps)
+    if head is None or not files.images:
+        return clip
+    clip = _with_offset(clip, head, frame_offset)
+    return replace(clip, fits=_measure_fits(clip, head, progress))
+
+
+def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View], dict[int, float]]:
+    views: dict[int, View] = {}
+    steps: dict[int, float] = {}
+    previous: tuple[int, np.ndarray] | None = None
+    numbers = list(files.images)
+    with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
+        looks = pool.map(lambda n: look_at(_files_of(files, n)), numbers)
+        for number, view in zip(numbers, progress(looks, len(numbers), "images"), strict=True):
+            views[number] = replace(view, grey=None)
+            if view.grey is None:
+                continue
+            grey = view.grey.astype(np.int16)
+            if previous is not None and previous[0] == number - 1 and previous[1].shape == grey.shape:
+                steps[number] = float(np.abs(grey - previous[1]).mean())
+            previous = number, grey
+    return views, steps
+
+
+def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, Fit]:
+    tracks = {image: track for image, track in clip.tracked() if clip.is_whole(image)}
+    masks = clip.files.head_masks or clip.files.alphas
+    numbers = [number for number in tracks if number in masks]
+    project = MeshProjector(head, next(iter(clip.tracking.frames.values())).intrinsics)
+    with ThreadPoolExecutor(max_workers=2) as pool:  # as do matrix products
+        fits = pool.map(lambda n: fit_of_files(project, tracks[n], masks[n], clip.files.mouth_masks.get(n)), numbers)
+        found = dict(zip(numbers, progress(fits, len(numbers), "mesh against masks"), strict=True))
+    return {number: fit for number, fit in found.items() if fit is not None}
+
+
+def _with_offset(clip: Clip, head: HeadModel, given: int | None) -> Clip:
+    """Find the offset of the whole clip, and of its first and last third: they differ where frames were dropped."""
+    numbers = list(clip.tracking.frames)
+    third = len(numbers) // 3
+    parts: tuple[int, int] | None = None
+    if third >= MIN_PART:
+        first, last = (_estimate(clip, head, part) for part in (numbers[:third], numbers[-third:]))
+        if isinstance(first, OffsetEstimate) and isinstance(last, OffsetEstimate):
+            parts = first.offset, last.offset
+    if given is not None:
+        return replace(clip, part_offsets=parts)
+    estimate = _estimate(clip, head, numbers)
+    if isinstance(estimate, OffsetEstimate):
+        return replace(clip, offset=estimate.offset, offset_evidence=estimate.sentence(), part_offsets=parts)
+    return replace(clip, offset=None, offset_evidence=estimate, part_offsets=parts)
+
+
+def _estimate(clip: Clip, head: HeadModel, numbers: list[int]) -> OffsetEstimate | str:
+    """The offset of these tracking frames, or the sentence that says why it is not clear."""
+    tracks = {n: clip.tracking.frames[n] for n in numbers}
+    images, heads, mouths = (
+        {n: path for n, path in found.items() if clip.is_whole(n)}
+        for found in (clip.files.images, clip.files.head_masks or clip.files.alphas, clip.files.mouth_masks)
+    )
+    if not images:
+        return "no image can be read"
+    try:
+        return detect_offset(head, tracks, next(iter(tracks.values())).intrinsics, images, heads, mouths)
+    except UserError as error:
+        return str(error)
+
+
+def _files_of(files: FrameFiles, number: int) -> Mapping[str, Path]:
+    kinds = {kind: found for kind, found in files.of_kind().items() if kind != "checkpoint"}
+    return {kind: found[number] for kind, found in kinds.items() if number in found}
