@@ -17,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from avatar.gaussians.hyper_cpu import Interpolation
 from avatar.gaussians.uv import UVTexels
 from avatar.head.assets import HeadAssets
 
@@ -24,13 +25,8 @@ from avatar.head.assets import HeadAssets
 class LatentGrid(NamedTuple):
     """M nodes and where each of N Gaussians lies between them."""
 
-    nodes: Int[Tensor, "N 4"]  # which nodes
-    weights: Float[Tensor, "N 4"]  # bilinear, >= 0, each row's sum is 1
+    interpolate: Interpolation  # values of the nodes [M, n] -> at the Gaussians [N, n]; bilinear, weights add up to 1
     places: Float[Tensor, "M 3"]  # of the nodes on the neutral mesh, metres
-
-    def interpolate(self, values: Float[Tensor, "M n"]) -> Float[Tensor, "N n"]:
-        """The values of the nodes at the Gaussians."""
-        return (values[self.nodes] * self.weights[..., None]).sum(dim=1)
 
 
 def latent_grid(
@@ -63,7 +59,7 @@ def latent_grid(
     total = torch.zeros(len(used), dtype=torch.float64).index_add_(0, flat, share)
     pulled = (points.double()[:, None, :] * weight[..., None]).reshape(-1, 3)
     places = torch.zeros(len(used), 3, dtype=torch.float64).index_add_(0, flat, pulled) / total[:, None]
-    return LatentGrid(nodes, weight.float(), places.to(points.dtype))
+    return LatentGrid(Interpolation(nodes, weight.float(), len(used)), places.to(points.dtype))
 
 
 def uv_charts(uv_faces: Int[np.ndarray, "F 3"], num_uvs: int) -> Int[np.ndarray, " F"]:

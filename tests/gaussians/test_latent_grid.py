@@ -27,10 +27,10 @@ def grid_of(assets: HeadAssets, cells: int):
 def test_a_constant_is_kept_and_every_node_is_used(cells: int) -> None:
     texels, _, grid = grid_of(grid_head(), cells)
     M = len(grid.places)
-    assert grid.nodes.shape == grid.weights.shape == (len(texels.row), 4)
-    assert (grid.weights >= 0).all()
+    assert grid.interpolate.cells.shape == grid.interpolate.weights.shape == (len(texels.row), 4)
+    assert (grid.interpolate.weights >= 0).all()
     torch.testing.assert_close(grid.interpolate(torch.full((M, 2), 3.0)), torch.full((len(texels.row), 2), 3.0))
-    assert set(grid.nodes[grid.weights > 0].tolist()) == set(range(M))
+    assert set(grid.interpolate.cells[grid.interpolate.weights > 0].tolist()) == set(range(M))
     assert min(cells, RASTER) ** 2 >= M or cells > RASTER
 
 
@@ -41,11 +41,11 @@ def test_what_is_linear_over_the_map_is_kept_between_the_outermost_nodes() -> No
     # A node's own place in the map, from any Gaussian that takes all or part of it: its cell's centre.
     at = torch.zeros(len(grid.places), 2)
     for corner, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
-        some = grid.weights[:, corner] > 0
+        some = grid.interpolate.weights[:, corner] > 0
         low_u = (u * cells - 0.5).clamp(0, cells - 1).floor().clamp(max=cells - 2)
         low_v = (v * cells - 0.5).clamp(0, cells - 1).floor().clamp(max=cells - 2)
         centre = torch.stack((low_u + j + 0.5, low_v + i + 0.5), dim=-1) / cells
-        at[grid.nodes[some, corner]] = centre[some].float()
+        at[grid.interpolate.cells[some, corner]] = centre[some].float()
     inside = (u > 0.5 / cells) & (u < 1 - 0.5 / cells) & (v > 0.5 / cells) & (v < 1 - 0.5 / cells)
     found = grid.interpolate(at)
     expected = torch.stack((u, v), dim=-1).float()
@@ -84,7 +84,7 @@ def test_charts_are_not_mixed() -> None:
     )
     texels, _, grid = grid_of(split, 6)
     on_right = right[texels.face]
-    left_nodes, right_nodes = (set(grid.nodes[side].flatten().tolist()) for side in (~on_right, on_right))
+    left_nodes, right_nodes = (set(grid.interpolate.cells[side].flatten().tolist()) for side in (~on_right, on_right))
     assert left_nodes and right_nodes and left_nodes.isdisjoint(right_nodes)
     values = torch.zeros(len(grid.places), 1)
     values[sorted(right_nodes)] = 1.0
@@ -94,6 +94,6 @@ def test_charts_are_not_mixed() -> None:
 def test_places_are_the_weighted_means_of_their_gaussians() -> None:
     _, points, grid = grid_of(grid_head(), 4)
     for node in (0, len(grid.places) // 2, len(grid.places) - 1):
-        taken = (grid.nodes == node).double() * grid.weights.double()
+        taken = (grid.interpolate.cells == node).double() * grid.interpolate.weights.double()
         expected = (taken.sum(1)[:, None] * points.double()).sum(0) / taken.sum()
         torch.testing.assert_close(grid.places[node].double(), expected, rtol=0, atol=1e-7)
