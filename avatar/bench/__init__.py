@@ -31,4 +31,5 @@ class Request:
 PARTS = {
     "splat": Part("avatar.bench.splat_report"),
     "render": Part("avatar.bench.render", "RUN"),
+    "train": Part("avatar.bench.train_report", "FOLDER"),
 }

@@ -1,0 +1,119 @@
+"""One training step cut into stages, each timed forward and backward by itself on the values that a real step gives it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avatar.gaussians.compose import compose, split_offsets
+from avatar.losses import PhotometricLoss
+from avatar.model import Avatar
+from avatar.train.optim import schedule, set_rates
+from avatar.train.step import Objective, check_step
+from avatar.types import Frame, Gaussians
+
+
+@dataclass
+class Stopwatch:
+    """Milliseconds by stage, one value a step."""
+
+    spans: dict[str, list[float]] = field(default_factory=dict)
+
+    def measure(self, stage: str, function: Callable[[], Any]) -> Any:
+        begin = time.perf_counter()
+        result = function()
+        self.spans.setdefault(stage, []).append(1e3 * (time.perf_counter() - begin))
+        return result
+
+
+@dataclass
+class Link:
+    """A stage that has run forward: its inputs, cut off from what made them, and its outputs."""
+
+    name: str
+    inputs: list[Tensor]
+    outputs: list[Tensor]
+
+
+class StagedStep:
+    """A training step of `avatar`, stage by stage; the same operations in the same order as `training_step`."""
+
+    def __init__(self, avatar: Avatar, optimizer: torch.optim.Adam, objective: Objective) -> None:
+        self.avatar, self.optimizer, self.objective = avatar, optimizer, objective
+        self.watch = Stopwatch()
+        self._chain: list[Link] = []
+
+    def __call__(self, step: int, make_frame: Callable[[], Frame]) -> PhotometricLoss:
+        """One whole step with its update. `make_frame` decodes or fetches the frame, which is the stage `frame`."""
+        avatar, objective, watch = self.avatar, self.objective, self.watch
+        self._chain.clear()
+        frame = watch.measure("frame", make_frame)
+        target = watch.measure("target", lambda: frame.composite(objective.background))
+        vertices = watch.measure("skinning", lambda: avatar.head.vertices(frame.params))
+        points = watch.measure("embedding", lambda: avatar.embedding.points(vertices))
+        condition = avatar.condition(frame.params)
+
+        network = list(avatar.deformation.parameters())
+        (raw,) = self._forward("network", lambda: (avatar.deformation(avatar.code, condition),), [], network)
+        if avatar.grid is not None:
+            interpolate = avatar.grid.interpolate
+            (raw,) = self._forward("interpolation", lambda z: (interpolate(z),), [raw])
+        if avatar.hyper is not None:
+            heads = avatar.hyper
+            (raw,) = self._forward("heads", lambda z: (heads(z),), [raw], list(heads.parameters()))
+        base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
+        gaussians = self._forward(
+            "compose",
+            lambda z: compose(points, *base[:3], torch.cat(base[3:], dim=1), split_offsets(z)),  # type: ignore[arg-type]
+            [raw],
+            base,
+        )
+        degree = avatar.config.sh_degree
+        (image,) = self._forward(
+            "splat", lambda *g: (objective.draw(step, frame, Gaussians(*g), degree),), list(gaussians)
+        )
+        loss: list[PhotometricLoss] = []
+
+        def compare(picture: Tensor) -> tuple[Tensor]:
+            loss.append(objective.loss(step, frame, picture, target))
+            return (loss[0].total,)
+
+        self._forward("loss", compare, [image])
+        watch.measure("backward: clearing", self.optimizer.zero_grad)
+        self._backward()
+        watch.measure("check", lambda: check_step(step, frame, loss[0], avatar))
+        set_rates(self.optimizer, schedule(step, objective.config))
+        watch.measure("optimizer", self.optimizer.step)
+        return loss[0]
+
+    def _forward(
+        self,
+        name: str,
+        function: Callable[..., Sequence[Tensor]],
+        inputs: Sequence[Tensor],
+        parameters: Sequence[Tensor] = (),
+    ) -> list[Tensor]:
+        cut = [tensor.detach().requires_grad_() for tensor in inputs]
+        outputs = list(self.watch.measure(name, lambda: function(*cut)))
+        self._chain.append(Link(name, [*cut, *parameters], outputs))
+        return outputs
+
+    def _backward(self) -> None:
+        """From the loss back to the network: each stage's cotangents are the next one's gradients of its inputs."""
+        cotangents = [torch.ones(())]
+        for link in reversed(self._chain):
+            found = self.watch.measure(
+                f"{link.name}, backward",
+                lambda link=link: torch.autograd.grad(link.outputs, link.inputs, cotangents),  # noqa: B023 (called at once)
+            )
+            cotangents = []
+            for tensor, gradient in zip(link.inputs, found, strict=True):
+                if isinstance(tensor, torch.nn.Parameter):
+                    tensor.grad = gradient
+                else:
+                    cotangents.append(gradient)

@@ -1,0 +1,149 @@
+"""Time of a training step on a tracked folder, whole and by stage, for every preset: `avatar bench train FOLDER`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import cycle
+from typing import Any
+
+import torch
+
+from avatar.bench import Request
+from avatar.bench.clock import Time, paired_medians, time_of
+from avatar.bench.stages import StagedStep
+from avatar.config import Config, load_config
+from avatar.data.loader import FrameLoader
+from avatar.data.subject import Subject
+from avatar.model import Avatar
+from avatar.run import Source, find_head, open_subject
+from avatar.train.optim import make_optimizer
+from avatar.train.posed import PosedMeshes
+from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.types import Frame
+
+PRESETS = ("paper", "balanced", "fast")
+FRAMES = 8  # training frames that take turns; all are decoded before the clock runs
+ONCE_A_FRAME = ("skinning",)  # done once for each frame of a training, not in every step
+QUICK = ("model.uv_size=20", "data.size=48", "model.mlp_width=16")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One preset. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged."""
+
+    preset: str
+    gaussians: int
+    places: int  # at which the network is evaluated
+    parameters: int
+    early: Time
+    late: Time
+    stages: dict[str, Time]  # of a late step
+
+
+@dataclass
+class Trainee:
+    """An avatar in training, as far as a step needs it."""
+
+    config: Config
+    avatar: Avatar
+    optimizer: torch.optim.Adam
+    objective: Objective
+    frames: Iterator[Frame]
+    meshes: PosedMeshes
+
+    def step(self, number: int) -> None:
+        frame = next(self.frames)
+        training_step(self.avatar, self.optimizer, self.objective, number, frame, self.meshes.vertices(frame))
+
+
+def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:
+    """Time all presets in turns on the same frames. Raises UserError as `avatar train` does."""
+    folder, overrides = request.inputs[0], [*(QUICK if request.quick else ()), *request.overrides]
+    source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
+    subject, assets = open_subject(source, load_config(overrides), say)
+    trainees = {}
+    for preset in PRESETS:
+        config = load_config([f"preset={preset}", *overrides])
+        torch.manual_seed(config.trainer.seed)
+        trainees[preset] = trainee(
+            Avatar(assets, subject.identity, config.model), subject, config, say if preset == PRESETS[0] else silent
+        )
+    steps: dict[tuple[str, bool], Callable[[], object]] = {}
+    for preset, learner in trainees.items():
+        for late in (False, True):
+            steps[preset, late] = lambda learner=learner, late=late: run_steps(learner, late)
+    times = paired_medians(steps, repeats, warm_up=3)
+    return [
+        Row(
+            preset,
+            len(learner.avatar),
+            len(learner.avatar.code),
+            sum(p.numel() for p in learner.avatar.parameters()),
+            times[preset, False],
+            per_step(times[preset, True], late_steps(learner)),
+            stages(learner, subject, repeats),
+        )
+        for preset, learner in trainees.items()
+    ]
+
+
+def trainee(avatar: Avatar, subject: Subject, config: Config, say: Callable[[str], None]) -> Trainee:
+    """An avatar with opacities as after training: what is drawn decides what drawing costs."""
+    with torch.no_grad():
+        avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
+    train = subject.split.train
+    chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
+    with FrameLoader(subject, config.data.size) as loader:
+        frames = list(loader.frames(chosen))
+    meshes = PosedMeshes(avatar.head)
+    for frame in frames:
+        meshes.vertices(frame)
+    objective = Objective(config.trainer, torch.tensor(config.data.background), choose_perceptual(config.trainer, say))
+    return Trainee(config, avatar, make_optimizer(avatar, config.trainer), objective, cycle(frames), meshes)
+
+
+def silent(_: str) -> None:
+    """What was said for the first preset holds for the others."""
+
+
+def late_steps(learner: Trainee) -> int:
+    """So many steps hold one with the perceptual term."""
+    return learner.objective.perceptual.every
+
+
+def run_steps(learner: Trainee, late: bool) -> None:
+    """One step with all degrees of colour but before the perceptual term, or the last ones, as many as hold one with it."""
+    iterations = learner.config.trainer.iterations
+    if late:
+        first = iterations // late_steps(learner) * late_steps(learner)
+        for number in range(first, first + late_steps(learner)):
+            learner.step(number)
+    else:
+        learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1)
+
+
+def per_step(time: Time, steps: int) -> Time:
+    return Time(time.median / steps, time.p95 / steps, time.repeats)
+
+
+def stages(learner: Trainee, subject: Subject, repeats: int) -> dict[str, Time]:
+    staged = StagedStep(learner.avatar, learner.optimizer, learner.objective)
+    size = learner.config.data.size
+    pixels = [
+        (frame.index, subject.pixels(frame.index, size)) for frame in (next(learner.frames) for _ in range(FRAMES))
+    ]
+    number = learner.config.trainer.iterations // late_steps(learner) * late_steps(learner)
+    for turn in range(repeats + 2):
+        index, decoded = pixels[turn % len(pixels)]
+        staged(number, lambda index=index, decoded=decoded: subject.assemble(index, decoded, size))
+    return {name: time_of(values[2:]) for name, values in staged.watch.spans.items()}
+
+
+def share_of_faithful(rows: Sequence[Row]) -> dict[str, float]:
+    """How many times faster each preset's late step is than the first row's."""
+    return {row.preset: rows[0].late.median / row.late.median for row in rows}
+
+
+def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    return [asdict(row) for row in rows]

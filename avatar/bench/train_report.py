@@ -1,0 +1,92 @@
+"""What `avatar bench train FOLDER` leaves: a table on the terminal, bench_train.json and bench_train.png."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from avatar.bench import Request
+from avatar.bench.machine import describe_machine
+from avatar.bench.train import ONCE_A_FRAME, Row, as_json, measure, share_of_faithful
+
+REPEATS, QUICK_REPEATS, FULL_REPEATS = 15, 2, 41
+
+
+def run(request: Request) -> None:
+    """Measure, print and write; `quick` takes an avatar too small to say anything."""
+    repeats = QUICK_REPEATS if request.quick else FULL_REPEATS if request.full else REPEATS
+    rows = measure(request, repeats)
+    for line in table(rows):
+        print(line)
+    figures, plot = request.out / "bench_train.json", request.out / "bench_train.png"
+    content = {
+        "machine": describe_machine(),
+        "folder": str(request.inputs[0]),
+        "overrides": list(request.overrides),
+        "rows": as_json(rows),
+    }
+    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_plot(rows, plot)
+    print(f"\nFigures  {figures}\nPlot     {plot}")
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Milliseconds of a step as median (95th percentile), then of its stages, forward / backward."""
+    lines = [
+        f"{'preset':>9} {'Gaussians':>9} {'network at':>10} {'parameters':>10} {'ms, first half':>17} "
+        f"{'ms, second half':>17} {'faster':>7}"
+    ]
+    faster = share_of_faithful(rows)
+    for row in rows:
+        early, late = (f"{time.median:.1f} ({time.p95:.1f})" for time in (row.early, row.late))
+        lines.append(
+            f"{row.preset:>9} {row.gaussians:9,} {row.places:10,} {row.parameters:10,} {early:>17} {late:>17} "
+            f"{faster[row.preset]:6.1f}x"
+        )
+    names = stage_names(rows)
+    lines += ["", f"{'stage of a step with the perceptual term':>40} {''.join(f'{row.preset:>18}' for row in rows)}"]
+    for name in names:
+        lines.append(f"{name:>40} {''.join(f'{stage_cell(row, name):>18}' for row in rows)}")
+    lines.append(f"{'sum without ' + ', '.join(ONCE_A_FRAME):>40} {''.join(f'{stage_sum(row):18.1f}' for row in rows)}")
+    return lines
+
+
+def stage_names(rows: Sequence[Row]) -> list[str]:
+    """The stages of all rows in the order of a step; the row with most of them knows it."""
+    longest = max(rows, key=lambda row: len(row.stages))
+    return list(dict.fromkeys(name.removesuffix(", backward") for name in longest.stages))
+
+
+def stage_cell(row: Row, name: str) -> str:
+    if name not in row.stages:
+        return "-"
+    forward, backward = row.stages[name], row.stages.get(f"{name}, backward")
+    return f"{forward.median:.2f}" + (f" / {backward.median:.2f}" if backward else "")
+
+
+def stage_sum(row: Row) -> float:
+    return sum(time.median for name, time in row.stages.items() if name not in ONCE_A_FRAME)
+
+
+def write_plot(rows: Sequence[Row], path: Path) -> None:
+    """One bar a preset, stacked by stage."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    left = {row.preset: 0.0 for row in rows}
+    for index, name in enumerate(name for name in stage_names(rows) if name not in ONCE_A_FRAME):
+        for row in rows:
+            width = sum(row.stages[key].median for key in (name, f"{name}, backward") if key in row.stages)
+            axes.barh(row.preset, width, left=left[row.preset], color=f"C{index % 10}", label=name)
+            left[row.preset] += width
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    axes.legend(unique.values(), unique.keys(), fontsize=8, ncols=2)
+    axes.invert_yaxis()
+    axes.set(xlabel="milliseconds of a training step, forward and backward", title=f"{rows[0].gaussians:,} Gaussians")
+    axes.grid(alpha=0.3, axis="x")
+    figure.savefig(path, dpi=100)

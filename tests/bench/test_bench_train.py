@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+from small_runs import new_avatar, open_small, small_config
+
+from avatar.bench import Request
+from avatar.bench.stages import StagedStep
+from avatar.bench.train_report import run
+from avatar.train.optim import make_optimizer
+from avatar.train.step import Objective, choose_perceptual, training_step
+
+
+@pytest.mark.parametrize("overrides", [["preset=paper"], ["preset=fast"], ["model=flashavatar"]])
+def test_a_step_in_stages_is_the_trainings_step(tracked_folder: Path, overrides: list[str]) -> None:
+    """To the bit: what is timed is what is done."""
+    config = small_config(*overrides)
+    _, subject, assets = open_small(tracked_folder, config)
+    frame, number = subject.frame(3), 11
+    avatars = []
+    for staged in (False, True):
+        avatar = new_avatar(assets, subject, config)
+        optimizer = make_optimizer(avatar, config.trainer)
+        objective = Objective(config.trainer, torch.ones(3), choose_perceptual(config.trainer, lambda _: None))
+        for _ in range(2):
+            if staged:
+                StagedStep(avatar, optimizer, objective)(number, lambda: frame)
+            else:
+                training_step(avatar, optimizer, objective, number, frame, avatar.head.vertices(frame.params))
+        avatars.append(dict(avatar.named_parameters()))
+    whole, staged = avatars
+    assert not [name for name in whole if not torch.equal(whole[name], staged[name])]
+
+
+def test_quick_run_prints_a_table_and_writes_figures_and_plot(
+    tracked_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(Request(tmp_path, quick=True, inputs=(tracked_folder,), frame_offset=1))
+    output = capsys.readouterr().out
+    figures = json.loads((tmp_path / "bench_train.json").read_text())
+    assert [row["preset"] for row in figures["rows"]] == ["paper", "balanced", "fast"]
+    for row in figures["rows"]:
+        assert f"{row['late']['median']:.1f} ({row['late']['p95']:.1f})" in output
+        assert row["early"]["median"] > 0 and {"network", "network, backward", "splat", "loss"} <= row["stages"].keys()
+    assert {"interpolation"} <= figures["rows"][2]["stages"].keys() - figures["rows"][0]["stages"].keys()
+    assert iio.imread(tmp_path / "bench_train.png").shape[1] > 500
