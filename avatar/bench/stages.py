@@ -109,7 +109,7 @@ class StagedStep:
         for link in reversed(self._chain):
             found = self.watch.measure(
                 f"{link.name}, backward",
-                lambda link=link: torch.autograd.grad(link.outputs, link.inputs, cotangents),  # noqa: B023 (called at once)
+                lambda link=link: gradients(link, cotangents),  # noqa: B023 (called at once)
             )
             cotangents = []
             for tensor, gradient in zip(link.inputs, found, strict=True):
@@ -117,3 +117,8 @@ class StagedStep:
                     tensor.grad = gradient
                 else:
                     cotangents.append(gradient)
+
+
+def gradients(link: Link, cotangents: Sequence[Tensor]) -> list[Tensor]:
+    """Of a stage's inputs; laid out densely, as `backward` leaves them and the fused optimizer needs them."""
+    return [found.contiguous() for found in torch.autograd.grad(link.outputs, link.inputs, cotangents)]
