@@ -95,7 +95,7 @@ class Renderer:
         latents, grid = self._network(self._avatar.condition(params)), self._avatar.grid
         if grid is None:
             return latents
-        return embedding_bag(grid.nodes, latents, mode="sum", per_sample_weights=grid.weights)
+        return grid.interpolate(latents)
 
     def offsets(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
         """The ten values of each Gaussian before the tanh; the latents themselves where there is no HyperGaussian."""
