@@ -42,7 +42,6 @@ def splat_backward(
     scales: Tensor,
     opacities: Tensor,
     sh: Tensor,
-    image: Tensor,
     grad_image: Tensor | None,
     grad_alpha: Tensor | None,
     grad_means: Tensor,

@@ -20,6 +20,7 @@ from avatar.types import Camera, Gaussians, Rendering
 __all__ = ["Counters", "counters", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
+T_MIN = 1e-30
 
 
 def splat(
@@ -44,7 +45,8 @@ def splat(
     sh_degree    colour from the first (sh_degree + 1)^2 coefficients only; None: all. The others get zero gradient
     alpha_min    a splat is skipped at pixels where its alpha is below this, and everywhere if its opacity is; in [0, 1)
     alpha_max    alpha is clamped to this, with zero gradient where it is; in (0, 0.9999]
-    t_min        the splat that would bring the transmittance of a pixel below this is not drawn, nor any after it; [0, 1)
+    t_min        the splat that would bring the transmittance of a pixel below this is not drawn, nor any after it; in
+                 [0, 1). Below 1e-30 it counts as 1e-30: float32 ends soon after, and what lies behind could not be seen
     blur         pixels^2 added to both variances of a projected splat, so that none falls between pixels; >= 0
     near         splats whose centre is nearer than this along the optical axis are left out; metres, > 0
     antialiased  multiply the opacity by sqrt(det / det with blur), so that the blur adds no light (Mip-Splatting)
@@ -137,7 +139,7 @@ def _checked_options(
     pixels = check_region(region, camera.width, camera.height)
 
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
-    alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, t_min], dtype=torch.float32).tolist()
+    alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, max(t_min, T_MIN)], dtype=torch.float32).tolist()
     return {
         "sh_degree": sh_degree,
         "alpha_min": alpha_min,

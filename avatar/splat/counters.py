@@ -8,8 +8,8 @@ from typing import NamedTuple
 class Counters(NamedTuple):
     """Numbers of one drawing, in the order in which the kernel gives them.
 
-    A pair is one splat in one tile. A row is one row of pixels of a strip of a tile, as wide as the tile or a vector
-    register; it is stopped when no splat can change its pixels any more, a tile when all its rows are.
+    A pair is one splat in one tile. A block holds as many neighbouring pixels as a vector register has lanes; it is stopped
+    when no splat can change its pixels any more, a tile when all its blocks are.
     """
 
     hidden_transparent: int  # splats whose opacity is below alpha_min
@@ -22,8 +22,8 @@ class Counters(NamedTuple):
     )
     tiles: int
     tiles_stopped: int
-    rows: int
-    rows_stopped: int
+    blocks: int
+    blocks_stopped: int
     pairs: int  # by the ellipse where alpha reaches alpha_min
     pairs_in_boxes: int  # by the box around that ellipse, for comparison
     pairs_in_squares: int  # by a square of three standard deviations of the longer axis, for comparison

@@ -85,21 +85,19 @@ class _Splat(torch.autograd.Function):
         gaussians = Gaussians(*(t.detach().contiguous() for t in inputs))
         image, alpha, drawing = _draw(gaussians, background.detach(), size, settings)
         ctx.drawing = drawing
-        ctx.save_for_backward(*gaussians, image)
+        ctx.save_for_backward(*gaussians)
         ctx.set_materialize_grads(False)
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
-        *inputs, image = ctx.saved_tensors
-        gaussians = Gaussians(*inputs)
+        gaussians = Gaussians(*ctx.saved_tensors)
         gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
         grad_background = torch.empty(3, dtype=torch.float32)
         _core.splat_backward(
             ctx.drawing,
             **gaussians._asdict(),
-            image=image,
             grad_image=None if grad_image is None else grad_image.contiguous(),
             grad_alpha=None if grad_alpha is None else grad_alpha.contiguous(),
             **{f"grad_{name}": gradient for name, gradient in gradients._asdict().items()},

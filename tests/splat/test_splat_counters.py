@@ -52,7 +52,7 @@ def test_the_numbers_add_up(name: str) -> None:
     assert found.visible_without_effect <= found.visible
     assert found.pairs_processed <= found.pairs <= found.pairs_in_boxes
     assert found.tiles == -(-scene.camera.width // TILE) * -(-scene.camera.height // TILE)
-    assert found.rows_stopped <= found.rows and found.tiles_stopped <= found.tiles
+    assert found.blocks_stopped <= found.blocks and found.tiles_stopped <= found.tiles
 
 
 def test_every_reason_to_hide_a_splat_is_counted() -> None:
@@ -92,7 +92,7 @@ def test_what_stands_behind_a_wall_has_no_effect_and_exactly_no_gradient() -> No
     behind = behind._replace(means=behind.means + torch.tensor([0.0, 0.0, 2.0]))
     scene = Scene(Gaussians(*(torch.cat(f) for f in zip(wall, behind, strict=True))), camera(30, 30, yaw=0.0))
     found = _count(scene)
-    assert found.tiles_stopped == found.tiles == 1 and found.rows_stopped == found.rows
+    assert found.tiles_stopped == found.tiles == 1 and found.blocks_stopped == found.blocks
     assert found.pairs_processed <= 40 and found.visible_without_effect >= found.visible - 40 > 0
     grads = gradients(scene, "cpu", torch.randn(30, 30, 3), torch.randn(30, 30))
     untouched = sum(all((grads[n][i] == 0).all() for n in Gaussians._fields) for i in range(100))

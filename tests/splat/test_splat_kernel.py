@@ -15,6 +15,7 @@ from splat.scenes import (
     SCENES,
     SIMD,
     Scene,
+    assert_agrees,
     camera,
     gradients,
     in_float64,
@@ -25,6 +26,7 @@ from splat.scenes import (
 )
 
 from avatar.bench.scenes import head_camera, head_shell
+from avatar.splat import counters
 from avatar.types import Gaussians
 
 HEAD = Scene(head_shell(), head_camera(200), torch.ones(3))
@@ -117,6 +119,28 @@ def test_gradient_is_the_finite_difference_of_the_kernel(field: str, antialiased
     difference = (4 * fine - coarse) / 3
     expected = float((grad.double() * direction).sum())
     assert difference == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize("simd", SIMD)
+@pytest.mark.parametrize("t_min", [0.0, 1e-20, 1e-4])
+def test_gradients_hold_where_the_transmittance_is_tiny(
+    t_min: float, simd: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The backward pass finds each transmittance by division from the one behind, here down to 1e-30.
+    use_simd(monkeypatch, simd)
+    g = random_gaussians(60, seed=8, spread=0.03, size=0.3)._replace(opacities=torch.linspace(0.9, 1.0, 60))
+    assert_agrees(Scene(g, camera(33, 20), options={"alpha_max": 0.9999, "t_min": t_min}))
+
+
+@pytest.mark.parametrize("simd", SIMD)
+def test_gradients_hold_behind_thousands_of_faint_splats(simd: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_simd(monkeypatch, simd)
+    g = random_gaussians(4000, seed=9, sh_degree=0, spread=0.02, size=0.5, anisotropy=0.1)
+    scene = Scene(g._replace(opacities=torch.full((4000,), 0.005)), camera(20, 20))
+    scene = scene.with_options(alpha_min=0.0)  # or cut-offs would fall on many pixels
+    assert_agrees(scene)
+    found = counters(scene.gaussians, scene.camera, scene.background, **scene.options)
+    assert found.pixels_composited > 1000 * 400
 
 
 def test_two_python_threads_may_draw_at_once() -> None:

@@ -188,7 +188,7 @@ def test_no_output_memory_is_left_uninitialised() -> None:
     outputs = {f"grad_{name}": torch.full_like(field, torch.nan) for name, field in g._asdict().items()}
     outputs["grad_background"] = torch.full((3,), torch.nan)
     cotangents = {"grad_image": torch.randn(57, 83, 3), "grad_alpha": torch.randn(57, 83)}
-    _core.splat_backward(drawing=drawing, **g._asdict(), image=image, **cotangents, **outputs)
+    _core.splat_backward(drawing=drawing, **g._asdict(), **cotangents, **outputs)
     assert all(torch.isfinite(output).all() for output in outputs.values())
     assert (outputs["grad_means"] == 0).all(-1).any() and (outputs["grad_means"] != 0).any()
 

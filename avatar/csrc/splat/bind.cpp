@@ -62,18 +62,17 @@ void bind_splat(nb::module_& m) {
     m.def(
         "splat_backward",
         [](const Drawing& drawing, ConstFloats means, ConstFloats quats, ConstFloats scales, ConstFloats opacities,
-           ConstFloats sh, ConstFloats image, std::optional<ConstFloats> grad_image,
-           std::optional<ConstFloats> grad_alpha, Floats grad_means, Floats grad_quats, Floats grad_scales,
+           ConstFloats sh, std::optional<ConstFloats> grad_image, std::optional<ConstFloats> grad_alpha, Floats grad_means, Floats grad_quats, Floats grad_scales,
            Floats grad_opacities, Floats grad_sh, Floats grad_background) {
             const GaussianGradients gradients{grad_means.data(), grad_quats.data(), grad_scales.data(),
                                               grad_opacities.data(), grad_sh.data()};
             const nb::gil_scoped_release unlocked;
-            backward(drawing, gaussians_of(means, quats, scales, opacities, sh), image.data(),
+            backward(drawing, gaussians_of(means, quats, scales, opacities, sh),
                      grad_image ? grad_image->data() : nullptr, grad_alpha ? grad_alpha->data() : nullptr, gradients,
                      grad_background.data());
         },
         nb::arg("drawing"), nb::arg("means").noconvert(), nb::arg("quats").noconvert(), nb::arg("scales").noconvert(),
-        nb::arg("opacities").noconvert(), nb::arg("sh").noconvert(), nb::arg("image").noconvert(),
+        nb::arg("opacities").noconvert(), nb::arg("sh").noconvert(),
         nb::arg("grad_image").noconvert().none(), nb::arg("grad_alpha").noconvert().none(),
         nb::arg("grad_means").noconvert(), nb::arg("grad_quats").noconvert(), nb::arg("grad_scales").noconvert(),
         nb::arg("grad_opacities").noconvert(), nb::arg("grad_sh").noconvert(), nb::arg("grad_background").noconvert());

@@ -1,18 +1,30 @@
 #pragma once
 // What the forward and the backward kernel share: the pixels of a tile, and the alpha of a splat at them. Both
-// directions must make the same decisions (skipped, drawn, stopped) to the last bit, so both get them here.
+// directions must make the same decisions (skipped, drawn) to the last bit, so both get them here.
 #include "splat/raster.h"
 #include "splat/simd.h"
 
 namespace avatar::splat {
 namespace {
 
-constexpr int kTilePixels = kTileWidth * kTileHeight;
-constexpr int kStrips = kTileWidth / kLanes;  // a tile is cut into strips as wide as a vector
-static_assert(kTileWidth % kLanes == 0 && kTileHeight % kLanes == 0 && kTileHeight <= 32);
+// A vector holds a block of pixels, as square as it can be: 4x1, 4x2 or 4x4. Of vectors of 16x1 a splat of the usual size
+// would leave three quarters of the lanes without work.
+constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
+constexpr int kBlocksAcross = kTileWidth / kBlockWidth, kBlocksDown = kTileHeight / kBlockHeight;
+constexpr int kBlocks = kBlocksAcross * kBlocksDown;
+constexpr int kWords = kBlocks / 64;  // sets of blocks are kept as bits
+static_assert(kBlocksAcross == 8 && kBlocks % 64 == 0 && kBlocks <= kMaxBlocks);
 
-// The per-pixel arrays of a tile hold row after row; a vector is one row of one strip.
-inline int vector_at(int row, int strip) { return row * kTileWidth + strip * kLanes; }
+// The per-pixel arrays of a tile hold block after block, rows of blocks from the top.
+inline int pixel_at(int row, int column) {
+    const int block = row / kBlockHeight * kBlocksAcross + column / kBlockWidth;
+    return block * kLanes + row % kBlockHeight * kBlockWidth + column % kBlockWidth;
+}
+
+constexpr int kAhead = 4;  // pairs, for which a splat is fetched before it is needed: they lie all over the memory
+
+typedef unsigned long long Word;
+inline int first_bit(Word bits) { return __builtin_ctzll(bits); }
 
 struct TileArea {
     TileArea(const Raster& r, std::int64_t tile)
@@ -24,91 +36,94 @@ struct TileArea {
         end_column = region.right - left < kTileWidth ? region.right - left : kTileWidth;
         end_row = region.bottom - top < kTileHeight ? region.bottom - top : kTileHeight;
     }
+
+    bool is_whole() const {
+        return first_column == 0 && first_row == 0 && end_column == kTileWidth && end_row == kTileHeight;
+    }
+
+    // Calls visit(index in the tile's arrays, index in the image) for the pixels of the region.
+    template <typename Visit>
+    void for_each_pixel(std::int64_t image_width, const Visit& visit) const {
+        for (int row = first_row; row < end_row; ++row)
+            for (int column = first_column; column < end_column; ++column)
+                visit(pixel_at(row, column), (top + row) * image_width + left + column);
+    }
+
+    // The blocks that have a pixel in the region.
+    void blocks(Word set[kWords]) const {
+        const Word columns = (2u << ((end_column - 1) / kBlockWidth)) - (1u << (first_column / kBlockWidth));
+        for (int w = 0; w < kWords; ++w) set[w] = 0;
+        for (int y = first_row / kBlockHeight; y <= (end_row - 1) / kBlockHeight; ++y)
+            set[y * kBlocksAcross / 64] |= columns << (y * kBlocksAcross % 64);
+    }
+
     int left, top;                                     // of the tile in the image
     int first_column, first_row, end_column, end_row;  // the part of the tile inside the region
 };
 
 // One splat as seen from one tile.
 struct SplatInTile {
-    Floats u_lane[kStrips];  // u of a pixel is u_row[its row] + u_lane[its strip]
     Floats opacity;
-    alignas(64) float u_row[kTileHeight];
-    alignas(64) float v_row[kTileHeight];
-    alignas(64) float minus_vv_row[kTileHeight];
-    unsigned rows[kStrips];  // bit r: row r of the strip may have a pixel where alpha reaches alpha_min
+    Floats u_lane, v_lane;  // (u, v) of a pixel is that of its block's first pixel plus that of its lane
+    alignas(64) float u_block[kBlocks], v_block[kBlocks];
+    Word blocks[kWords];  // those that may have a pixel where alpha reaches alpha_min
 
     SplatInTile(const Splat& s, const TileArea& area) {
         const double dx = area.left + 0.5 - s.x, dy = area.top + 0.5 - s.y;
         const float a = float(s.a), b = float(s.b), c = float(s.c);
+        opacity = broadcast(s.opacity);
+        u_lane = fma(broadcast(b), lane_rows(), broadcast(a) * lane_columns());
+        v_lane = broadcast(c) * lane_rows();
+
+        // The ranges of u and v in a block (a and c are above 0), and their values nearest to the splat's centre.
+        const float b_height = b * (kBlockHeight - 1);
+        const Floats u_less = broadcast(b_height < 0.0f ? b_height : 0.0f);
+        const Floats u_more = broadcast(a * (kBlockWidth - 1) + (b_height > 0.0f ? b_height : 0.0f));
+        const Floats v_more = broadcast(c * (kBlockHeight - 1));
+        const Floats b_step = broadcast(b * kBlockHeight), c_step = broadcast(c * kBlockHeight);
         const Floats u0 = broadcast(float(s.a * dx + s.b * dy)), v0 = broadcast(float(s.c * dy));
         const Floats reach = broadcast(s.reach), zero{};
-        opacity = broadcast(s.opacity);
-        for (int strip = 0; strip < kStrips; ++strip) {
-            u_lane[strip] = broadcast(a) * (iota() + broadcast(float(strip * kLanes)));
-            rows[strip] = 0;
+        for (int w = 0; w < kWords; ++w) blocks[w] = 0;
+        Word rows = 0;  // of blocks, by v alone: most splats are much smaller than a tile
+        for (int y = 0; y < kBlocksDown; y += kLanes) {
+            const Floats v = fma(c_step, remainders(kLanes) + broadcast(float(y)), v0);
+            const Floats nearest_v = max(v, zero) + min(v + v_more, zero);
+            rows |= Word(signs(nearest_v * nearest_v <= reach)) << y;
         }
-        for (int row = 0; row < kTileHeight; row += kLanes) {
-            const Floats j = iota() + broadcast(float(row));
-            const Floats u = fma(broadcast(b), j, u0), v = fma(broadcast(c), j, v0);
-            const Floats vv = v * v;
-            store(u_row + row, u);
-            store(v_row + row, v);
-            store(minus_vv_row + row, -vv);
-            for (int strip = 0; strip < kStrips; ++strip) {
-                // The point of this row of the strip that is nearest to the centre, in whitened coordinates; a > 0.
-                const Floats first = u + broadcast(a * (strip * kLanes)), last = first + broadcast(a * (kLanes - 1));
-                const Floats nearest = max(first, zero) + min(last, zero);
-                rows[strip] |= signs(fma(nearest, nearest, vv) <= reach) << row;
+        const Floats u_first = fma(broadcast(a * kBlockWidth), remainders(kBlocksAcross), u0);
+        for (rows = groups_of(rows); rows != 0; rows &= rows - 1) {
+            const int row = first_bit(rows);
+            const Floats y = quotients(kBlocksAcross) + broadcast(float(row));
+            const Floats v = fma(c_step, y, v0), nearest_v = max(v, zero) + min(v + v_more, zero);
+            for (int column = 0; column < kBlocksAcross; column += kLanes) {
+                const int block = row * kBlocksAcross + column;
+                const Floats u = fma(b_step, y, u_first) + broadcast(a * (kBlockWidth * column));
+                store(u_block + block, u);
+                store(v_block + block, v);
+                const Floats nearest_u = max(u + u_less, zero) + min(u + u_more, zero);
+                const Ints reached = fma(nearest_u, nearest_u, nearest_v * nearest_v) <= reach;
+                blocks[block / 64] |= Word(signs(reached)) << (block % 64);
             }
         }
     }
 
-    // 2^-(u^2 + v^2) at the pixels of a vector; times the opacity it is the alpha before clamping.
-    Floats falloff(int row, Floats u) const { return exp2_negative(fma(-u, u, broadcast(minus_vv_row[row]))); }
-};
+    Floats u(int block) const { return broadcast(u_block[block]) + u_lane; }
+    Floats v(int block) const { return broadcast(v_block[block]) + v_lane; }
 
-inline unsigned first_bit(unsigned bits) { return static_cast<unsigned>(__builtin_ctz(bits)); }
+    // Times the opacity it is the alpha before clamping.
+    static Floats falloff(Floats u, Floats v) { return exp2_negative(fma(-u, u, -(v * v))); }
 
-// Whether splats are skipped, drawn or end a pixel, and the transmittance behind them. A pixel that has stopped, or
-// that is outside the region, is marked by the sign bit of its transmittance; nothing is drawn there any more.
-struct Step {
-    Ints drawn;
-    Floats after;
+private:
+    static Floats lane_columns() { return remainders(kBlockWidth); }
+    static Floats lane_rows() { return quotients(kBlockWidth); }
 
-    Step(Floats before, Floats alpha, Floats alpha_min, Floats t_min) {
-        const Floats next = fma(-before, alpha, before);
-        const Ints hit = alpha >= alpha_min, enough = next >= t_min;
-        drawn = hit & enough;
-        const Ints kept = (Ints)(drawn ? next : before);
-        after = (Floats)(kept | (hit & ~enough & sign_bits()));
+    // The first rows of the groups of rows that have as many blocks as a vector has lanes.
+    static Word groups_of(Word rows) {
+        constexpr int kGroup = kLanes > kBlocksAcross ? kLanes / kBlocksAcross : 1;
+        static_assert(kGroup <= 2);
+        return kGroup == 1 ? rows : (rows | rows >> 1) & 0x5555555555555555u & ((Word{1} << kBlocksDown) - 1);
     }
 };
-
-inline void clear_transmittance(const TileArea& area, float* transmittance, unsigned alive[kStrips]) {
-    for (int row = 0; row < kTileHeight; ++row)
-        for (int column = 0; column < kTileWidth; ++column)
-            transmittance[row * kTileWidth + column] = row >= area.first_row && row < area.end_row &&
-                                                               column >= area.first_column && column < area.end_column
-                                                           ? 1.0f
-                                                           : -1.0f;
-    const unsigned rows = (2u << (area.end_row - 1)) - (1u << area.first_row);
-    for (int strip = 0; strip < kStrips; ++strip) {
-        const bool inside = strip * kLanes < area.end_column && (strip + 1) * kLanes > area.first_column;
-        alive[strip] = inside ? rows : 0;
-    }
-}
-
-inline int bits_of(const unsigned alive[kStrips]) {
-    int bits = 0;
-    for (int strip = 0; strip < kStrips; ++strip) bits += __builtin_popcount(alive[strip]);
-    return bits;
-}
-
-inline bool any_alive(const unsigned alive[kStrips]) {
-    unsigned any = 0;
-    for (int strip = 0; strip < kStrips; ++strip) any |= alive[strip];
-    return any != 0;
-}
 
 }  // namespace
 }  // namespace avatar::splat

@@ -106,10 +106,10 @@ void count_drawing(const Drawing& drawing, const std::vector<TileCounts>& tile_c
     counts.tiles = static_cast<std::int64_t>(tile_counts.size());
     for (std::int64_t tile = 0; tile < counts.tiles; ++tile) {
         const TileCounts& t = tile_counts[tile];
-        counts.tiles_stopped += t.rows == t.rows_stopped;
-        counts.rows += t.rows;
-        counts.rows_stopped += t.rows_stopped;
-        counts.pairs_processed += drawing.processed[tile];
+        counts.tiles_stopped += t.blocks == t.blocks_stopped;
+        counts.blocks += t.blocks;
+        counts.blocks_stopped += t.blocks_stopped;
+        counts.pairs_processed += drawing.ends[tile].processed;
         counts.pixels_evaluated += t.pixels_evaluated;
         counts.pixels_composited += t.pixels_composited;
     }
@@ -176,6 +176,8 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                                  {},
                                                  {},
                                                  {},
+                                                 {},
+                                                 {},
                                                  {}});
     if (!project_all(gaussians, *drawing, counts)) return nullptr;
     const auto visible = static_cast<std::int64_t>(drawing->splats.size());
@@ -183,15 +185,20 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
     drawing->lists = build_tile_lists(drawing->splats.data(), visible, grid, kMaxPairs, threads);
 
     const std::int64_t tiles = grid.count();
-    drawing->processed.resize(tiles);
-    drawing->transmittance.resize(std::int64_t{camera.width} * camera.height);
+    // Not initialised: the kernels write all that they read.
+    drawing->transmittance.reset(new float[tiles * kTilePixels]);
+    drawing->stops.reset(new int[tiles * kTilePixels]);
+    drawing->ends.reset(new TileEnd[tiles]);
+    drawing->block_stops.reset(new BlockStop[tiles * kMaxBlocks]);
     const Raster raster = raster_of(*drawing);
     std::vector<TileCounts> tile_counts(counts != nullptr ? tiles : 0);
     std::vector<unsigned char> composited(counts != nullptr ? drawing->lists.pair_count : 0, 0);
     const ForwardTarget target{image,
                                alpha,
-                               drawing->transmittance.data(),
-                               drawing->processed.data(),
+                               drawing->transmittance.get(),
+                               drawing->stops.get(),
+                               drawing->ends.get(),
+                               drawing->block_stops.get(),
                                tile_counts.data(),
                                composited.data()};
     const auto draw_tile = counts != nullptr ? kernels.count_tile : kernels.forward_tile;
@@ -203,14 +210,15 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
     return drawing;
 }
 
-void backward(const Drawing& drawing, const Gaussians& gaussians, const float* image, const float* grad_image,
-              const float* grad_alpha, const GaussianGradients& gradients, float grad_background[3]) {
+void backward(const Drawing& drawing, const Gaussians& gaussians, const float* grad_image, const float* grad_alpha,
+              const GaussianGradients& gradients, float grad_background[3]) {
     const TileLists& lists = drawing.lists;
     const std::int64_t tiles = TileGrid(drawing.view.region).count();
     const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
     std::vector<double> tile_backgrounds(3 * tiles);
     const Raster raster = raster_of(drawing);
-    const BackwardSource source{image, drawing.transmittance.data(), drawing.processed.data(), grad_image, grad_alpha};
+    const BackwardSource source{drawing.transmittance.get(), drawing.stops.get(), drawing.ends.get(),
+                                drawing.block_stops.get(),   grad_image,          grad_alpha};
     const BackwardTarget target{moments.get(), tile_backgrounds.data()};
     parallel_for(drawing.threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t k = begin; k < end; ++k)

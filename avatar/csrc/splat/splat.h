@@ -16,7 +16,7 @@ struct Counts {
     std::int64_t visible;            // Gaussians
     std::int64_t without_effect;     // visible ones that no pixel shows
     std::int64_t tiles, tiles_stopped;
-    std::int64_t rows, rows_stopped;  // of strips of tiles; stopped: all pixels saturated
+    std::int64_t blocks, blocks_stopped;  // of as many pixels as a vector has lanes; stopped: all pixels saturated
     std::int64_t pairs;              // of a tile and a splat
     std::int64_t pairs_in_boxes;     // as many as the boxes around the ellipses would meet
     std::int64_t pairs_in_squares;   // as many as squares of 3 standard deviations of the longer axis would meet
@@ -30,11 +30,13 @@ struct Drawing {
     float background[3];
     const Kernels* kernels;
     int threads;
-    std::vector<Splat> splats;             // visible, front to back
-    std::vector<std::int32_t> rank_of;     // [N] position of each Gaussian in `splats`, -1: hidden
+    std::vector<Splat> splats;          // visible, front to back
+    std::vector<std::int32_t> rank_of;  // [N] position of each Gaussian in `splats`, -1: hidden
     TileLists lists;
-    std::vector<std::uint32_t> processed;  // [tiles], see ForwardTarget
-    std::vector<float> transmittance;      // [height * width]
+    std::unique_ptr<float[]> transmittance;  // this and the rest: see ForwardTarget
+    std::unique_ptr<int[]> stops;
+    std::unique_ptr<TileEnd[]> ends;
+    std::unique_ptr<BlockStop[]> block_stops;
 };
 
 // Draws the region into image [height * width * 3] and alpha [height * width]; the rest of them shows the background.
@@ -44,8 +46,8 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                  const Region& region, const float background[3], const Kernels& kernels, int threads,
                                  float* image, float* alpha, Counts* counts = nullptr);
 
-// Writes all gradients. grad_image or grad_alpha may be null; `image` is what forward drew.
-void backward(const Drawing& drawing, const Gaussians& gaussians, const float* image, const float* grad_image,
-              const float* grad_alpha, const GaussianGradients& gradients, float grad_background[3]);
+// Writes all gradients. grad_image or grad_alpha may be null.
+void backward(const Drawing& drawing, const Gaussians& gaussians, const float* grad_image, const float* grad_alpha,
+              const GaussianGradients& gradients, float grad_background[3]);
 
 }  // namespace avatar::splat
