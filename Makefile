@@ -8,7 +8,7 @@ PIP_FLAGS ?=
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
 NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
-STRESS_EXAMPLES ?= 20000
+STRESS_EXAMPLES ?= 100000
 
 .PHONY: help setup demo test stress sanitize check format smoke wheel clean
 help: ## show this list
@@ -22,8 +22,8 @@ demo: setup ## make a subject, train an avatar on it, evaluate it and let anothe
 test: setup ## run all tests
 	$(BIN)/python -m pytest
 
-stress: setup ## draw tens of thousands of random and poisoned scenes (STRESS_EXAMPLES=20000 of each kind)
-	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest --timeout=0 tests/stress
+stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
+	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress
 
 sanitize: setup ## run the splatter's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh
