@@ -92,8 +92,13 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument("--driver", type=Path, required=True, metavar="FOLDER", help="tracked folder of the driver")
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
     reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
-    reenact.add_argument("--transfer", choices=("raw", "relative", "mean"), default="relative")
+    reenact.add_argument("--transfer", choices=("raw", "relative", "mean", "pca"), default="relative")
+    reenact.add_argument("--strength", type=float, default=1.0, metavar="S", help="scales the departure from neutral")
+    reenact.add_argument(
+        "--smoothing", type=float, default=0.0, metavar="FRAMES", help="Gaussian over time (default: off)"
+    )
     reenact.add_argument("--camera", choices=("driver", "target"), default="driver", help="whose head pose is shown")
+    reenact.add_argument("--intrinsics", choices=("driver", "target"), default="driver", help="through whose lens")
     reenact.add_argument(
         "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
     )

@@ -23,6 +23,7 @@ from avatar.evaluation.evaluate import evaluate
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
 from avatar.quality.folder import as_text, check_folder
+from avatar.reenact import Choices
 from avatar.reenact import reenact as drive
 from avatar.run import Run, Source, check_same, find_head, load_run, open_subject, read_source, start_run
 from avatar.train.trainer import train as run_training
@@ -126,7 +127,10 @@ def eval(arguments: Namespace) -> int:
 def reenact(arguments: Namespace) -> int:
     run = load_run(arguments.run, arguments.head)
     driver = open_driver(arguments.driver, run, arguments.head, arguments.driver_tracking, arguments.frame_offset)
-    drive(run, driver, transfer=arguments.transfer, camera=arguments.camera, out=arguments.out)
+    choices = Choices(
+        arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
+    )
+    drive(run, driver, choices, out=arguments.out)
     return OK
 
 

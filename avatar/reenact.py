@@ -1,80 +1,192 @@
-"""Driving one person's avatar with another person's motion."""
+"""Driving one person's avatar with another person's motion.
+
+DRIVER-TRANSFER.mp4    the driver's picture, where there is one, beside the render; under them each frame's distance from
+                       the training expressions
+DRIVER-TRANSFER.csv    those distances
+DRIVER-TRANSFER.json   every choice that made the video
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 from tqdm import tqdm
 
+from avatar.checkpoint import write_atomically
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
+from avatar.drive import Drive, Whose, choose_cameras, smoothed, subject_drive
+from avatar.drive_strip import DistanceStrip, distances_csv
 from avatar.errors import UserError
+from avatar.expression_space import fit_expressions
 from avatar.head.model import HeadModel
 from avatar.render import Renderer
-from avatar.run import Run
-from avatar.transfer import Transfer, transfer_motion
-from avatar.types import Camera, HeadParams
+from avatar.run import Run, versions
+from avatar.transfer import RestPose, Transfer, transfer_motion
+from avatar.types import Camera
 from avatar.video import side_by_side, write_video
 
 FOCAL_TOLERANCE = 0.1  # relative difference of the field of view from which a warning is worth its line
+SIDECAR_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How a driver's motion becomes the avatar's."""
+
+    transfer: Transfer = "relative"
+    strength: float = 1.0  # scales the departure from rest
+    smoothing: float = 0.0  # standard deviation in frames; 0 is off
+    camera: Whose = "driver"  # whose head pose is shown
+    intrinsics: Whose = "driver"  # through whose lens, where the driver's head pose is shown
+
+
+DEFAULT_CHOICES = Choices()
 
 
 def reenact(
     run: Run,
-    driver: Subject,
+    driver: Subject | Drive,
+    choices: Choices = DEFAULT_CHOICES,
     *,
-    transfer: Transfer = "relative",
-    camera: Literal["driver", "target"] = "driver",
     out: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture.
 
-    camera    "driver": the head pose of each driver frame; "target": the avatar's own camera at rest, held still.
-    Returns the video's path. Raises UserError when the driver was tracked with another head model.
+    Returns the video's path. Raises UserError for choices out of range and for a driver tracked with another head model.
     """
+    check_choices(choices)
+    size = run.config.data.size
+    if isinstance(driver, Subject):
+        check_same_head(driver, run)
+    drive = smoothed(subject_drive(driver, size) if isinstance(driver, Subject) else driver, choices.smoothing)
+    out = out or run.path / "reenact" / f"{drive.name}-{choices.transfer}.mp4"
+    training = run.subject.split.train
+    target = [run.subject.params(i) for i in training]
+    moved, source, goal = transfer_motion(
+        drive.params,
+        target,
+        choices.transfer,
+        HeadModel(run.avatar.head.assets, drive.identity),
+        run.avatar.head,
+        strength=choices.strength,
+    )
+    neutral = {
+        drive.name: frame_name(source, drive.names),
+        run.subject.name: frame_name(goal, [run.subject.manifest.frames[i].name for i in training]),
+    }
+    if all(neutral.values()):
+        say("Neutral expression: " + ", ".join(f"frame {frame} of {name}" for name, frame in neutral.items()))
+
+    distances = fit_expressions(target).distances(moved)
+    say_distances(distances, say)
+    own = run.subject.camera(training[goal.frame if goal and goal.frame is not None else 0], size)
+    cameras = choose_cameras(drive, own, choices.camera, choices.intrinsics)
+    if choices.camera == "driver" and choices.intrinsics == "driver":
+        warn_of_other_intrinsics(cameras[0], own, say)
+    renderer = Renderer(run.avatar, torch.tensor(run.config.data.background))
+    renders = (rendering.image for rendering in renderer.stream(zip(moved, cameras, strict=True)))
+    data = run.config.data
+    loader = FrameLoader(driver, size, data.cache_mb << 20, data.workers) if isinstance(driver, Subject) else None
+    with loader or nullcontext():
+        pictures = (frame.image for frame in loader.frames(range(len(drive)))) if loader else None
+        frames = panels(renders, pictures, run.subject.name, distances.tolist())
+        write_video(out, tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True), drive.fps)
+    write_atomically(out.with_suffix(".csv"), distances_csv(drive.names, distances.tolist()).encode())
+    sidecar = describe(run, drive, choices, neutral, cameras, own, distances)
+    write_atomically(out.with_suffix(".json"), json.dumps(sidecar, indent=2, allow_nan=False).encode())
+    say(f"{len(drive)} frames written to {out}; its choices and each frame's distance beside it (.json, .csv)")
+    return out
+
+
+def check_choices(choices: Choices) -> None:
+    for name, value, high in (("strength", choices.strength, 10.0), ("smoothing", choices.smoothing, 1000.0)):
+        if not 0.0 <= value <= high:  # a NaN is refused too
+            raise UserError(f"--{name} must be from 0 to {high:g}, not {value}")
+
+
+def check_same_head(driver: Subject, run: Run) -> None:
     if driver.head_fingerprint != run.subject.head_fingerprint:
         raise UserError(
             f"the driver {driver.name} was tracked with another head model than the avatar {run.subject.name} "
             f"({driver.head_fingerprint[:12]} and {run.subject.head_fingerprint[:12]}): the same coefficients mean "
             "other expressions there; track the driver again with the avatar's head model"
         )
-    out = out or run.path / "reenact" / f"{driver.name}-{transfer}.mp4"
-    target_frames = run.subject.split.train
-    moved, source, goal = transfer_motion(
-        [driver.params(i) for i in range(len(driver))],
-        [run.subject.params(i) for i in target_frames],
-        transfer,
-        HeadModel(run.avatar.head.assets, driver.identity),
-        run.avatar.head,
-    )
-    if source is not None and goal is not None and source.frame is not None and goal.frame is not None:
-        theirs = driver.manifest.frames[source.frame].name
-        own_name = run.subject.manifest.frames[target_frames[goal.frame]].name
-        say(f"Neutral expression: frame {theirs} of {driver.name}, frame {own_name} of {run.subject.name}")
-
-    size = run.config.data.size
-    own = run.subject.camera(target_frames[goal.frame if goal and goal.frame is not None else 0], size)
-    warn_of_other_intrinsics(driver.camera(0, size), own, say)
-    cameras = [driver.camera(i, size) if camera == "driver" else own for i in range(len(driver))]
-    with FrameLoader(driver, size, run.config.data.cache_mb << 20, run.config.data.workers) as loader:
-        write_video(out, pairs(run, loader, moved, cameras), driver.fps)
-    say(f"{len(driver)} frames written to {out}")
-    return out
 
 
-def pairs(run: Run, loader: FrameLoader, motion: list[HeadParams], cameras: list[Camera]) -> Iterator[np.ndarray]:
-    """The driver's picture beside the avatar's render, frame by frame, uint8."""
-    renders = Renderer(run.avatar, torch.tensor(run.config.data.background)).stream(zip(motion, cameras, strict=True))
-    frames = tqdm(
-        loader.frames(range(len(motion))), total=len(motion), desc="reenact", unit="frame", dynamic_ncols=True
-    )
-    for frame, render in zip(frames, renders, strict=True):
-        yield side_by_side([frame.image, render.image], ["driver", run.subject.name])
+def frame_name(rest: RestPose | None, names: Sequence[str]) -> str | None:
+    return names[rest.frame] if rest is not None and rest.frame is not None else None
+
+
+def say_distances(distances: Float[Tensor, " T"], say: Callable[[str], None]) -> None:
+    far = int((distances > 1.0).sum())
+    if far:
+        say(
+            f"{far} of {len(distances)} frames are farther from the training expressions than 99% of those are (at most "
+            f"{float(distances.max()):.1f} times as far): the avatar guesses there; --transfer pca keeps to what it knows"
+        )
+
+
+def panels(
+    renders: Iterator[Float[Tensor, "H W 3"]],
+    pictures: Iterator[Float[Tensor, "H W 3"]] | None,
+    name: str,
+    distances: Sequence[float],
+) -> Iterator[UInt8[np.ndarray, "H_panel W_panel 3"]]:
+    """The driver's picture, if any, beside the render, over the strip of distances."""
+    strip: DistanceStrip | None = None
+    for index, render in enumerate(renders):
+        images = [render] if pictures is None else [next(pictures), render]
+        panel = side_by_side(images, [name] if pictures is None else ["driver", name])
+        strip = strip or DistanceStrip(distances, panel.shape[1], panel.shape[0])
+        yield np.concatenate((panel, strip.frame(index)))
+
+
+def describe(
+    run: Run,
+    drive: Drive,
+    choices: Choices,
+    neutral: dict[str, str | None],
+    cameras: Sequence[Camera],
+    own: Camera,
+    distances: Float[Tensor, " T"],
+) -> dict[str, Any]:
+    """What the sidecar holds."""
+    return {
+        "format": SIDECAR_FORMAT,
+        "avatar": {"run": str(run.path.resolve()), "subject": run.subject.name, "step": run.step},
+        "driver": {
+            "name": drive.name,
+            "frames": len(drive),
+            "fps": drive.fps,
+            "has_cameras": drive.cameras is not None,
+        },
+        "choices": asdict(choices),
+        "neutral_frames": neutral,
+        "intrinsics": {"shown": intrinsics(cameras[0]), "avatar": intrinsics(own)},
+        "distance": {
+            "measured": "Mahalanobis distance of the moved expression and jaw in the principal components of the training "
+            "frames, divided by the 99th percentile of their own",
+            "frames_above_1": int((distances > 1.0).sum()),
+            "median": round(float(distances.median()), 4),
+            "largest": round(float(distances.max()), 4),
+        },
+        "versions": versions(),
+    }
+
+
+def intrinsics(camera: Camera) -> dict[str, float]:
+    return {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
 
 
 def warn_of_other_intrinsics(driver: Camera, target: Camera, say: Callable[[str], None]) -> None:
@@ -83,5 +195,5 @@ def warn_of_other_intrinsics(driver: Camera, target: Camera, say: Callable[[str]
     if abs(driver.fy / driver.height - target.fy / target.height) > FOCAL_TOLERANCE * target.fy / target.height:
         say(
             f"Warning: the driver's camera sees {fields[0]:.1f} degrees, the avatar's {fields[1]:.1f}: shown from the "
-            "driver's camera the head has another perspective than in training; --camera target keeps its own"
+            "driver's camera the head has another perspective than in training; --intrinsics target keeps its own lens"
         )

@@ -3,7 +3,8 @@
 Two people's tracked coefficients differ even when both faces are at rest, because a tracker explains a part of the shape
 by the expression basis. `raw` copies the coefficients and so copies that difference onto the target, which is why it looks
 wrong; `relative` moves the target away from its own rest as far as the driver is away from its rest (advised by
-FlashAvatar's author); `mean` does the same with the two means over time (GaussianBlendshapes' author).
+FlashAvatar's author); `mean` does the same with the two means over time (GaussianBlendshapes' author); `pca` is `relative`
+brought to what the target has shown in training: clamped to its range along each principal component of its expressions.
 Gaze and eyelids are copied as they are in every mode: zero means the same for everybody there.
 """
 
@@ -11,16 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from torch import Tensor
 
+from avatar.expression_space import fit_expressions
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.types import IDENTITY_6D, HeadParams
 
-Transfer = Literal["raw", "relative", "mean"]
+Transfer = Literal["raw", "relative", "mean", "pca"]
+TRANSFERS: tuple[Transfer, ...] = ("raw", "relative", "mean", "pca")
 CALM_SHARE = 0.2  # of the frames, those whose face is nearest to the generic neutral
 NEUTRAL_SHARE = 0.02  # of the frames, so many are averaged into the neutral expression
 
@@ -32,6 +36,12 @@ class RestPose:
     expression: Float[Tensor, " E"]
     jaw: Float[Tensor, "3 3"]  # rotation matrix
     frame: int | None  # the frame that is most like it; None for a mean
+
+
+class Transferred(NamedTuple):
+    motion: list[HeadParams]
+    source: RestPose | None  # the driver's rest; None for `raw`
+    goal: RestPose | None  # the target's
 
 
 def find_neutral(motion: Sequence[HeadParams], head: HeadModel) -> RestPose:
@@ -71,11 +81,14 @@ def transfer_motion(
     mode: Transfer,
     driver_head: HeadModel,
     target_head: HeadModel,
-) -> tuple[list[HeadParams], RestPose | None, RestPose | None]:
+    *,
+    strength: float = 1.0,
+) -> Transferred:
     """The driver's motion as the target's parameters, as many frames as the driver has.
 
-    `target` holds the frames that the avatar was trained on. Returns the motion and the two rest poses that were used
-    (None for `raw`). Raises ValueError when either has no frame or the expression bases differ in size.
+    `target` holds the frames that the avatar was trained on. `strength` scales the departure from rest of expression and
+    jaw: 0 is the rest itself, 1 the driver's departure; with `raw` the rest is zero. Raises ValueError when either has no
+    frame or the expression bases differ in size.
     """
     if not driver or not target:
         raise ValueError(
@@ -86,23 +99,29 @@ def transfer_motion(
         raise ValueError(
             f"the driver has {sizes[0]} expression coefficients, the target {sizes[1]}; they must be the same"
         )
-    if mode == "raw":
-        return list(driver), None, None
-    if mode == "relative":
-        source, goal = find_neutral(driver, driver_head), find_neutral(target, target_head)
-    else:
+    if mode == "raw" and strength == 1.0:
+        return Transferred(list(driver), None, None)
+    source = goal = None
+    if mode == "mean":
         source, goal = find_mean(driver), find_mean(target)
-    # R = goal (source^-1 driver): the driver's rotation as seen from its rest, applied to the target's rest.
-    jaw_change = goal.jaw @ source.jaw.T
-    moved = [
-        replace(
-            params,
-            expression=goal.expression + params.expression - source.expression,
-            jaw=(jaw_change @ matrix_from_6d(params.jaw))[:2].reshape(6),
-        )
-        for params in driver
-    ]
-    return moved, source, goal
+    elif mode != "raw":
+        source, goal = find_neutral(driver, driver_head), find_neutral(target, target_head)
+    zero = RestPose(torch.zeros_like(driver[0].expression), torch.eye(3), None)
+    moved = _moved(driver, source or zero, goal or zero, strength)
+    if mode == "pca":
+        moved = fit_expressions(target).nearest(moved)
+    return Transferred(moved, source, goal)
+
+
+def _moved(driver: Sequence[HeadParams], source: RestPose, goal: RestPose, strength: float) -> list[HeadParams]:
+    """goal + strength (driver - source), and for the jaw's rotation goal (source^-1 driver)^strength."""
+    expression, jaw = _stacked(driver)
+    change = source.jaw.T @ jaw
+    if strength != 1.0:
+        change = axis_angle_to_rotation_matrix(strength * rotation_matrix_to_axis_angle(change))
+    expression = goal.expression + strength * (expression - source.expression)
+    jaw = (goal.jaw @ change)[:, :2].reshape(-1, 6)
+    return [replace(params, expression=e, jaw=j) for params, e, j in zip(driver, expression, jaw, strict=True)]
 
 
 def _stacked(motion: Sequence[HeadParams]) -> tuple[Float[Tensor, "N E"], Float[Tensor, "N 3 3"]]:

@@ -6,8 +6,9 @@ import pytest
 import torch
 from heads import grid_head, rest_params
 
+from avatar.expression_space import fit_expressions
 from avatar.head.model import HeadModel, matrix_from_6d
-from avatar.transfer import find_mean, find_neutral, transfer_motion
+from avatar.transfer import TRANSFERS, find_mean, find_neutral, transfer_motion
 from avatar.types import HeadParams
 
 
@@ -63,7 +64,7 @@ def test_mean_transfer_moves_mean_to_mean() -> None:
     torch.testing.assert_close(find_mean(moved).jaw, find_mean(target).jaw, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("mode", ["raw", "relative", "mean"])
+@pytest.mark.parametrize("mode", TRANSFERS)
 def test_gaze_eyelids_and_the_number_of_frames_are_the_drivers(mode) -> None:
     driver, target = talking(REST_A, 3.0, frames=33), talking(REST_B, -2.0, frames=60)
     moved, _, _ = transfer_motion(driver, target, mode, HEAD, HEAD)
@@ -89,3 +90,37 @@ def test_one_frame_is_enough_and_none_or_another_basis_is_refused() -> None:
         transfer_motion([], one, "raw", HEAD, HEAD)
     with pytest.raises(ValueError, match="5 expression coefficients, the target 2"):
         transfer_motion(one, [replace(one[0], expression=torch.zeros(2))], "relative", HEAD, HEAD)
+
+
+@pytest.mark.parametrize("mode", ["raw", "relative", "mean"])
+def test_strength_scales_the_departure_from_rest(mode) -> None:
+    driver, target = talking(REST_A, 3.0), talking(REST_B, -2.0)
+    still, source, goal = transfer_motion(driver, target, mode, HEAD, HEAD, strength=0.0)
+    full = transfer_motion(driver, target, mode, HEAD, HEAD).motion
+    half = transfer_motion(driver, target, mode, HEAD, HEAD, strength=0.5).motion
+    rest = torch.zeros(5) if goal is None else goal.expression
+    rest_jaw = torch.eye(3) if goal is None else goal.jaw
+    assert (source is None) == (goal is None) == (mode == "raw")
+    for i in range(0, 100, 7):
+        torch.testing.assert_close(still[i].expression, rest)
+        torch.testing.assert_close(matrix_from_6d(still[i].jaw), rest_jaw, rtol=0, atol=1e-6)
+        torch.testing.assert_close(half[i].expression, 0.5 * (rest + full[i].expression))
+        # Twice the half turn is the whole one, seen from rest.
+        step = rest_jaw.T @ matrix_from_6d(half[i].jaw)
+        torch.testing.assert_close(rest_jaw @ step @ step, matrix_from_6d(full[i].jaw), rtol=0, atol=1e-5)
+
+
+def test_pca_transfer_stays_within_what_the_target_has_shown() -> None:
+    """The driver also raises brows and yawns wide; the target has done neither."""
+    driver, target = talking(REST_A, 3.0), talking(REST_B, -2.0)
+    brows = torch.tensor([0, 0, 0, 0, 2.0])
+    wild = [replace(p, expression=p.expression + (brows if i % 10 == 0 else 0)) for i, p in enumerate(driver)]
+    wild[0] = replace(wild[0], jaw=rotation_x(60.0)[:2].reshape(6))
+    space = fit_expressions(target)
+    kept = transfer_motion(wild, target, "pca", HEAD, HEAD).motion
+    free = transfer_motion(wild, target, "relative", HEAD, HEAD).motion
+    assert float(space.distances(free)[::10].min()) > 2.0
+    assert float(space.distances(kept).max()) < 1.5
+    assert max(float(p.expression[4].abs()) for p in kept) < 0.1, "the driver's is 2, the target only wobbles"
+    widest = max(float(matrix_from_6d(p.jaw)[2, 1].asin()) for p in target)
+    assert float(matrix_from_6d(kept[0].jaw)[2, 1].asin()) < widest + 0.01

@@ -83,21 +83,48 @@ def test_eval_prints_the_table_and_writes_what_it_says(trained: Path) -> None:
     assert "hypergaussians" in avatar("eval", trained, "--protocol", "hypergaussians")
 
 
-@pytest.mark.parametrize("transfer", ["raw", "relative", "mean"])
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tracked_folder(tmp_path_factory.mktemp("drivers") / "driver", frames=8, size=48, seed=5)
+
+
+@pytest.mark.parametrize("transfer", ["raw", "relative", "mean", "pca"])
 @pytest.mark.parametrize("camera", ["driver", "target"])
 def test_reenact_gives_as_many_frames_as_the_driver_has(
-    trained: Path, tmp_path: Path, transfer: str, camera: str
+    trained: Path, driver: Path, transfer: str, camera: str
 ) -> None:
-    driver = write_tracked_folder(tmp_path / "driver", frames=8, size=48, seed=5)
     options = ("--transfer", transfer, "--camera", camera, "--frame-offset", 1)
     output = avatar("reenact", trained, "--driver", driver, *options)
     video = trained / "reenact" / f"driver-{transfer}.mp4"
     assert str(video) in output
     frames = iio.imread(video)
     assert len(frames) == 8
-    assert ("Neutral expression: frame" in output) == (transfer == "relative")
-    render = frames[:, :, frames.shape[2] // 2 :]
+    assert ("Neutral expression: frame" in output) == (transfer in ("relative", "pca"))
+    render = frames[:, :40, frames.shape[2] // 2 :]
     assert render.reshape(8, -1).std(axis=1).min() > 5, "the render is empty"
+
+
+def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, driver: Path, tmp_path: Path) -> None:
+    video = tmp_path / "out.mp4"
+    options = ("--strength", 0.5, "--smoothing", 1.5, "--intrinsics", "target", "--frame-offset", 1, "--out", video)
+    avatar("reenact", trained, "--driver", driver, *options)
+    recorded = json.loads(video.with_suffix(".json").read_text())
+    assert recorded["choices"] == {
+        "transfer": "relative",
+        "strength": 0.5,
+        "smoothing": 1.5,
+        "camera": "driver",
+        "intrinsics": "target",
+    }
+    assert recorded["driver"] == {"name": "driver", "frames": 8, "fps": 25.0, "has_cameras": True}
+    assert recorded["intrinsics"]["shown"]["fx"] == recorded["intrinsics"]["avatar"]["fx"]
+    rows = list(csv.DictReader(video.with_suffix(".csv").open()))
+    assert [row["name"] for row in rows] == [f"{i:05d}" for i in range(1, 9)]
+    far = sum(float(row["distance"]) > 1.0 for row in rows)
+    assert recorded["distance"]["frames_above_1"] == far
+    for option, value in (("--strength", -1), ("--strength", "nan"), ("--smoothing", -0.5)):
+        output = avatar("reenact", trained, "--driver", driver, "--frame-offset", 1, option, value, status=1)
+        assert f"{option} must be from 0 to" in output
 
 
 def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
