@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -20,7 +19,6 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from avatar.gaussians.compose import compose, split_offsets
-from avatar.gaussians.hyper import HyperHead, HyperHeads
 from avatar.model import Avatar
 from avatar.splat import splat
 from avatar.splat.cpu import thread_count
@@ -40,7 +38,7 @@ class Renderer:
         self.background = background.detach().clone()
         self._avatar = avatar
         self._network = FoldedNetwork(avatar)
-        self._heads = None if avatar.hyper is None else fold_heads(avatar.hyper)
+        self._heads = None if avatar.hyper is None else avatar.hyper.fold()
         self._base = {
             name: getattr(avatar, name).detach().clone() for name in ("quats", "log_scales", "opacity_logits")
         }
@@ -130,42 +128,6 @@ class FoldedNetwork:
             x, spare = spare, x
         weight, bias = self._layers[-1]
         return torch.addmm(bias, x, weight)
-
-
-class AffineHeads(NamedTuple):
-    """The conditional means of all HyperGaussians as offsets = constant + sum_k latent_k columns_k.
-
-    Values of Gaussians lie in rows, so that each multiply-add runs along contiguous memory.
-    """
-
-    columns: Float[Tensor, "n 10 N"]
-    constant: Float[Tensor, "10 N"]
-
-    def __call__(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
-        offsets = self.constant.clone()
-        for column, latent in zip(self.columns, latents.T.contiguous(), strict=True):
-            offsets.addcmul_(column, latent)
-        return offsets.T
-
-
-def fold_heads(heads: HyperHeads) -> AffineHeads:
-    """E[a | z] = (mu_a + B mu_b) - B z with B = L11^-T L21^T, solved once in float64."""
-    columns, constants = [], []
-    for head in (heads.position, heads.rotation, heads.scale):
-        B, mean_a, mean_b = _slope(head)
-        columns.append(-B)
-        constants.append(mean_a + (B @ mean_b[..., None]).squeeze(-1))
-    return AffineHeads(
-        torch.cat(columns, dim=1).permute(2, 1, 0).float().contiguous(),
-        torch.cat(constants, dim=1).T.float().contiguous(),
-    )
-
-
-def _slope(head: HyperHead) -> tuple[Float[Tensor, "N m n"], Float[Tensor, "N m"], Float[Tensor, "N n"]]:
-    factor = head.factor()
-    B = torch.linalg.solve_triangular(factor.L11.double().mT, factor.L21.double().mT, upper=True)
-    mean_a, mean_b = head.mean.double().split((head.attribute_size, head.latent_size), dim=-1)
-    return B, mean_a, mean_b
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.gaussians.hyper_cpu import condition
+from avatar.gaussians.hyper_cpu import apply_folded, condition
 
 
 class Factor(NamedTuple):
@@ -96,6 +96,30 @@ class HyperHeads(nn.Module):
             return condition(latents, parameters)
         return torch.cat((self.position(latents), self.rotation(latents), self.scale(latents)), dim=-1)
 
+    @torch.no_grad()
+    def fold(self) -> FoldedHeads:
+        """The heads as they are now as one affine map for each Gaussian, solved once in float64."""
+        matrices, biases = [], []
+        for head in (self.position, self.rotation, self.scale):
+            factor = head.factor()
+            mean_a, mean_b = head.mean.double().split((head.attribute_size, head.latent_size), dim=-1)
+            slope = torch.linalg.solve_triangular(factor.L11.double().mT, factor.L21.double().mT, upper=True)
+            matrices.append(-slope.mT)
+            biases.append(mean_a + (slope @ mean_b[..., None]).squeeze(-1))
+        dtype = self.position.mean.dtype
+        return FoldedHeads(torch.cat(matrices, dim=-1).to(dtype).contiguous(), torch.cat(biases, dim=-1).to(dtype))
+
     def uncertainty(self) -> Float[Tensor, " N"]:
         """The paper's uncertainty, the log-determinants of the conditional covariances summed over the heads."""
         return sum(head.log_det_covariance() for head in (self.position, self.rotation, self.scale))  # type: ignore[return-value]
+
+
+class FoldedHeads(NamedTuple):
+    """Heads that are not trained any more: offsets = bias + latents times matrix, for each Gaussian its own."""
+
+    matrix: Float[Tensor, "N n 10"]
+    bias: Float[Tensor, "N 10"]
+
+    def __call__(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
+        """What the heads gave when they were folded, to rounding; no gradients."""
+        return apply_folded(self.matrix, self.bias, latents)

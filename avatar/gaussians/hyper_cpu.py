@@ -55,6 +55,20 @@ def _forward(latents: Tensor, parameters: Sequence[Tensor], solved: Tensor | Non
     return offsets
 
 
+@torch.no_grad()
+def apply_folded(
+    matrix: Float[Tensor, "N n 10"], bias: Float[Tensor, "N 10"], latents: Float[Tensor, "N n"]
+) -> Float[Tensor, "N 10"]:
+    """bias + latents times matrix for each Gaussian. Float32 on the CPU is compiled, all else torch's own."""
+    check_shapes(latents=(latents, "N n"), matrix=(matrix, "N n 10"), bias=(bias, "N 10"))
+    if any(t.dtype != torch.float32 or t.device.type != "cpu" for t in (matrix, bias, latents)):
+        return bias + (latents[:, None, :] @ matrix).squeeze(1)
+    matrix, bias, latents = (t.detach().contiguous() for t in (matrix, bias, latents))
+    offsets = torch.empty_like(bias)
+    _core.hyper_apply(matrix, bias, latents, instruction_set(), thread_count(), offsets)
+    return offsets
+
+
 class _Condition(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, latents: Tensor, *parameters: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avatar.bench.splat import available_simd
+from avatar.bench.machine import available_simd
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import condition
 
@@ -121,6 +121,36 @@ def test_extreme_diagonals() -> None:
     torch.testing.assert_close(found[normal].double(), expected[normal], rtol=3e-7, atol=0)
     assert bool((found[expected >= 3.5e38] == torch.inf).all())
     assert bool((found[expected <= 1.1e-38].double() - expected[expected <= 1.1e-38]).abs().max() <= 1.5e-45)
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 8, 33])
+@pytest.mark.parametrize("num", [0, 1, 500])
+def test_folded_heads_are_the_heads(num: int, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    heads, latents = random_heads(num, n), torch.randn(num, n)
+    exact, wide = in_float64(heads), latents.double()
+    torch.testing.assert_close(exact.fold()(wide), exact(wide).detach(), rtol=1e-12, atol=1e-12)
+    folded = heads.fold()
+    found = folded(latents)
+    assert not found.requires_grad
+    torch.testing.assert_close(found.double(), exact(wide).detach(), **TOLERANCE)
+    for threads in "125":
+        for simd in available_simd():
+            monkeypatch.setenv("AVATAR_THREADS", threads)
+            monkeypatch.setenv("AVATAR_SIMD", simd)
+            assert torch.equal(folded(latents), found)
+    strided = latents.T.contiguous().T
+    assert torch.equal(folded(strided), found)
+
+
+def test_folded_heads_do_not_follow_the_heads() -> None:
+    heads, latents = random_heads(5, 2), torch.randn(5, 2)
+    folded = heads.fold()
+    before = folded(latents)
+    with torch.no_grad():
+        heads.position.mean.add_(1.0)
+    assert torch.equal(folded(latents), before)
+    with pytest.raises(ValueError, match="matrix has N = 5, but latents has N = 4; they must be the same"):
+        folded(latents[:4])
 
 
 def test_wrong_tensors_are_named() -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from avatar.bench.splat import available_simd
+from avatar.bench.machine import available_simd
 from avatar.gaussians.hyper_cpu import Interpolation, interpolate
 
 
