@@ -1,6 +1,8 @@
 """Evaluation of a run on frames that it has not seen: figures, the pictures they come from, and a video.
 
-    RUN/eval/results.json                  every choice, what was evaluated, means
+    RUN/eval/results.json                  every choice, what was evaluated, means, intervals
+    RUN/eval/curves.png                    the figures along the video
+    RUN/eval/worst.png                     truth, render and error of the first protocol's worst frames
     RUN/eval/truth_render_error.mp4        frames and background of the first protocol
     RUN/eval/<protocol>/frames.csv         the figures of each frame
     RUN/eval/<protocol>/{renders,gt,masks,...}/%05d.png    with --frames; numbers are those of frames.csv
@@ -11,37 +13,32 @@ Renders and truths are measured as the pictures that the PNG files hold, so that
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
 from tqdm import tqdm
 
 from avatar.checkpoint import write_atomically
 from avatar.data.loader import FrameLoader
-from avatar.evaluation.measure import Figures, FrameMeasurer, Pair, as_seen
-from avatar.evaluation.networks import ChosenLpips, find_networks
+from avatar.evaluation.conditions import conditions
+from avatar.evaluation.curves import curves
+from avatar.evaluation.draw import contact_sheet, draw, panel, speed
+from avatar.evaluation.jitter import JitterMeter
+from avatar.evaluation.measure import FrameMeasurer
+from avatar.evaluation.networks import find_networks
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
-from avatar.evaluation.protocol import SHARED_CHOICES, Colour, Look, Protocol, choose_protocols
+from avatar.evaluation.protocol import SHARED_CHOICES, Protocol, choose_protocols
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import colour_name, frames_csv, table
+from avatar.evaluation.results import FrameResult, summarise
+from avatar.lpips_network import Lpips, Net
+from avatar.render import Renderer
 from avatar.run import Run, versions
-from avatar.splat import splat
-from avatar.types import Frame
-from avatar.video import error_map, side_by_side, video_writer
+from avatar.video import video_writer
 
 RESULTS_FORMAT = 2
-ERROR_SCALE = 0.25  # mean absolute error at which the map in the video is brightest
-
-
-class FrameResult(NamedTuple):
-    index: int
-    name: str
-    figures: Figures
 
 
 @torch.no_grad()
@@ -62,66 +59,89 @@ def evaluate(
     chosen = choose_protocols(protocols)
     folder = run.path / "eval"
     subject, data = run.subject, run.config.data
-    indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in chosen}
-    results: dict[str, list[FrameResult]] = {protocol.name: [] for protocol in chosen}
+    renderer = Renderer(run.avatar, torch.tensor(chosen[0].background))
     networks = find_networks(protocol.lpips_net for protocol in chosen)
+    lpips: dict[Net, Lpips | None] = {net: found.network for net, found in networks.items()}
+    indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in chosen}
+    order = sorted(set().union(*indices.values()))
+    known = conditions(run.avatar.head, subject, order)
+    results: dict[str, list[FrameResult]] = {protocol.name: [] for protocol in chosen}
+    jitter = {protocol.look: JitterMeter() for protocol in chosen}
     for protocol in chosen:
         clear_pictures(folder / protocol.name)
 
     video = folder / "truth_render_error.mp4"
-    order = sorted(set().union(*indices.values()))
     with (
         FrameLoader(subject, data.size, data.cache_mb << 20, data.workers) as loader,
         video_writer(video, subject.fps) as add_to_video,
     ):
         for frame in tqdm(loader.frames(order), total=len(order), desc="eval", unit="frame", disable=None):
             wanted = [protocol for protocol in chosen if frame.index in indices[protocol.name]]
-            pairs = draw(run, frame, {protocol.look for protocol in wanted})
-            masks = region_masks(
-                frame, run.avatar.head, {r for protocol in wanted for r in protocol.regions} | {"head"}
-            )
-            measurer = FrameMeasurer(pairs, masks, {net: found.network for net, found in networks.items()})
+            pairs = draw(renderer, frame, [protocol.look for protocol in wanted])
+            masks = region_masks(frame, run.avatar.head, {"head", *(r for p in wanted for r in p.regions)})
+            for look, pair in pairs.items():
+                jitter[look].add(subject.manifest.frames[frame.index].tracking, pair, masks["head"])
+            measurer = FrameMeasurer(pairs, masks, lpips)
             for protocol in wanted:
-                results[protocol.name].append(FrameResult(frame.index, frame.name, measurer.measure(protocol)))
+                figures, pair = measurer.measure(protocol), pairs[protocol.look]
+                results[protocol.name].append(FrameResult(frame.index, frame.name, figures, known[frame.index]))
                 if protocol is chosen[0]:
-                    add_to_video(panel(pairs[protocol.look]))
+                    add_to_video(panel(pair))
                 if write_frames:
                     shown = {region: masks[region] for region in masks if region in ("head", *protocol.regions)}
-                    write_pictures(folder / protocol.name, frame.index, encode_pictures(pairs[protocol.look], shown))
+                    write_pictures(folder / protocol.name, frame.index, encode_pictures(pair, shown))
 
+    for protocol in chosen:
+        add_jitter(results[protocol.name], jitter[protocol.look], run)
     summary = {
         "format": RESULTS_FORMAT,
         "subject": subject.name,
         "data_hash": subject.data_hash,
+        "image_size": subject.image_size(data.size),
         "head_fingerprint": run.avatar.head.assets.fingerprint,
         "step": run.step,
         "config": run.config.to_dict(),
         "versions": versions(),
         "shared_choices": SHARED_CHOICES,
         "notes": [*background_notes(chosen, data.background), *region_notes(chosen, run)],
+        "rendering": speed(renderer, subject, order, data.size),
         "protocols": {
-            protocol.name: summarise(protocol, results[protocol.name], networks[protocol.lpips_net])
+            protocol.name: summarise(protocol, results[protocol.name], networks[protocol.lpips_net], subject.fps)
             for protocol in chosen
         },
     }
     for protocol in chosen:
         rows = frames_csv(protocol.columns, results[protocol.name])
         write_atomically(folder / protocol.name / "frames.csv", rows.encode())
+    worst = summary["protocols"][chosen[0].name]["worst"]
+    (folder / "worst.png").unlink(missing_ok=True)
+    if worst:  # none where every frame is drawn without an error
+        write_atomically(folder / "worst.png", worst_sheet(run, renderer, chosen[0], worst))
+    write_atomically(folder / "curves.png", curves(chosen, results, [entry["frame"] for entry in worst]))
     path = folder / "results.json"
     write_atomically(path, json.dumps(summary, indent=2, allow_nan=False).encode())
     say(table(summary))
-    say(f"Results  {path}\nVideo    {video}")
+    places = {"Results": path, "Curves": folder / "curves.png", "Worst": folder / "worst.png", "Video": video}
+    say("\n".join(f"{name:8} {place}" for name, place in places.items() if place.exists()))
     return path
 
 
-def draw(run: Run, frame: Frame, looks: set[Look]) -> dict[Look, Pair]:
-    """Render and truth of a frame for each look; looks of one background share the rendering."""
-    gaussians = run.avatar(frame.params)
-    images: dict[Colour, Pair] = {}
-    for background in {look.background for look in looks}:
-        colour = torch.tensor(background)
-        images[background] = Pair(splat(gaussians, frame.camera, colour).image, frame.composite(colour))
-    return {look: Pair(*(as_seen(image, look) for image in images[look.background])) for look in looks}
+def add_jitter(results: Sequence[FrameResult], meter: JitterMeter, run: Run) -> None:
+    """Give each frame whose neighbours belong to the protocol too its jitter, the others NaN."""
+    own = {result.index for result in results}
+    for result in results:
+        found = meter.of.get(run.subject.manifest.frames[result.index].tracking, float("nan"))
+        result.figures["jitter"] = found if {result.index - 1, result.index + 1} <= own else float("nan")
+
+
+def worst_sheet(run: Run, renderer: Renderer, protocol: Protocol, worst: Sequence[Mapping[str, Any]]) -> bytes:
+    """The contact sheet of a protocol's worst frames, drawn again."""
+    panels = []
+    for entry in worst:
+        frame = run.subject.frame(entry["frame"], run.config.data.size)
+        pair = draw(renderer, frame, [protocol.look])[protocol.look]
+        panels.append(panel(pair, (f"truth of {entry['name']}", f"render, {entry['psnr']:.2f} dB")))
+    return contact_sheet(panels)
 
 
 def background_notes(protocols: Sequence[Protocol], trained: Sequence[float]) -> list[str]:
@@ -145,27 +165,3 @@ def region_notes(protocols: Sequence[Protocol], run: Run) -> list[str]:
     return [
         f"{' and '.join(names)}: eyes and rest not measured, because the head model names no left_eyeball and right_eyeball"
     ]
-
-
-def panel(pair: Pair) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
-    """Truth, render and error map under captions, for the video."""
-    render, truth = (image / 255.0 if image.dtype == torch.uint8 else image for image in pair)
-    images = (truth, render, error_map(render, truth, ERROR_SCALE))
-    return side_by_side(images, ("truth", "render", f"error, 0 to {ERROR_SCALE:g}"))
-
-
-def summarise(protocol: Protocol, results: Sequence[FrameResult], lpips: ChosenLpips) -> dict[str, Any]:
-    """One protocol's entry of results.json: its choices, its frames, and means over the frames that have a figure."""
-    means: dict[str, float | None] = {}
-    counts: dict[str, int] = {}
-    for column in protocol.columns:
-        values = [result.figures[column] for result in results if math.isfinite(result.figures[column])]
-        counts[column] = len(values)
-        means[column] = math.fsum(values) / len(values) if values else None
-    return {
-        "choices": protocol.choices(),
-        "lpips": lpips.as_json(),
-        "means": means,
-        "frames_with_a_figure": counts,
-        "frames": [result.name for result in results],
-    }

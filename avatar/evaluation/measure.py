@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.evaluation.protocol import Levels, Look, Protocol, Region, column
+from avatar.evaluation.protocol import MEASURES, Levels, Look, Protocol, Region, column
 from avatar.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.metrics import SSIM_RADIUS, bounding_box, squared_error, ssim_map, weighted_mean
 
@@ -56,14 +56,14 @@ class FrameMeasurer:
         self._lpips: dict[tuple[Look, str, Net], float] = {}
 
     def measure(self, protocol: Protocol) -> Figures:
-        """All figures of the protocol. NaN: undefined (a region without a pixel) or not measured."""
+        """All figures of the protocol but its jitter. NaN: undefined (a region without a pixel) or not measured."""
         figures: Figures = {}
         for region in (None, *protocol.regions):
             mask = None
             if region is not None or protocol.mask == "only":
                 mask = self._masks.get(region or "head")
                 if mask is None:
-                    figures |= {name: float("nan") for name in protocol.columns if name.endswith(f"_{region}")}
+                    figures |= {column(name, region): float("nan") for name in MEASURES}
                     continue
             multiply = region is None and protocol.mask == "multiply"
             error, similarity = self._maps_of(protocol.look, multiply)

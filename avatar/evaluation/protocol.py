@@ -45,6 +45,12 @@ SHARED_CHOICES = {
     "lpips": "version 0.1, images brought to [-1, 1], times the protocol's lpips_scale",
     "of_a_region": "weighted mean over the region alone of squared error and of the SSIM map; LPIPS of both images times "
     "the mask, cropped to its bounding box grown to at least 64 pixels",
+    "jitter": "of the head, in levels of 8 bits: with e = render - truth, the mean over pixels and channels of "
+    "|e(t-1) - 2 e(t) + e(t+1)|, weighted by the smallest of the three head masks; none where a neighbour is missing",
+    "yaw": "degrees about the head's vertical axis from which the camera sees it, positive from the head's own left",
+    "expression_distance": "root mean square distance of the vertices, in mm, neck and head at rest, from the training "
+    "frame where it is smallest",
+    "worst": "lowest main PSNR; of frames closer than a bootstrap block only the worst",
     "means": "over frames, of the figures of each frame; a frame without a pixel in a region has no figure there",
 }
 
@@ -82,8 +88,8 @@ class Protocol:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the figures of each frame: `psnr`, `ssim`, `lpips`, then each with `_REGION`."""
-        return tuple(column(measure, region) for region in (None, *self.regions) for measure in MEASURES)
+        """Names of the figures of each frame: `psnr`, `ssim`, `lpips`, then each with `_REGION`, then `jitter`."""
+        return (*(column(measure, region) for region in (None, *self.regions) for measure in MEASURES), "jitter")
 
     def choices(self) -> dict[str, Any]:
         """Every choice by name, for results files."""

@@ -19,13 +19,15 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, FrameRecord, Manifest
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.evaluation import draw as draw_module
 from avatar.evaluation import evaluate as evaluate_module
 from avatar.evaluation import measure as measure_module
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import MEASURES, builtin_protocols, choose_protocols
 from avatar.lpips import lpips_folder, save_lpips
 from avatar.lpips_network import Lpips
-from avatar.types import Gaussians, HeadParams
+from avatar.splat import splat
+from avatar.types import Camera, Frame, Gaussians, HeadParams, Rendering
 
 SIZE, COUNT, TEST = 72, 10, (7, 8, 9)
 SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255, "channel_axis": 2}
@@ -35,6 +37,7 @@ SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": Fals
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("AVATAR_LPIPS", raising=False)
+    monkeypatch.setattr(evaluate_module, "Renderer", BlobRenderer)
 
 
 @pytest.fixture
@@ -120,6 +123,19 @@ class Blob:
         )
 
 
+class BlobRenderer:
+    """Stands in for `avatar.render.Renderer`."""
+
+    def __init__(self, avatar: Blob, background: torch.Tensor) -> None:
+        self.avatar, self.background = avatar, background
+
+    def gaussians(self, params: HeadParams) -> Gaussians:
+        return self.avatar(params)
+
+    def render(self, params: HeadParams, camera: Camera) -> Rendering:
+        return splat(self.avatar(params), camera, self.background)
+
+
 def make_run(path: Path, subject: Subject) -> Any:
     data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0), cache_mb=16, workers=1)
     config = SimpleNamespace(data=data, to_dict=lambda: {"data": {"size": None}})
@@ -134,7 +150,7 @@ def test_every_figure_can_be_recomputed_from_the_pictures(tmp_path: Path, subjec
     run = make_run(tmp_path / "run", subject)
     said: list[str] = []
     results = json.loads(evaluate(run, write_frames=True, say=said.append).read_text())
-    assert run.avatar.seen == pytest.approx([7 / 9, 8 / 9, 1.0])  # the held-out frames, each once
+    assert run.avatar.seen[:3] == pytest.approx([7 / 9, 8 / 9, 1.0])  # the held-out frames, each once for all protocols
     for protocol in choose_protocols(None):
         name = protocol.name
         folder = run.path / "eval" / name
@@ -201,11 +217,81 @@ def test_protocols_measure_what_they_share_once(
 ) -> None:
     """Five protocols over three backgrounds: three renderings and, with one masked pair, four SSIM maps a frame."""
     calls: list[str] = []
-    for module, name in ((evaluate_module, "splat"), (measure_module, "ssim_map")):
+    for module, name in ((draw_module, "splat"), (measure_module, "ssim_map")):
         real = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, real=real, name=name: (calls.append(name), real(*a))[1])
     evaluate(make_run(tmp_path / "run", subject), say=lambda _: None)
-    assert (calls.count("splat"), calls.count("ssim_map")) == (3 * len(TEST), 4 * len(TEST))
+    worst = 3  # drawn again for the contact sheet
+    assert (calls.count("splat"), calls.count("ssim_map")) == (3 * len(TEST) + worst, 4 * len(TEST))
+
+
+def test_jitter_can_be_recomputed_from_the_pictures(tmp_path: Path, subject: Subject) -> None:
+    """Three frames have one second difference, which belongs to the middle one."""
+    run = make_run(tmp_path / "run", subject)
+    results = json.loads(evaluate(run, ["flashavatar"], write_frames=True, say=lambda _: None).read_text())
+    folder = run.path / "eval" / "flashavatar"
+
+    def stack(kind: str) -> np.ndarray:
+        return np.stack([read_png(folder / kind / f"{index:05d}.png").astype(float) for index in TEST])
+
+    error, masks = stack("renders") - stack("gt"), stack("masks")
+    change = np.abs(error[0] - 2 * error[1] + error[2]).mean(axis=2)
+    expected = np.average(change, weights=masks.min(axis=0))
+    rows = list(csv.DictReader((folder / "frames.csv").open()))
+    assert [row["jitter"] for row in rows] == ["nan", f"{expected:.6f}", "nan"]
+    entry = results["protocols"]["flashavatar"]
+    assert entry["means"]["jitter"] == pytest.approx(expected, rel=1e-9) and expected > 0.1
+    assert entry["frames_with_a_figure"]["jitter"] == 1
+
+
+def test_bins_intervals_worst_frames_and_speed_are_in_the_results(tmp_path: Path, subject: Subject) -> None:
+    run = make_run(tmp_path / "run", subject)
+    said: list[str] = []
+    results = json.loads(evaluate(run, say=said.append).read_text())
+    entry = results["protocols"]["hypergaussians"]
+    rows = list(csv.DictReader((run.path / "eval" / "hypergaussians" / "frames.csv").open()))
+    low, high = entry["intervals"]["psnr"]
+    figures = [float(row["psnr"]) for row in rows]
+    assert min(figures) - 1e-6 <= low < entry["means"]["psnr"] < high <= max(figures) + 1e-6
+    assert entry["bootstrap"] == {
+        "method": "moving-block bootstrap over frames, percentile interval of the mean",
+        "level": 0.95,
+        "block_frames": 1,  # a second would have 20 frames, and there are 3
+        "resamples": 2000,
+        "seed": 0,
+    }
+    assert [float(row["yaw"]) for row in rows] == [180.0] * 3  # the test's camera stands behind the head
+    (part,) = entry["by_yaw"]
+    assert (part["from"], part["to"], part["frames"]) == (30.0, None, 3)
+    assert part["means"] == entry["means"]
+    assert sum(part["frames"] for part in entry["by_expression_distance"]) == 3
+    order = sorted(rows, key=lambda row: float(row["psnr"]))
+    assert [part["name"] for part in entry["worst"]] == [row["name"] for row in order]
+    rendering = results["rendering"]
+    assert (rendering["width"], rendering["height"], rendering["frames"]) == (SIZE, SIZE, 3)
+    assert rendering["frames_per_second"] == pytest.approx(1000 / rendering["median_ms"])
+    assert results["image_size"] == [SIZE, SIZE]
+    assert f"{low:.2f} - {high:.2f}" in said[0] and f"worst frames, main PSNR        {order[0]['name']}" in said[0]
+    sheet = read_png(run.path / "eval" / "worst.png")
+    assert sheet.shape[1] == 2 * 3 * SIZE  # two columns of truth, render and error
+    assert sheet.shape[0] % 2 == 0 and (sheet[-1, -1] == 255).all()  # three panels: the last place is empty
+    assert read_png(run.path / "eval" / "curves.png").std() > 10
+
+
+def test_an_avatar_without_error_has_no_worst_frame(
+    tmp_path: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Infinite PSNR is no figure: results stay valid JSON, and there is nothing to look at."""
+    monkeypatch.setattr(
+        draw_module, "splat", lambda gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), None)
+    )
+    monkeypatch.setattr(Frame, "composite", lambda self, colour: colour.expand(SIZE, SIZE, 3))
+    run = make_run(tmp_path / "run", subject)
+    said: list[str] = []
+    entry = json.loads(evaluate(run, ["strict"], say=said.append).read_text())["protocols"]["strict"]
+    assert entry["means"]["psnr"] is None and entry["means"]["ssim"] == 1.0 and entry["means"]["jitter"] == 0.0
+    assert entry["worst"] == [] and entry["intervals"]["psnr"] is None and entry["intervals"]["ssim"] == [1.0, 1.0]
+    assert not (run.path / "eval" / "worst.png").exists() and "worst.png" not in said[1]
 
 
 def test_a_protocol_of_ones_own_is_measured_as_it_says(tmp_path: Path, subject: Subject) -> None:

@@ -132,4 +132,5 @@ def test_every_choice_can_be_made(tmp_path: Path) -> None:
         *("psnr", "ssim", "lpips"),
         *("psnr_head", "ssim_head", "lpips_head"),
         *("psnr_rest", "ssim_rest", "lpips_rest"),
+        "jitter",
     )

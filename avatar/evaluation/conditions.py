@@ -1,0 +1,60 @@
+"""How far a frame is from what training has seen: the angle of view and the distance of the expression."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.data.subject import Subject
+from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.types import IDENTITY_6D, Camera, HeadParams
+
+
+class Conditions(NamedTuple):
+    """Field names are columns of frames.csv."""
+
+    yaw: float  # degrees
+    expression_distance: float  # mm
+
+
+def conditions(head: HeadModel, subject: Subject, indices: Sequence[int]) -> dict[int, Conditions]:
+    """The conditions of these frames; distances are to the nearest of the subject's training frames."""
+    distances = expression_distances(
+        head, [subject.params(i) for i in indices], [subject.params(i) for i in subject.split.train]
+    )
+    return {
+        index: Conditions(yaw(subject.camera(index), subject.params(index)), distance)
+        for index, distance in zip(indices, distances, strict=True)
+    }
+
+
+def yaw(camera: Camera, params: HeadParams) -> float:
+    """The angle in degrees, about the head's vertical axis, from which the camera sees it: 0 from the front, positive from
+    the head's own left. The neck's rotation counts as the head's.
+    """
+    position = -camera.R_cam_world.T @ camera.t_cam_world  # of the camera in the head's world
+    x, _, z = (matrix_from_6d(params.neck).T @ position).tolist()
+    return math.degrees(math.atan2(x, z))
+
+
+def expression_distances(head: HeadModel, frames: Sequence[HeadParams], training: Sequence[HeadParams]) -> list[float]:
+    """For each frame the root mean square distance of its vertices, in mm, from the nearest training frame's.
+
+    Vertices in the head's own space, the neck at rest: expression, jaw, eyes and lids count, the head's pose does not.
+    """
+    shapes = torch.stack([_shape(head, params) for params in (*training, *frames)])
+    shapes = (shapes - shapes[0]).flatten(1)  # small numbers, because cdist takes differences of squares
+    seen, asked = shapes[: len(training)], shapes[len(training) :]
+    vertices = shapes.shape[1] / 3
+    nearest = torch.cdist(asked, seen).amin(dim=1) / math.sqrt(vertices)
+    return (nearest * 1000.0).tolist()
+
+
+def _shape(head: HeadModel, params: HeadParams) -> Float[Tensor, "V 3"]:
+    return head.vertices(replace(params, neck=params.neck.new_tensor(IDENTITY_6D)))

@@ -1,0 +1,81 @@
+"""Pictures of an evaluated frame: render and truth as protocols compare them, and panels for people."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from avatar.data.subject import Subject
+from avatar.evaluation.measure import Pair, as_seen
+from avatar.evaluation.protocol import Colour, Look
+from avatar.render import Renderer
+from avatar.splat import splat
+from avatar.splat.cpu import thread_count
+from avatar.types import Frame
+from avatar.video import error_map, side_by_side
+
+ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
+SHEET_COLUMNS = 2
+SHEET_WIDTH = 1600  # pixels at most
+TIMED_FRAMES, WARM_UP = 30, 3
+
+
+def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, Pair]:
+    """Render and truth of a frame for each look; looks of one background share the drawing."""
+    gaussians = renderer.gaussians(frame.params)
+    images: dict[Colour, Pair] = {}
+    pairs = {}
+    for look in looks:
+        if look.background not in images:
+            colour = torch.tensor(look.background)
+            images[look.background] = Pair(splat(gaussians, frame.camera, colour).image, frame.composite(colour))
+        pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
+    return pairs
+
+
+def panel(pair: Pair, captions: tuple[str, str] = ("truth", "render")) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
+    """Truth, render and error map side by side under captions."""
+    render, truth = (image / 255.0 if image.dtype == torch.uint8 else image for image in pair)
+    images = (truth, render, error_map(render, truth, ERROR_SCALE))
+    return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"))
+
+
+def contact_sheet(panels: Sequence[UInt8[np.ndarray, "H W 3"]]) -> bytes:
+    """Panels in two columns, row by row, as a PNG file."""
+    blank = np.full_like(panels[0], 255)
+    filled = [*panels, *[blank] * (-len(panels) % SHEET_COLUMNS)]
+    rows = [np.concatenate(filled[i : i + SHEET_COLUMNS], axis=1) for i in range(0, len(filled), SHEET_COLUMNS)]
+    sheet = np.concatenate(rows)
+    if sheet.shape[1] > SHEET_WIDTH:
+        height = round(sheet.shape[0] * SHEET_WIDTH / sheet.shape[1])
+        sheet = cv2.resize(sheet, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
+
+
+def speed(renderer: Renderer, subject: Subject, indices: Sequence[int], size: int | None) -> dict[str, Any]:
+    """How long one frame takes, from head parameters to image, one frame at a time; for results files."""
+    count = min(TIMED_FRAMES, len(indices))
+    chosen = [indices[i * len(indices) // count] for i in range(count)]
+    seconds = []
+    for index in [*chosen[:1] * WARM_UP, *chosen]:
+        params, camera = subject.params(index), subject.camera(index, size)
+        begin = time.perf_counter()
+        renderer.render(params, camera)
+        seconds.append(time.perf_counter() - begin)
+    timed = np.array(seconds[WARM_UP:]) * 1000.0
+    width, height = subject.image_size(size)
+    return {
+        "frames_per_second": float(1000.0 / np.median(timed)),
+        "median_ms": float(np.median(timed)),
+        "p95_ms": float(np.quantile(timed, 0.95)),
+        "frames": count,
+        "width": width,
+        "height": height,
+        "threads": thread_count(),
+    }

@@ -1,0 +1,86 @@
+"""What results.json says of one protocol: its choices and the figures in short."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avatar.evaluation.bootstrap import BlockBootstrap, block_length, describe
+from avatar.evaluation.conditions import Conditions
+from avatar.evaluation.measure import Figures
+from avatar.evaluation.networks import ChosenLpips
+from avatar.evaluation.protocol import Protocol
+
+YAW_EDGES = (-30.0, -10.0, 10.0, 30.0)  # degrees
+DISTANCE_QUANTILES = (0.25, 0.5, 0.75)  # edges of the bins of expression distance: four bins with as many frames each
+WORST = 8
+
+
+class FrameResult(NamedTuple):
+    index: int
+    name: str
+    figures: Figures
+    conditions: Conditions
+
+
+def summarise(protocol: Protocol, results: Sequence[FrameResult], lpips: ChosenLpips, fps: float) -> dict[str, Any]:
+    """One protocol's entry of results.json; means are over the frames that have a finite figure."""
+    figures = {name: np.array([result.figures[name] for result in results]) for name in protocol.columns}
+    block = block_length(len(results), fps)
+    bootstrap = BlockBootstrap(len(results), block)
+    yaws = np.array([result.conditions.yaw for result in results])
+    distances = np.array([result.conditions.expression_distance for result in results])
+    return {
+        "choices": protocol.choices(),
+        "lpips": lpips.as_json(),
+        "means": means(figures),
+        "intervals": {name: bootstrap.interval(values) for name, values in figures.items()},
+        "bootstrap": describe(block),
+        "frames_with_a_figure": {name: int(np.isfinite(values).sum()) for name, values in figures.items()},
+        "by_yaw": binned(yaws, YAW_EDGES, figures),
+        "by_expression_distance": binned(distances, np.quantile(distances, DISTANCE_QUANTILES), figures),
+        "worst": [
+            {"frame": result.index, "name": result.name, "psnr": result.figures["psnr"]}
+            for result in worst_frames(results, apart=block)
+        ],
+        "frames": [result.name for result in results],
+    }
+
+
+def means(figures: Mapping[str, np.ndarray]) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for name, values in figures.items():
+        finite = values[np.isfinite(values)].tolist()
+        found[name] = math.fsum(finite) / len(finite) if finite else None
+    return found
+
+
+def binned(
+    values: np.ndarray, edges: Sequence[float] | np.ndarray, figures: Mapping[str, np.ndarray]
+) -> list[dict[str, Any]]:
+    """Means of the figures over the frames in each bin [from, to) that has any; None: the bin is open on that side."""
+    bins = np.digitize(values, edges)
+    bounds = [None, *(float(edge) for edge in edges), None]
+    return [
+        {
+            "from": bounds[number],
+            "to": bounds[number + 1],
+            "frames": int((bins == number).sum()),
+            "means": means({name: column[bins == number] for name, column in figures.items()}),
+        }
+        for number in np.unique(bins).tolist()
+    ]
+
+
+def worst_frames(results: Sequence[FrameResult], apart: int) -> list[FrameResult]:
+    """Up to `WORST` frames of lowest main PSNR, worst first; of frames less than `apart` from each other only the worst."""
+    chosen: list[FrameResult] = []
+    for result in sorted(results, key=lambda result: result.figures["psnr"]):
+        if math.isfinite(result.figures["psnr"]) and all(abs(result.index - other.index) >= apart for other in chosen):
+            chosen.append(result)
+        if len(chosen) == WORST:
+            break
+    return chosen
