@@ -12,7 +12,7 @@ from stress.test_random_scenes import allowed_and_error, assert_agrees, draw_wit
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, Rendering
 
-SEEDS = range(8)
+SEEDS = range(12)
 
 
 def reference(gaussians: Gaussians, camera: Camera, background: torch.Tensor, **options: Any) -> Rendering:
@@ -69,5 +69,5 @@ def test_few_pixels_are_left_out_and_most_gradients_are_held_to_a_fifth() -> Non
         for size, allowed in allowed_and_error(truth, nothing).values():  # the error is the gradient itself
             splats += int((size > 0).sum())
             sharp += int((allowed < 0.2 * size)[size > 0].sum())
-    assert ambiguous < 0.02 * pixels
+    assert ambiguous < 0.01 * pixels
     assert sharp > 0.6 * splats

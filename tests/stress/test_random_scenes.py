@@ -74,7 +74,7 @@ def draw_with_kernel(
         leaves = [field[b].to(dtype, copy=True).requires_grad_() for field in (*batch.gaussians, batch.background)]
         found = function(Gaussians(*leaves[:5]), batch.camera(b), leaves[5], **asdict(batch.options))
         cotangents = truth.grad_image[b].to(dtype), truth.grad_alpha[b].to(dtype)
-        gradients.append(torch.autograd.grad(found, leaves, cotangents))
+        gradients.append(torch.autograd.grad(found, leaves, cotangents, materialize_grads=True))
         renderings.append(Rendering(*(t.detach() for t in found)))
     names = (*Gaussians._fields, "background")
     image, alpha = (torch.stack(fields).double() for fields in zip(*renderings, strict=True))
