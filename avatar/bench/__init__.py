@@ -32,4 +32,5 @@ PARTS = {
     "splat": Part("avatar.bench.splat_report"),
     "render": Part("avatar.bench.render", "RUN"),
     "train": Part("avatar.bench.train_report", "FOLDER"),
+    "quality": Part("avatar.bench.quality_report", "RUN..."),
 }

@@ -66,9 +66,10 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     for preset in PRESETS:
         config = load_config([f"preset={preset}", *overrides])
         torch.manual_seed(config.trainer.seed)
-        trainees[preset] = trainee(
-            Avatar(assets, subject.identity, config.model), subject, config, say if preset == PRESETS[0] else silent
-        )
+        avatar = Avatar(assets, subject.identity, config.model)
+        with torch.no_grad():  # opacities as after training: what is drawn decides what drawing costs
+            avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
+        trainees[preset] = trainee(avatar, subject, config, say if preset == PRESETS[0] else silent)
     steps: dict[tuple[str, bool], Callable[[], object]] = {}
     for preset, learner in trainees.items():
         for late in (False, True):
@@ -81,7 +82,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
             len(learner.avatar.code),
             sum(p.numel() for p in learner.avatar.parameters()),
             times[preset, False],
-            per_step(times[preset, True], late_steps(learner)),
+            per_step(times[preset, True], steps_at_once(learner)),
             stages(learner, subject, repeats),
         )
         for preset, learner in trainees.items()
@@ -89,9 +90,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
 
 
 def trainee(avatar: Avatar, subject: Subject, config: Config, say: Callable[[str], None]) -> Trainee:
-    """An avatar with opacities as after training: what is drawn decides what drawing costs."""
-    with torch.no_grad():
-        avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
+    """The avatar with a few decoded frames that are spread over the training split."""
     train = subject.split.train
     chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
     with FrameLoader(subject, config.data.size) as loader:
@@ -107,7 +106,7 @@ def silent(_: str) -> None:
     """What was said for the first preset holds for the others."""
 
 
-def late_steps(learner: Trainee) -> int:
+def steps_at_once(learner: Trainee) -> int:
     """So many steps hold one with the perceptual term."""
     return learner.objective.perceptual.every
 
@@ -116,8 +115,8 @@ def run_steps(learner: Trainee, late: bool) -> None:
     """One step with all degrees of colour but before the perceptual term, or the last ones, as many as hold one with it."""
     iterations = learner.config.trainer.iterations
     if late:
-        first = iterations // late_steps(learner) * late_steps(learner)
-        for number in range(first, first + late_steps(learner)):
+        first = iterations // steps_at_once(learner) * steps_at_once(learner)
+        for number in range(first, first + steps_at_once(learner)):
             learner.step(number)
     else:
         learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1)
@@ -133,7 +132,7 @@ def stages(learner: Trainee, subject: Subject, repeats: int) -> dict[str, Time]:
     pixels = [
         (frame.index, subject.pixels(frame.index, size)) for frame in (next(learner.frames) for _ in range(FRAMES))
     ]
-    number = learner.config.trainer.iterations // late_steps(learner) * late_steps(learner)
+    number = learner.config.trainer.iterations // steps_at_once(learner) * steps_at_once(learner)
     for turn in range(repeats + 2):
         index, decoded = pixels[turn % len(pixels)]
         staged(number, lambda index=index, decoded=decoded: subject.assemble(index, decoded, size))

@@ -1,0 +1,131 @@
+"""Quality of held-out frames against training time, for finished or interrupted runs: `avatar bench quality RUN RUN...`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from avatar.bench.clock import Time, paired_medians
+from avatar.bench.train import Trainee, per_step, run_steps, steps_at_once, trainee
+from avatar.checkpoint import list_checkpoints, load_checkpoint, load_module
+from avatar.data.loader import FrameLoader
+from avatar.errors import UserError
+from avatar.evaluation.measure import to_8_bit
+from avatar.metrics import psnr, ssim
+from avatar.render import Renderer
+from avatar.run import Run, load_run
+from avatar.types import Frame
+
+
+@dataclass(frozen=True)
+class Point:
+    """A checkpoint: held-out frames over the head mask alone, means over frames of 8-bit pictures."""
+
+    step: int
+    minutes: float  # of training up to there
+    psnr: float  # dB
+    ssim: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One run. Times are those that steps of its configuration take now, in turns with the other runs' steps."""
+
+    run: str
+    gaussians: int
+    iterations: int  # that its schedule is made for
+    early: Time  # milliseconds of a step before the perceptual term takes part
+    late: Time  # and after
+    frames: int  # held out, evenly spread over the test split
+    points: list[Point]
+
+    @property
+    def last(self) -> Point:
+        return self.points[-1]
+
+    @property
+    def best(self) -> Point:
+        return max(self.points, key=lambda point: point.psnr)
+
+    def minutes_to(self, psnr: float) -> float | None:
+        """Training time of the first checkpoint that has so many dB; None when none has."""
+        return next((point.minutes for point in self.points if point.psnr >= psnr), None)
+
+
+def measure(
+    paths: Sequence[Path], head: Path | None, *, frames: int, repeats: int, say: Callable[[str], None] = print
+) -> list[Curve]:
+    """A curve for each run. Raises UserError for runs of different subjects: their figures cannot be compared."""
+    runs = [load_run(path, head, say) for path in paths]
+    for run in runs:
+        if run.subject.data_hash != runs[0].subject.data_hash:
+            raise UserError(f"{run.path} was trained on other data than {runs[0].path}; compare runs of one subject")
+    learners = [trainee(run.avatar, run.subject, run.config, lambda _: None) for run in runs]
+    times = time_steps(learners, repeats)
+    curves = []
+    for run, learner, (early, late) in zip(runs, learners, times, strict=True):
+        points = []
+        files = list_checkpoints(run.path / "checkpoints")
+        held_out = held_out_frames(run, frames)
+        for file in tqdm(files, desc=run.path.name, unit="checkpoint", disable=None):
+            checkpoint = load_checkpoint(file)
+            load_module(run.avatar, checkpoint, run.path)
+            minutes = minutes_of(learner, checkpoint.step, early, late)
+            points.append(Point(checkpoint.step, minutes, *figures(run, held_out)))
+        iterations = run.config.trainer.iterations
+        curves.append(Curve(str(run.path), len(run.avatar), iterations, early, late, len(held_out), points))
+    return curves
+
+
+def time_steps(learners: Sequence[Trainee], repeats: int) -> list[tuple[Time, Time]]:
+    """Milliseconds of an early and a late step of each, taken in turns."""
+    steps: dict[tuple[int, bool], Callable[[], object]] = {}
+    for index, learner in enumerate(learners):
+        for late in (False, True):
+            steps[index, late] = lambda learner=learner, late=late: run_steps(learner, late)
+    times = paired_medians(steps, repeats, warm_up=2)
+    return [
+        (times[index, False], per_step(times[index, True], steps_at_once(learner)))
+        for index, learner in enumerate(learners)
+    ]
+
+
+def minutes_of(learner: Trainee, step: int, early: Time, late: Time) -> float:
+    trainer = learner.config.trainer
+    before = min(step, round(trainer.perceptual_start * trainer.iterations))
+    return (before * early.median + (step - before) * late.median) / 60_000
+
+
+def held_out_frames(run: Run, count: int) -> list[Frame]:
+    test = run.subject.split.test
+    chosen = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, count).round().astype(int))]
+    with FrameLoader(run.subject, run.config.data.size) as loader:
+        return list(loader.frames(chosen))
+
+
+@torch.no_grad()
+def figures(run: Run, frames: Sequence[Frame]) -> tuple[float, float]:
+    """PSNR and SSIM over the head mask, means over the frames."""
+    background = torch.tensor(run.config.data.background)
+    renderings = Renderer(run.avatar, background).stream((frame.params, frame.camera) for frame in frames)
+    values = []
+    for frame, rendering in zip(frames, renderings, strict=True):
+        pictures = (rendering.image, frame.composite(background))
+        render, truth = (to_8_bit(picture).double() / 255 for picture in pictures)
+        mask = frame.head_mask.double()
+        values.append((float(psnr(render, truth, mask)), float(ssim(render, truth, mask))))
+    mean_psnr, mean_ssim = np.mean(values, axis=0).tolist()
+    return mean_psnr, mean_ssim
+
+
+def pareto(curves: Sequence[Curve]) -> list[Curve]:
+    """The runs whose last checkpoint no other run reaches in less time, quickest first."""
+    ordered = sorted(curves, key=lambda curve: curve.last.minutes)
+    best = [-np.inf, *np.maximum.accumulate([curve.last.psnr for curve in ordered])]
+    return [curve for curve, (before, after) in zip(ordered, pairwise(best), strict=True) if after > before]
