@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.gaussians.compose import compose, split_offsets
+from avatar.gaussians.compose import compose_raw
 from avatar.losses import PhotometricLoss
 from avatar.model import Avatar
 from avatar.train.optim import schedule, set_rates
@@ -69,7 +69,7 @@ class StagedStep:
         base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
         gaussians = self._forward(
             "compose",
-            lambda z: compose(points, *base[:3], torch.cat(base[3:], dim=1), split_offsets(z)),  # type: ignore[arg-type]
+            lambda z: compose_raw(points, *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
             [raw],
             base,
         )
