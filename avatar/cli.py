@@ -140,6 +140,9 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     """The options that name a tracked folder and what belongs to it."""
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
     add_head(parser)
+    parser.add_argument(
+        "--format", metavar="NAME", help="metrical-tracker, VHAP, INSTA or IMavatar (default: told from the files)"
+    )
     add_tracking(parser)
 
 

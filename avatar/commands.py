@@ -37,7 +37,11 @@ def train(arguments: Namespace) -> int:
     if arguments.resume:
         return resume_training(run, arguments, overrides)
     source = Source(
-        arguments.folder, find_head(arguments.folder, arguments.head), arguments.tracking, arguments.frame_offset
+        arguments.folder,
+        find_head(arguments.folder, arguments.head),
+        arguments.tracking,
+        arguments.frame_offset,
+        arguments.format,
     )
     return train_new(source, load_config(overrides), run)
 
@@ -151,6 +155,7 @@ def prepare(arguments: Namespace) -> int:
         head,
         tracking=arguments.tracking,
         frame_offset=arguments.frame_offset,
+        format=arguments.format,
         out=arguments.out,
     )
     subject = Subject.open(prepared)

@@ -41,6 +41,7 @@ class Source:
     head: Path
     tracking: Path | None = None
     frame_offset: int | None = None
+    format: str | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def find_head(folder: Path, given: Path | None = None) -> Path:
 
 def check_folder(folder: Path) -> None:
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder; give the tracked video folder (with imgs/ and checkpoint/)")
+        raise UserError(f"{folder} is not a folder; give the tracked video folder (docs/data.md)")
 
 
 def open_subject(
@@ -88,6 +89,7 @@ def open_subject(
         source.head,
         tracking=source.tracking,
         frame_offset=source.frame_offset,
+        format=source.format,
         split=sizes,
         say=say,
     )
@@ -106,6 +108,7 @@ def start_run(path: Path, source: Source, config: Config, subject: Subject) -> N
             "head": str(source.head.resolve()),
             "tracking": str(source.tracking.resolve()) if source.tracking else None,
             "frame_offset": source.frame_offset,
+            "folder_format": source.format,
             "data_hash": subject.data_hash,
             "head_fingerprint": subject.head_fingerprint,
             "config": config.to_dict(),
@@ -135,10 +138,13 @@ def read_source(path: Path, info: dict[str, Any], head: Path | None) -> tuple[Co
     try:
         config = config_from_dict(info["config"])
         tracking, offset = info["tracking"], info["frame_offset"]
-        recorded = Source(Path(info["folder"]), Path(info["head"]), Path(tracking) if tracking else None, offset)
+        folder, recorded_head = Path(info["folder"]), Path(info["head"])
+        source = Source(
+            folder, head or recorded_head, Path(tracking) if tracking else None, offset, info.get("folder_format")
+        )
     except (KeyError, TypeError) as error:
         raise UserError(f"{path / 'run.json'} is damaged: {error} is missing or of the wrong type") from None
-    return config, Source(recorded.folder, head or recorded.head, recorded.tracking, recorded.frame_offset)
+    return config, source
 
 
 def check_same(path: Path, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets) -> None:

@@ -12,6 +12,7 @@ from avatar.errors import UserError
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 _TAIL = 4096  # some writers pad after the end marker
 
 
@@ -21,8 +22,8 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """uint8 [H, W]; colour files become their luminance. Raises UserError as `read_image` does."""
-    return _decode(read_bytes(path), path, cv2.IMREAD_GRAYSCALE)
+    """uint8 [H, W]: the transparency of a PNG that has any, else the luminance. Raises UserError as `read_image` does."""
+    return decode_mask(read_bytes(path), path)
 
 
 def decode_image(data: bytes, path: Path) -> np.ndarray:
@@ -32,7 +33,17 @@ def decode_image(data: bytes, path: Path) -> np.ndarray:
 
 def decode_mask(data: bytes, path: Path) -> np.ndarray:
     """`read_mask` of bytes that were read already; `path` is for the message."""
+    if has_transparency(data):
+        channels = _decode(data, path, cv2.IMREAD_UNCHANGED)
+        matte = channels[..., -1] if channels.ndim == 3 else channels
+        if matte.dtype == np.uint8 and matte.min() < 255:
+            return np.ascontiguousarray(matte)
     return _decode(data, path, cv2.IMREAD_GRAYSCALE)
+
+
+def has_transparency(data: bytes) -> bool:
+    """Whether the header is that of a PNG with an alpha channel."""
+    return data.startswith(_PNG_START) and len(data) > _PNG_COLOUR_TYPE and data[_PNG_COLOUR_TYPE] in (4, 6)
 
 
 def read_bytes(path: Path) -> bytes:

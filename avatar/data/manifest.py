@@ -14,14 +14,14 @@ from typing import Any
 
 from avatar.errors import UserError
 
-MANIFEST_VERSION = 1
+MANIFEST_VERSION = 2
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
 _MAX_BYTES = 2**28
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One usable frame: its files, relative to the source folder (or to the prepared one, see `mouth_masks`)."""
+    """One usable frame: its files, relative to the source folder (or to the prepared one, see `Manifest`)."""
 
     name: str  # stem of the image
     image: str
@@ -34,6 +34,7 @@ class FrameRecord:
 @dataclass(frozen=True)
 class Manifest:
     name: str
+    format: str  # whose layout the tracked folder has
     source: str  # absolute path of the tracked folder
     tracking: str  # absolute path of the folder of tracking files
     width: int  # pixels
@@ -47,7 +48,8 @@ class Manifest:
     test: tuple[int, ...]
     left_out: dict[str, str]  # image name -> reason
     notes: tuple[str, ...]  # what was assumed or found, one sentence each
-    mouth_masks: str  # "source", "derived" (in the prepared folder) or "none"
+    head_masks: str  # "source", "derived" (in the prepared folder) or "none"
+    mouth_masks: str  # the same
     head_path: str  # absolute path of the head model
     head_fingerprint: str
     input_hash: str  # of names, sizes and times of the inputs, and the options: decides whether to prepare again
@@ -85,6 +87,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
     count = len(frames)
     manifest = Manifest(
         name=_of(raw, "name", str),
+        format=_of(raw, "format", str),
         source=_of(raw, "source", str),
         tracking=_of(raw, "tracking", str),
         width=_of(raw, "width", int),
@@ -98,6 +101,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         test=_indices(raw, "test", count),
         left_out={str(k): str(v) for k, v in _of(raw, "left_out", dict).items()},
         notes=tuple(str(note) for note in _of(raw, "notes", list)),
+        head_masks=_of(raw, "head_masks", str),
         mouth_masks=_of(raw, "mouth_masks", str),
         head_path=_of(raw, "head_path", str),
         head_fingerprint=_of(raw, "head_fingerprint", str),
@@ -108,8 +112,9 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         raise ValueError(f"an image size of {manifest.width}x{manifest.height} is impossible")
     if manifest.fps <= 0 or min(manifest.intrinsics[:2]) <= 0:
         raise ValueError("fps and focal lengths must be positive")
-    if manifest.mouth_masks not in ("source", "derived", "none"):
-        raise ValueError(f"mouth_masks is {manifest.mouth_masks!r}")
+    for masks in (manifest.head_masks, manifest.mouth_masks):
+        if masks not in ("source", "derived", "none"):
+            raise ValueError(f"head_masks or mouth_masks is {masks!r}")
     if set(manifest.train) & set(manifest.test):
         raise ValueError("a frame is in both train and test")
     return manifest

@@ -137,8 +137,10 @@ class Subject:
             # Where the matte has anything: the matte itself would count twice in `Frame.composite`.
             head_mask = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))
         else:
-            head_mask = self._mask(source, record.head_mask, shape, default=255)
-        mouth_mask = self._mask(self._mouth_root(source), record.mouth_mask, shape, default=0)
+            root = self.folder if self.manifest.head_masks == "derived" else source
+            head_mask = self._mask(root, record.head_mask, shape, default=255)
+        root = self.folder if self.manifest.mouth_masks == "derived" else source
+        mouth_mask = self._mask(root, record.mouth_mask, shape, default=0)
         pixels = FramePixels(image, alpha, head_mask, mouth_mask)
         if size is None or size == self.width:
             return pixels
@@ -163,9 +165,6 @@ class Subject:
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of subject {self.name}, which has frames 0 to {len(self) - 1}")
         return index
-
-    def _mouth_root(self, source: Path) -> Path:
-        return self.folder if self.manifest.mouth_masks == "derived" else source
 
     def _mask(self, root: Path, path: str | None, shape: tuple[int, int], default: int) -> np.ndarray:
         if path is None:

@@ -5,11 +5,25 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
-from avatar.data.images import IMAGE_SUFFIXES
+import numpy as np
+
+from avatar.data.images import IMAGE_SUFFIXES, decode_mask
 from avatar.errors import UserError, refuse
+
+
+class KindNames(NamedTuple):
+    """Where a layout has its masks, for messages."""
+
+    alphas: str = "alpha/"
+    head_masks: str = "parsing/*_neckhead.png"
+    mouth_masks: str = "parsing/*_mouth.png"
+
+
+_NUMBERED_NAMES = KindNames()
 
 
 @dataclass(frozen=True)
@@ -22,6 +36,10 @@ class FrameFiles:
     head_masks: dict[int, Path]
     mouth_masks: dict[int, Path]
     tracking: dict[int, Path]
+    parsing: dict[int, Path] = field(default_factory=dict)  # class maps that stand in for head and mouth masks
+    decode_parsing: Callable[[bytes, Path], np.ndarray] = decode_mask  # to the classes of `face_parsing`
+    listings: tuple[Path, ...] = ()  # files that say which image and which tracking belong together
+    names: KindNames = _NUMBERED_NAMES
 
     def of_kind(self) -> dict[str, dict[int, Path]]:
         """By the name that a person knows each kind by."""
@@ -32,6 +50,13 @@ class FrameFiles:
             "parsing *_mouth": self.mouth_masks,
             "checkpoint": self.tracking,
         }
+
+    def frame_names(self) -> dict[int, str]:
+        """The images' stems; with their folders where images lie in several, as the same stem may come twice."""
+        if len({path.parent for path in self.images.values()}) == 1:
+            return {number: path.stem for number, path in self.images.items()}
+        inside = {number: path.relative_to(self.folder) for number, path in self.images.items()}
+        return {number: "_".join(path.with_suffix("").parts) for number, path in inside.items()}
 
 
 def find_frame_files(

@@ -18,8 +18,9 @@ import numpy as np
 
 from avatar.data.images import read_mask
 from avatar.data_prep.image_motion import motion_residuals
-from avatar.data_prep.metrical_tracker import FrameTrack
+from avatar.data_prep.overlap import MIN_OVERLAP, mean_overlap
 from avatar.data_prep.projection import filled_lips, project_head, region_faces, silhouette
+from avatar.data_prep.tracking import FrameTrack
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
 
@@ -28,7 +29,6 @@ SAMPLED_FRAMES = 120
 RASTER_WIDTH = 256  # pixels; the features are sub-pixel, more resolution does not help
 MIN_COMMON_FRAMES = 6
 MIN_T = 3.0  # paired differences, best against every other offset
-MIN_OVERLAP = 0.3  # below, the tracking is not of this video or not of this head model
 _RIDGE = 4.0  # pseudo-frames that say "no pose-dependent misfit"
 _CLIP = 9.0  # squared, in units of the best offset's own misfit: one bad mask must not decide
 _MASK_ON = 127
@@ -98,8 +98,8 @@ def detect_offset(
         moving = motion_residuals(head, tracks, intrinsics, images, candidates, sampled, (width, height))
         best, runner_up, t = _decide(_misfits(_joined(residuals, moving)))
 
-    head_overlap = _mean_overlap(bodies, head_masks, best) if head_masks else None
-    mouth_overlap = _mean_overlap(mouths, mouth_masks, best) if use_mouth else None
+    head_overlap = mean_overlap(bodies, head_masks, best) if head_masks else None
+    mouth_overlap = mean_overlap(mouths, mouth_masks, best) if use_mouth else None
     estimate = OffsetEstimate(best, t, runner_up, head_overlap, mouth_overlap, len(sampled), used_images)
     overlaps = [value for value in (head_overlap, mouth_overlap) if value is not None]
     if overlaps and max(overlaps) < MIN_OVERLAP:
@@ -262,18 +262,3 @@ def _standard_errors(gain: np.ndarray) -> float:
     r = min(max(r, 0.0), 0.9)
     independent = len(gain) * (1 - r) / (1 + r)
     return float(gain.mean() / np.sqrt(variance / independent + 1e-12))
-
-
-def _mean_overlap(projected: Mapping[int, np.ndarray | None], masks: Mapping[int, Path], offset: int) -> float:
-    """Mean IoU of projected and observed masks; frames where both are empty do not count."""
-    values = []
-    for number, mask in projected.items():
-        if mask is None or number + offset not in masks:
-            continue
-        height, width = mask.shape
-        observed = read_mask(masks[number + offset]) > _MASK_ON
-        observed = cv2.resize(observed.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        union = int((mask | observed).sum())
-        if union:
-            values.append(int((mask & observed).sum()) / union)
-    return float(np.mean(values)) if values else 0.0

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from avatar.data.images import read_image
-from avatar.data_prep.metrical_tracker import FrameTrack
 from avatar.data_prep.projection import project_head
+from avatar.data_prep.tracking import FrameTrack
 from avatar.head.model import HeadModel
 
 _EYELID_MOVES = 0.5  # of the largest displacement of the eyelid's blendshape

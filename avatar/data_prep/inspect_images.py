@@ -44,7 +44,8 @@ def inspect_images(files: FrameFiles) -> Inspection:
     sizes = {n: seen.size for n, seen in images.items() if seen.problem is None}
     if not sizes:
         raise UserError(
-            f"none of the {len(images)} images in {files.folder / 'imgs'} can be read: {next(iter(bad.values()))}"
+            f"none of the {len(images)} images in {next(iter(files.images.values())).parent} can be read: "
+            f"{next(iter(bad.values()))}"
         )
     first = next(iter(sizes))
     for number, size in sizes.items():
@@ -54,11 +55,16 @@ def inspect_images(files: FrameFiles) -> Inspection:
                 "all frames must have one size"
             )
     digests = {n: [seen.digest] for n, seen in images.items()}
-    kinds = {"alpha": files.alphas, "head mask": files.head_masks, "mouth mask": files.mouth_masks}
-    for kind, paths in kinds.items():
+    kinds = {
+        "alpha": (files.alphas, decode_mask),
+        "head mask": (files.head_masks, decode_mask),
+        "mouth mask": (files.mouth_masks, decode_mask),
+        "face parsing": (files.parsing, files.decode_parsing),
+    }
+    for kind, (paths, decode) in kinds.items():
         if not paths:
             continue
-        masks = _look_at({n: p for n, p in paths.items() if n in files.images}, decode_mask)
+        masks = _look_at({n: p for n, p in paths.items() if n in files.images}, decode)
         for number, seen in masks.items():
             digests[number].append(seen.digest)
             if seen.problem is not None:
@@ -68,10 +74,10 @@ def inspect_images(files: FrameFiles) -> Inspection:
                     f"{paths[number]} is {_x(seen.size)} pixels but the images are {_x(sizes[first])}; "
                     "make the masks at the size of the images"
                 )
-            elif kind == "head mask" and seen.maximum == 0:
+            elif kind in ("head mask", "face parsing") and seen.maximum == 0:
                 bad.setdefault(number, f"{paths[number].name} is empty: no head was found")
         brightest = max((seen.maximum for seen in masks.values()), default=255)
-        if brightest == 1:
+        if brightest == 1 and kind != "face parsing":
             raise UserError(
                 f"the {kind} files in {next(iter(paths.values())).parent} hold 0 and 1; multiply them by 255"
             )

@@ -10,7 +10,7 @@ import numpy as np
 from avatar.data_prep.frame_files import FrameFiles, describe_numbers, gaps
 from avatar.data_prep.frame_offset import RADIUS
 from avatar.data_prep.inspect_images import Inspection
-from avatar.data_prep.metrical_tracker import Tracking
+from avatar.data_prep.tracking import Tracking
 from avatar.errors import UserError
 
 MAX_BAD_FRACTION = 0.05

@@ -2,41 +2,36 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from safetensors.numpy import save_file
 
-from avatar.data.manifest import (
-    MANIFEST_FILE,
-    MANIFEST_VERSION,
-    TRACKS_FILE,
-    FrameRecord,
-    Manifest,
-    read_manifest,
-)
-from avatar.data.split import DEFAULT_SIZES, SplitSizes, split_frames
-from avatar.data_prep.frame_files import FrameFiles, find_frame_files
+from avatar.data.images import read_bytes
+from avatar.data.manifest import MANIFEST_VERSION, FrameRecord, Manifest
+from avatar.data.split import DEFAULT_SIZES, Split, SplitSizes, split_frames
+from avatar.data_prep.face_parsing import HEAD, MOUTH, mask_of
+from avatar.data_prep.formats import open_tracked_folder
+from avatar.data_prep.frame_files import FrameFiles
 from avatar.data_prep.frame_offset import detect_offset
 from avatar.data_prep.inspect_images import Inspection, composited_background, inspect_images
-from avatar.data_prep.metrical_tracker import FrameTrack, Tracking, neck_identity, read_tracking
+from avatar.data_prep.overlap import confirm_pairing
 from avatar.data_prep.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from avatar.data_prep.projection import filled_lips, project_head, region_faces
+from avatar.data_prep.tracked_folder import TrackedFolder
+from avatar.data_prep.tracking import Tracking, fit_coefficients
+from avatar.data_prep.write_prepared import is_current, write_prepared
 from avatar.errors import UserError
-from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
+from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 
-DEFAULT_FPS = 25.0  # of FlashAvatar's protocol; the layout does not record it
-MOUTH_FOLDER = "mouth"
+DEFAULT_FPS = 25.0  # of FlashAvatar's protocol; the layouts do not record it
+HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
 
 
 def prepare(
@@ -46,6 +41,7 @@ def prepare(
     *,
     tracking: Path | str | None = None,
     frame_offset: int | None = None,
+    format: str | None = None,
     out: Path | str | None = None,
     split: SplitSizes | None = None,
     fps: float = DEFAULT_FPS,
@@ -53,55 +49,60 @@ def prepare(
 ) -> Path:
     """Prepare a tracked folder and return the prepared subject's folder; nothing is done when it is up to date.
 
-    `out` defaults to a folder in the cache (see `cache_folder`). `say` receives one sentence per finding. Raises UserError
-    with the file or frame and what to do when the folder cannot be used.
+    `out` defaults to a folder in the cache (see `cache_folder`), `format` to what the files look like (see `formats`).
+    `say` receives one sentence per finding. Raises UserError with the file or frame and what to do when the folder cannot
+    be used.
     """
     folder, split = Path(folder).resolve(), split or DEFAULT_SIZES
-    files = find_frame_files(folder, None if tracking is None else Path(tracking).resolve())
+    source = open_tracked_folder(folder, None if tracking is None else Path(tracking).resolve(), format)
+    files = source.files
     if not (np.isfinite(fps) and fps > 0):
         raise UserError(f"fps must be positive, not {fps}")
-    options = {"offset": frame_offset, "split": list(split), "fps": fps, "head": head.fingerprint}
+    options = {
+        "offset": frame_offset,
+        "format": source.format,
+        "split": list(split),
+        "fps": fps,
+        "head": head.fingerprint,
+    }
     input_hash = _input_hash(files, options)
     target = Path(out).resolve() if out is not None else _default_location(files, options)
-    if _is_current(target, input_hash, is_chosen=out is not None):
+    if is_current(target, input_hash, is_chosen=out is not None):
         say(f"using the prepared subject {target}")
         return target
 
+    say(f"format: {source.format}")
     inspection = inspect_images(files)
     refuse_if_many(inspection.bad, len(files.images), "images")
-    tracks = read_tracking(files.tracking)
+    tracks = source.read(head, (inspection.width, inspection.height))
     refuse_if_many(tracks.bad, len(files.tracking), "tracking files")
+    tracks = fit_coefficients(tracks, head)
     first = next(iter(tracks.frames.values()))
     if first.size != (inspection.width, inspection.height):
         raise UserError(
-            f"the tracking was made on {first.size[0]}x{first.size[1]} images, but those in {folder / 'imgs'} are "
-            f"{inspection.width}x{inspection.height}; resize the images or track them again"
+            f"the tracking was made on {first.size[0]}x{first.size[1]} images, but those in "
+            f"{next(iter(files.images.values())).parent} are {inspection.width}x{inspection.height}; resize the images "
+            "or track them again"
         )
-    notes = list(tracks.notes)
-    coefficients = fitted_coefficients(tracks, head, notes)
-    model = HeadModel(head, torch.from_numpy(coefficients["shape"]))
-    if frame_offset is None:
-        images, heads, mouths = (
-            {n: path for n, path in found.items() if n not in inspection.bad}
-            for found in (files.images, files.head_masks or files.alphas, files.mouth_masks)
-        )
-        estimate = detect_offset(model, tracks.frames, first.intrinsics, images, heads, mouths)
-        offset, evidence = estimate.offset, estimate.sentence()
-    else:
-        offset, evidence = frame_offset, f"image offset {frame_offset}, given with --frame-offset"
+    model = HeadModel(head, torch.from_numpy(first.shape))
+    offset, evidence = _pair(source, model, tracks, inspection, frame_offset)
     say(evidence)
     pairing = pair_frames(files, inspection, tracks, offset, model.neutral_vertices().mean(0).numpy())
-    notes += pairing.notes + _assumptions(files, inspection, has_lips=len(region_faces(model, "lips")) > 0)
+    has_lips = len(region_faces(model, "lips")) > 0
+    frames_split, split_notes = _split(source, pairing, split)
+    notes = [*source.notes, *tracks.notes, *pairing.notes, *_assumptions(files, inspection, has_lips), *split_notes]
     for note in notes:
         say(f"note: {note}")
     if pairing.left_out:
         total = len(pairing.pairs) + len(pairing.left_out)
         say(f"warning: left out {len(pairing.left_out)} of {total} frames: {describe_reasons(pairing.left_out)}")
-    frames_split = split_frames(len(pairing.pairs), split)
-    arrays = _stack_tracks(tracks, pairing, coefficients)
-    mouth_kind = "source" if files.mouth_masks else "derived" if len(region_faces(model, "lips")) else "none"
+    arrays = _stack_tracks(tracks, pairing)
+    names = files.frame_names()
+    head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
+    mouth_kind = "source" if files.mouth_masks else "derived" if files.parsing or has_lips else "none"
     manifest = Manifest(
         name=folder.name,
+        format=source.format,
         source=str(folder),
         tracking=str(next(iter(files.tracking.values())).parent),
         width=inspection.width,
@@ -110,18 +111,21 @@ def prepare(
         intrinsics=tuple(first.intrinsics.tolist()),
         frame_offset=offset,
         offset_evidence=evidence,
-        frames=_records(files, pairing, mouth_kind),
+        frames=_records(files, names, pairing, head_kind, mouth_kind),
         train=frames_split.train,
         test=frames_split.test,
-        left_out={files.images[n].stem: reason for n, reason in pairing.left_out.items()},
+        left_out={names[n]: reason for n, reason in pairing.left_out.items()},
         notes=tuple(notes),
+        head_masks=head_kind,
         mouth_masks=mouth_kind,
         head_path=str(Path(head_path).resolve()),
         head_fingerprint=head.fingerprint,
         input_hash=input_hash,
         data_hash=_data_hash(inspection, pairing, arrays, first.intrinsics),
     )
-    _write(target, manifest, arrays, model, tracks, pairing)
+    write_prepared(
+        target, manifest, arrays, lambda building: _write_masks(building, manifest, files, model, tracks, pairing)
+    )
     say(f"prepared {len(manifest.frames)} frames ({len(manifest.train)} train, {len(manifest.test)} test) in {target}")
     return target
 
@@ -142,99 +146,139 @@ def _input_hash(files: FrameFiles, options: dict[str, object]) -> str:
     digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), options]).encode())
     for kind, found in files.of_kind().items():
         for number, path in found.items():
-            status = path.stat()
-            digest.update(
-                f"{kind} {number} {path} {status.st_size} {status.st_mtime_ns}\n".encode(errors="surrogateescape")
-            )
+            digest.update(f"{kind} {number} {path} {_stamp(path)}\n".encode(errors="surrogateescape"))
+    for path in (*files.listings, *files.parsing.values()):
+        digest.update(f"{path} {_stamp(path)}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
 
-def _is_current(target: Path, input_hash: str, is_chosen: bool) -> bool:
-    """Whether `target` was prepared from these inputs. A chosen folder that is something else is never overwritten."""
+def _stamp(path: Path) -> str:
+    """Size and time, by which a change is noticed; a file that is named but not there is noticed when it comes."""
     try:
-        names = {path.name for path in target.iterdir()}
-    except FileNotFoundError:
-        return False
-    except NotADirectoryError:
-        names = {target.name} if target.exists() else set()
-    if MANIFEST_FILE not in names:
-        if is_chosen and names:
-            raise UserError(f"{target} exists and is not a prepared subject; choose another --out")
-        return False
-    try:
-        return read_manifest(target).input_hash == input_hash and (target / TRACKS_FILE).is_file()
-    except UserError:
-        return False
+        status = path.stat()
+    except OSError:
+        return "missing"
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
-def fitted_coefficients(tracks: Tracking, head: HeadAssets, notes: list[str]) -> dict[str, np.ndarray]:
-    """Identity [300] of the first frame and expressions [n, E] of all, fitted to the head model's number of directions."""
-    expression = np.stack([track.expression for track in tracks.frames.values()])
-    shape = next(iter(tracks.frames.values())).shape[None]
-    return {
-        "shape": _fitted(shape, IDENTITY_COEFFICIENTS, "identity", notes)[0],
-        "expression": _fitted(expression, head.num_expressions, "expression", notes),
-    }
-
-
-def _fitted(values: np.ndarray, count: int, what: str, notes: list[str]) -> np.ndarray:
-    have = values.shape[1]
-    if values[:, count:].any():
-        raise UserError(
-            f"the tracking has {have} {what} coefficients but the head model has {count} {what} directions; give --head "
-            "the model that the tracking was made with"
+def _pair(
+    source: TrackedFolder, model: HeadModel, tracks: Tracking, inspection: Inspection, given: int | None
+) -> tuple[int, str]:
+    """The offset (image number - tracking number) and a sentence on how it was found."""
+    images, heads, mouths = (
+        {n: path for n, path in found.items() if n not in inspection.bad}
+        for found in (source.files.images, source.files.head_masks or source.files.alphas, source.files.mouth_masks)
+    )
+    first = next(iter(tracks.frames.values()))
+    if source.is_paired:
+        if given:
+            raise UserError(
+                f"--frame-offset {given}: {source.files.listings[0].name} itself says which image belongs to which "
+                "tracking; leave it out, or give 0 to go on where head and masks do not overlap"
+            )
+        witness = (
+            "--frame-offset 0: not confirmed"
+            if given is not None
+            else confirm_pairing(model, tracks.frames, first.intrinsics, heads)
         )
-    if have != count:
-        notes.append(f"the tracking has {have} {what} coefficients, the head model {count}; the missing ones are zero")
-    return np.pad(values[:, :count], ((0, 0), (0, max(0, count - have)))).astype(np.float32)
+        return 0, f"images and tracking are paired by {source.files.listings[0].name}: {witness}"
+    if given is not None:
+        return given, f"image offset {given}, given with --frame-offset"
+    estimate = detect_offset(model, tracks.frames, first.intrinsics, images, heads, mouths)
+    return estimate.offset, estimate.sentence()
+
+
+def _split(source: TrackedFolder, pairing: Pairing, sizes: SplitSizes) -> tuple[Split, list[str]]:
+    """The folder's own division where it has one and no sizes are asked for, else the rule of `split_frames`."""
+    of_pair = [source.division.get(number) for _, number in pairing.pairs]
+    listed = Split(*(tuple(i for i, part in enumerate(of_pair) if part == name) for name in ("train", "test")))
+    if not any(of_pair) or sizes != DEFAULT_SIZES:
+        return split_frames(len(pairing.pairs), sizes), []
+    if not listed.train or not listed.test:
+        lacking = "test" if listed.train else "training"
+        return split_frames(len(pairing.pairs), sizes), [
+            f"the folder names no {lacking} frames: its last ones are tested"
+        ]
+    left = len(of_pair) - len(listed.train) - len(listed.test)
+    unused = f" ({left} of validation are not used)" if left else ""
+    return listed, [f"the folder's own division into training and test frames is kept{unused}"]
 
 
 def _assumptions(files: FrameFiles, inspection: Inspection, has_lips: bool) -> list[str]:
     notes = []
     if not files.alphas:
-        notes.append("there is no alpha/: the whole image is taken as foreground")
-    if not files.head_masks:
+        notes.append(f"there is no {files.names.alphas}: the whole image is taken as foreground")
+    if not files.head_masks and not files.parsing:
         taken = "the foreground matte" if files.alphas else "the whole image"
-        notes.append(f"there are no parsing/*_neckhead.png: {taken} is taken as the head")
-    if not files.mouth_masks:
+        notes.append(f"there are no {files.names.head_masks}: {taken} is taken as the head")
+    if not files.mouth_masks and not files.parsing:
         made = "masks of the projected lips are made" if has_lips else "the head model has no lips, so no mouth weight"
-        notes.append(f"there are no parsing/*_mouth.png: {made}")
+        notes.append(f"there are no {files.names.mouth_masks}: {made}")
     colour = composited_background(files, inspection.bad) if files.alphas else None
     if colour is not None:
         notes.append(
-            f"the images seem to be composited on {colour} already: compositing them again with alpha/ squares the matte "
-            "at the edges"
+            f"the images seem to be composited on {colour} already: compositing them again with their matte squares it at "
+            "the edges"
         )
     return notes
 
 
-def _stack_tracks(tracks: Tracking, pairing: Pairing, coefficients: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    row = {number: i for i, number in enumerate(tracks.frames)}
-    used: list[FrameTrack] = [tracks.frames[number] for _, number in pairing.pairs]
-    arrays = {name: np.stack([getattr(t, name) for t in used]) for name in ("jaw", "eyes", "eyelids", "R", "t")}
-    arrays["expression"] = coefficients["expression"][[row[number] for _, number in pairing.pairs]]
-    arrays["neck"] = neck_identity(len(used))
-    arrays["shape"] = coefficients["shape"]
+def _stack_tracks(tracks: Tracking, pairing: Pairing) -> dict[str, np.ndarray]:
+    used = [tracks.frames[number] for _, number in pairing.pairs]
+    moving = ("expression", "jaw", "eyes", "eyelids", "neck", "R", "t")
+    arrays = {name: np.stack([getattr(track, name) for track in used]) for name in moving}
+    arrays["shape"] = used[0].shape
     return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in sorted(arrays.items())}
 
 
-def _records(files: FrameFiles, pairing: Pairing, mouth_kind: str) -> tuple[FrameRecord, ...]:
+def _records(
+    files: FrameFiles, names: dict[int, str], pairing: Pairing, head_kind: str, mouth_kind: str
+) -> tuple[FrameRecord, ...]:
     def inside(paths: dict[int, Path], number: int) -> str | None:
         return paths[number].relative_to(files.folder).as_posix() if paths else None
 
+    def mask(kind: str, folder: str, paths: dict[int, Path], number: int) -> str | None:
+        return f"{folder}/{names[number]}.png" if kind == "derived" else inside(paths, number)
+
     return tuple(
         FrameRecord(
-            name=files.images[image].stem,
+            name=names[image],
             image=files.images[image].relative_to(files.folder).as_posix(),
             tracking=number,
             alpha=inside(files.alphas, image),
-            head_mask=inside(files.head_masks, image),
-            mouth_mask=f"{MOUTH_FOLDER}/{files.images[image].stem}.png"
-            if mouth_kind == "derived"
-            else inside(files.mouth_masks, image),
+            head_mask=mask(head_kind, HEAD_FOLDER, files.head_masks, image),
+            mouth_mask=mask(mouth_kind, MOUTH_FOLDER, files.mouth_masks, image),
         )
         for image, number in pairing.pairs
     )
+
+
+def _write_masks(
+    building: Path, manifest: Manifest, files: FrameFiles, model: HeadModel, tracks: Tracking, pairing: Pairing
+) -> None:
+    """The masks that the source does not have: from its face parsing, else the projected lips."""
+    for folder, kind in ((HEAD_FOLDER, manifest.head_masks), (MOUTH_FOLDER, manifest.mouth_masks)):
+        if kind == "derived":
+            (building / folder).mkdir()
+    lips = region_faces(model, "lips")
+    size = manifest.width, manifest.height
+    for record, (image, number) in zip(manifest.frames, pairing.pairs, strict=True):
+        classes = None
+        if image in files.parsing:
+            classes = files.decode_parsing(read_bytes(files.parsing[image]), files.parsing[image])
+        if manifest.head_masks == "derived" and classes is not None:
+            _write_mask(building / str(record.head_mask), mask_of(classes, HEAD))
+        if manifest.mouth_masks == "derived":
+            if classes is None:
+                screen = project_head(model, tracks.frames[number], np.array(manifest.intrinsics), *size)
+                _write_mask(building / str(record.mouth_mask), filled_lips(screen, lips, *size) * 255)
+            else:
+                _write_mask(building / str(record.mouth_mask), mask_of(classes, MOUTH))
+
+
+def _write_mask(path: Path, mask: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), mask):
+        raise OSError(None, f"could not write {path.name}")
 
 
 def _data_hash(inspection: Inspection, pairing: Pairing, arrays: dict[str, np.ndarray], intrinsics: np.ndarray) -> str:
@@ -244,54 +288,3 @@ def _data_hash(inspection: Inspection, pairing: Pairing, arrays: dict[str, np.nd
     for image, _ in pairing.pairs:
         digest.update(inspection.digests[image])
     return digest.hexdigest()
-
-
-def _write(
-    target: Path,
-    manifest: Manifest,
-    arrays: dict[str, np.ndarray],
-    model: HeadModel,
-    tracks: Tracking,
-    pairing: Pairing,
-) -> None:
-    """Write beside the target and rename, so that a prepared subject is either whole or not there."""
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    except OSError as error:
-        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another place") from None
-    try:
-        save_file(arrays, building / TRACKS_FILE)
-        if manifest.mouth_masks == "derived":
-            (building / MOUTH_FOLDER).mkdir()
-            lips = region_faces(model, "lips")
-            size = manifest.width, manifest.height
-            for record, (_, number) in zip(manifest.frames, pairing.pairs, strict=True):
-                screen = project_head(model, tracks.frames[number], np.array(manifest.intrinsics), *size)
-                cv2.imwrite(str(building / str(record.mouth_mask)), filled_lips(screen, lips, *size) * 255)
-        (building / MANIFEST_FILE).write_text(manifest.to_json(), encoding="utf-8")
-        building.chmod(0o755)
-        _replace(target, building, manifest.input_hash)
-    except OSError as error:
-        raise UserError(f"the prepared subject cannot be written to {target} ({error.strerror})") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
-
-
-def _replace(target: Path, building: Path, input_hash: str) -> None:
-    """Rename `building` to `target`, moving away what is there; another process may be doing the same."""
-    for attempt in range(100):
-        try:
-            building.rename(target)
-            return
-        except OSError:
-            if attempt == 99:
-                raise
-            if not target.exists():
-                continue  # moved away just now by another process
-        if _is_current(target, input_hash, is_chosen=False):
-            return
-        stale = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-        with contextlib.suppress(FileNotFoundError):
-            target.rename(stale / "old")
-        shutil.rmtree(stale)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 
-from avatar.data_prep.metrical_tracker import FrameTrack, neck_identity
+from avatar.data_prep.tracking import FrameTrack
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
 from avatar.types import Camera, HeadParams
@@ -18,7 +18,7 @@ def head_params(track: FrameTrack) -> HeadParams:
         jaw=torch.from_numpy(track.jaw.astype(np.float32)),
         eyes=torch.from_numpy(track.eyes.astype(np.float32)),
         eyelids=torch.from_numpy(track.eyelids.astype(np.float32)),
-        neck=torch.from_numpy(neck_identity(1)[0]),
+        neck=torch.from_numpy(track.neck.astype(np.float32)),
     )
 
 

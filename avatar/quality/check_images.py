@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data_prep.frame_offset import MIN_OVERLAP
 from avatar.data_prep.inspect_images import composited_background
+from avatar.data_prep.overlap import MIN_OVERLAP
 from avatar.quality.clip import Clip
 from avatar.quality.findings import Finding, frame_names, frames_phrase
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from avatar.data_prep.frame_files import describe_numbers
-from avatar.data_prep.frame_offset import MIN_OVERLAP
+from avatar.data_prep.overlap import MIN_OVERLAP
 from avatar.data_prep.safe_pickle import load_torch_pickle
 from avatar.errors import UserError
 from avatar.quality.clip import Clip

@@ -13,8 +13,8 @@ import torch
 
 from avatar.data_prep.frame_files import FrameFiles, find_frame_files
 from avatar.data_prep.frame_offset import OffsetEstimate, detect_offset
-from avatar.data_prep.metrical_tracker import FrameTrack, Tracking, read_tracking
-from avatar.data_prep.prepare import fitted_coefficients
+from avatar.data_prep.metrical_tracker import read_tracking
+from avatar.data_prep.tracking import FrameTrack, Tracking, fit_coefficients
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
@@ -86,7 +86,8 @@ def read_clip(
     head = None
     if assets is not None and tracks.frames:
         try:
-            head = HeadModel(assets, torch.from_numpy(fitted_coefficients(tracks, assets, [])["shape"]))
+            tracks = fit_coefficients(tracks, assets)
+            head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
         except UserError as error:
             complaints.append(("head-model", str(error)))
     clip = Clip(files, tracks, tuple(complaints), head, frame_offset, GIVEN, None)

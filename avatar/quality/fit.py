@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from avatar.data.images import read_mask
-from avatar.data_prep.metrical_tracker import FrameTrack
 from avatar.data_prep.projection import filled_lips, project_head, region_faces, silhouette
+from avatar.data_prep.tracking import FrameTrack
 from avatar.head.model import HeadModel
 from avatar.quality.view import measured_size
 

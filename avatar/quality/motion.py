@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.data_prep.metrical_tracker import FrameTrack
+from avatar.data_prep.tracking import FrameTrack
 
 
 @dataclass(frozen=True)

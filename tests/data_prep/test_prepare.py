@@ -36,7 +36,7 @@ def test_the_prepared_head_lies_on_the_masks(tmp_path: Path) -> None:
     """Every convention at once: pairing, cameras, 6D rotations, sizes. The renderer of the fixture is the witness."""
     folder = write_tracked_folder(tmp_path / "subject", frames=8, size=80, height=64, offset=2)
     subject, said = prepare_folder(folder, tmp_path / "out", frame_offset=2)
-    assert said[0] == "image offset 2, given with --frame-offset"
+    assert said[:2] == ["format: metrical-tracker", "image offset 2, given with --frame-offset"]
     head = HeadModel(load_head_assets(folder / "head_model"), subject.identity)
     for index in range(len(subject)):
         for size in (None, 40):
@@ -56,7 +56,7 @@ def test_manifest_and_tracks(tmp_path: Path) -> None:
     subject, said = prepare_folder(folder, tmp_path / "out")
     manifest = subject.manifest
     assert (manifest.name, manifest.fps, manifest.width, manifest.height) == ("subject", 25.0, 64, 64)
-    assert manifest.frame_offset == 1 and manifest.offset_evidence == said[0]
+    assert manifest.frame_offset == 1 and manifest.offset_evidence == said[1]
     assert [(f.name, f.tracking) for f in manifest.frames] == [(f"{n + 1:05d}", n) for n in range(15)]
     assert manifest.frames[3].image == "imgs/00004.png" and manifest.frames[3].mouth_mask == "parsing/00004_mouth.png"
     assert subject.split == (tuple(range(12)), tuple(range(12, 15)))
@@ -313,4 +313,4 @@ def test_development_subjects(name: str, count: int, shared_dir: Path, tmp_path:
     subject = Subject.open(prepared)
     assert len(subject) == count and subject.manifest.frame_offset == 1
     assert len(subject.split.test) == count // 5 and subject.manifest.notes == ()
-    assert said[0].startswith("image offset 1 ") and len(said) == 2
+    assert said[1].startswith("image offset 1 ") and len(said) == 3

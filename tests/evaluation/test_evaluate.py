@@ -61,6 +61,7 @@ def subject(tmp_path: Path) -> Subject:
         records.append(FrameRecord(stem, names[0], index, *names[1:]))
     manifest = Manifest(
         name="disc",
+        format="metrical-tracker",
         source=str(source),
         tracking=str(source),
         head_path=str(source),
@@ -75,6 +76,7 @@ def subject(tmp_path: Path) -> Subject:
         test=TEST,
         left_out={},
         notes=(),
+        head_masks="source",
         mouth_masks="source",
         head_fingerprint="ab" * 32,
         input_hash="cd" * 32,

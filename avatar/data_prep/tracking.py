@@ -1,0 +1,150 @@
+"""What every importer makes of its files: one `FrameTrack` per frame, checked, in the conventions of `avatar.types`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.errors import UserError, refuse
+from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
+
+ROTATION_TOLERANCE = 1e-2  # float16 and rounding; larger errors are not a rotation
+INTRINSICS_NOTE, INTRINSICS_ERROR = 1e-3, 5e-2  # relative change of fx, fy, cx, cy within a clip
+
+
+@dataclass(frozen=True)
+class FrameTrack:
+    """One frame's tracking, float64, checked for shape and finiteness; the head's pose is in R and t."""
+
+    expression: np.ndarray  # [E]
+    jaw: np.ndarray  # [6]
+    eyes: np.ndarray  # [12]
+    eyelids: np.ndarray  # [2]
+    neck: np.ndarray  # [6]
+    R: np.ndarray  # [3, 3], a rotation
+    t: np.ndarray  # [3]
+    shape: np.ndarray  # [S]
+    intrinsics: np.ndarray  # [4] = fx, fy, cx, cy in pixels
+    size: tuple[int, int]  # width, height
+    frame_id: int | None = None  # the number that the tracker wrote inside
+
+    def moving_values(self) -> np.ndarray:
+        """All that changes from frame to frame, as one vector."""
+        return np.concatenate((self.expression, self.jaw, self.eyes, self.eyelids, self.neck, self.R.ravel(), self.t))
+
+
+@dataclass(frozen=True)
+class Tracking:
+    frames: dict[int, FrameTrack]  # usable ones by number, increasing
+    bad: dict[int, str]  # why the others are not
+    notes: list[str]  # what the user should know
+    paths: dict[int, Path]
+
+
+class BadFrame(Exception):
+    """One frame cannot be used, and why; the others may be fine."""
+
+
+def checked_tracking(
+    frames: dict[int, FrameTrack],
+    bad: dict[int, str],
+    paths: dict[int, Path],
+    complain: Callable[[str], object] = refuse,
+) -> Tracking:
+    """Move frames with another number of coefficients to `bad`; `complain` of a camera that changes."""
+    frames, bad, notes = dict(frames), dict(bad), []
+    if frames:
+        first = next(iter(frames))
+        for number, frame in list(frames.items()):
+            for field in ("expression", "shape"):
+                here, there = len(getattr(frame, field)), len(getattr(frames[first], field))
+                if here != there:
+                    bad[number] = f"{here} {field} coefficients where {paths[first].name} has {there}"
+                    frames.pop(number, None)
+        _check_camera(frames, paths, notes, complain)
+    return Tracking(frames, dict(sorted(bad.items())), notes, paths)
+
+
+def fit_coefficients(tracking: Tracking, head: HeadAssets) -> Tracking:
+    """The same tracking with as many coefficients as the head model has directions, and one identity, the first's.
+
+    Missing coefficients are zero, further ones are cut where they are zero. Raises UserError where they are not.
+    """
+    notes = list(tracking.notes)
+    expression = np.stack([track.expression for track in tracking.frames.values()])
+    expression = _fitted(expression, head.num_expressions, "expression", notes)
+    shape = _fitted(next(iter(tracking.frames.values())).shape[None], IDENTITY_COEFFICIENTS, "identity", notes)[0]
+    frames = {
+        number: replace(track, expression=row, shape=shape)
+        for (number, track), row in zip(tracking.frames.items(), expression, strict=True)
+    }
+    return replace(tracking, frames=frames, notes=notes)
+
+
+def _fitted(values: np.ndarray, count: int, what: str, notes: list[str]) -> np.ndarray:
+    have = values.shape[1]
+    if values[:, count:].any():
+        raise UserError(
+            f"the tracking has {have} {what} coefficients but the head model has {count} {what} directions; give --head "
+            "the model that the tracking was made with"
+        )
+    if have != count:
+        rest = "the missing ones are zero" if have < count else "the others are zero and left out"
+        notes.append(f"the tracking has {have} {what} coefficients, the head model {count}; {rest}")
+    return np.pad(values[:, :count], ((0, 0), (0, max(0, count - have))))
+
+
+def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
+    """`value` as a float64 vector [count]. Raises BadFrame with `name` when it is not that many finite numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        raise BadFrame(f"{name} is not numbers") from None
+    if array.dtype.kind not in "iuf":
+        raise BadFrame(f"{name} is not numbers")
+    values = array.astype(np.float64).ravel()
+    if count is not None and len(values) != count:
+        raise BadFrame(f"{name} has {len(values)} values, not {count}")
+    if not np.isfinite(values).all():
+        raise BadFrame(f"{name} is not finite ({int((~np.isfinite(values)).sum())} of {len(values)} values)")
+    return values
+
+
+def nearest_rotation(R: np.ndarray, name: str) -> np.ndarray:
+    """The rotation nearest to R; refused when R is further from it than rounding explains."""
+    U, _, Vt = np.linalg.svd(R)
+    nearest = U @ Vt
+    error = float(np.abs(R - nearest).max())
+    if error > ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
+        raise BadFrame(f"{name} is not a rotation (determinant {np.linalg.det(R):.3g}, off by {error:.2g})")
+    return nearest
+
+
+def _check_camera(
+    frames: dict[int, FrameTrack], paths: dict[int, Path], notes: list[str], complain: Callable[[str], object]
+) -> None:
+    first_number, first = next(iter(frames.items()))
+    worst, worst_number = 0.0, first_number
+    for number, frame in frames.items():
+        if frame.size != first.size:
+            complain(
+                f"{paths[number]} was tracked on {frame.size[0]}x{frame.size[1]} images but {paths[first_number].name} "
+                f"on {first.size[0]}x{first.size[1]}; track the whole video at one size"
+            )
+            break
+        change = float(np.abs(frame.intrinsics - first.intrinsics).max() / first.intrinsics[:2].max())
+        if change > worst:
+            worst, worst_number = change, number
+    if worst > INTRINSICS_NOTE:
+        both = " and ".join(
+            f"{paths[n].name} has fx fy cx cy = {' '.join(f'{v:.2f}' for v in frames[n].intrinsics)}"
+            for n in (first_number, worst_number)
+        )
+        if worst > INTRINSICS_ERROR:
+            complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
+        else:
+            notes.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")

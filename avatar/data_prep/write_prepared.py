@@ -1,0 +1,76 @@
+"""The prepared subject's folder: written beside its place and renamed, so that it is either whole or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import save_file
+
+from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_manifest
+from avatar.errors import UserError
+
+
+def is_current(target: Path, input_hash: str, is_chosen: bool) -> bool:
+    """Whether `target` was prepared from these inputs. A chosen folder that is something else is never overwritten."""
+    try:
+        names = {path.name for path in target.iterdir()}
+    except FileNotFoundError:
+        return False
+    except NotADirectoryError:
+        names = {target.name} if target.exists() else set()
+    if MANIFEST_FILE not in names:
+        if is_chosen and names:
+            raise UserError(f"{target} exists and is not a prepared subject; choose another --out")
+        return False
+    try:
+        return read_manifest(target).input_hash == input_hash and (target / TRACKS_FILE).is_file()
+    except UserError:
+        return False
+
+
+def write_prepared(
+    target: Path, manifest: Manifest, arrays: dict[str, np.ndarray], write_masks: Callable[[Path], None]
+) -> None:
+    """Write `target`; `write_masks` puts the derived masks into the folder that it is given.
+
+    Raises UserError when the place cannot be written.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another place") from None
+    try:
+        save_file(arrays, building / TRACKS_FILE)
+        write_masks(building)
+        (building / MANIFEST_FILE).write_text(manifest.to_json(), encoding="utf-8")
+        building.chmod(0o755)
+        _replace(target, building, manifest.input_hash)
+    except OSError as error:
+        raise UserError(f"the prepared subject cannot be written to {target} ({error.strerror})") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
+def _replace(target: Path, building: Path, input_hash: str) -> None:
+    """Rename `building` to `target`, moving away what is there; another process may be doing the same."""
+    for attempt in range(100):
+        try:
+            building.rename(target)
+            return
+        except OSError:
+            if attempt == 99:
+                raise
+            if not target.exists():
+                continue  # moved away just now by another process
+        if is_current(target, input_hash, is_chosen=False):
+            return
+        stale = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
+        with contextlib.suppress(FileNotFoundError):
+            target.rename(stale / "old")
+        shutil.rmtree(stale)

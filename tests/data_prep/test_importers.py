@@ -1,0 +1,341 @@
+"""Every format of tracked folder gives the same subject: the same pictures, masks, meshes in the image, and split."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from exports import write_imavatar, write_insta, write_vhap
+from tracked_folder import write_tracked_folder
+
+from avatar.data.split import SplitSizes
+from avatar.data.subject import Subject
+from avatar.data_prep.prepare import prepare
+from avatar.errors import UserError
+from avatar.head.assets import load_head_assets
+from avatar.head.model import HeadModel
+from avatar.head.rasterize import rasterize_mesh
+
+FRAMES, SIZE, HEIGHT = 24, 64, 56
+PIXELS = 1e-3  # of the projected vertices; the parameters are float32
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small tracked folder without eyelids, which the other formats do not have."""
+    folder = tmp_path_factory.mktemp("formats") / "someone"
+    write_tracked_folder(folder, FRAMES, SIZE, height=HEIGHT, suffix=".png")
+    for path in (folder / "checkpoint").iterdir():
+        content = torch.load(path, weights_only=False)
+        content["flame"]["eyelids"][:] = 0
+        torch.save(content, path)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def original(tracked: Path, tmp_path_factory: pytest.TempPathFactory) -> Subject:
+    return import_folder(tracked, tracked, tmp_path_factory.mktemp("prepared") / "out")[0]
+
+
+def import_folder(folder: Path, tracked: Path, out: Path, **options) -> tuple[Subject, list[str]]:
+    said: list[str] = []
+    head = load_head_assets(tracked / "head_model")
+    prepared = prepare(folder, head, tracked / "head_model", out=out, say=said.append, **options)
+    return Subject.open(prepared), said
+
+
+def assert_same_pictures(subject: Subject, original: Subject, tracked: Path) -> None:
+    assets = load_head_assets(tracked / "head_model")
+    assert len(subject) == len(original)
+    heads = [HeadModel(assets, s.identity) for s in (subject, original)]
+    for index in range(len(subject)):
+        frames = subject.frame(index), original.frame(index)
+        mine, theirs = (
+            frame.camera.project(head.vertices(frame.params)) for head, frame in zip(heads, frames, strict=True)
+        )
+        torch.testing.assert_close(mine[:, :2], theirs[:, :2], atol=PIXELS, rtol=0)
+        torch.testing.assert_close(mine[:, 2], theirs[:, 2], atol=1e-5, rtol=0)
+        ids = [rasterize_mesh(v.numpy(), assets.faces.numpy(), HEIGHT, SIZE).face_id for v in (mine, theirs)]
+        assert np.mean(ids[0] == ids[1]) > 0.998
+        assert torch.equal(frames[0].image, frames[1].image)
+
+
+def test_vhap(tracked: Path, original: Subject, tmp_path: Path) -> None:
+    folder = write_vhap(tracked, tmp_path / "vhap")
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert said[0] == "format: VHAP" and subject.manifest.format == "VHAP"
+    assert said[1].startswith("images and tracking are paired by transforms_train.json: head overlap 1.000")
+    assert_same_pictures(subject, original, tracked)
+    assert all(torch.equal(subject.frame(i).alpha, original.frame(i).head_mask) for i in range(FRAMES))
+    assert subject.split == (tuple(range(16)), tuple(range(18, FRAMES)))
+    assert (
+        "note: the folder's own division into training and test frames is kept (2 of validation are not used)" in said
+    )
+    assert (
+        "note: the tracking has 100 expression coefficients, the head model 10; the others are zero and left out"
+        in said
+    )
+    assert "note: there are no head masks: the foreground matte is taken as the head" in said
+    assert subject.manifest.frames[3].image == "images/00003_00.png" and not subject.tracks["eyelids"].any()
+
+
+def test_vhap_with_one_listing_an_angle_of_view_and_no_masks(tracked: Path, original: Subject, tmp_path: Path) -> None:
+    folder = write_vhap(tracked, tmp_path / "vhap", divided=False, angle=True, masks=False)
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert_same_pictures(subject, original, tracked)
+    assert "there are no masks to confirm it with" in said[1]
+    assert "note: there is no fg_masks/: the whole image is taken as foreground" in said
+    assert subject.split == original.split
+
+
+def test_the_neck_is_kept(tracked: Path, tmp_path: Path) -> None:
+    folder = write_vhap(
+        tracked, tmp_path / "vhap", edit=lambda n, v: v["neck_pose"].__setitem__(slice(None), [0.1, 0, 0])
+    )
+    subject, _ = import_folder(folder, tracked, tmp_path / "out")
+    expected = torch.from_numpy(cv2.Rodrigues(np.array([0.1, 0, 0]))[0][:2].ravel()).float()
+    torch.testing.assert_close(subject.tracks["neck"], expected.expand(FRAMES, 6), atol=1e-6, rtol=0)
+
+
+def test_the_frontal_one_of_several_cameras_is_used(tracked: Path, original: Subject, tmp_path: Path) -> None:
+    folder = write_vhap(tracked, tmp_path / "vhap", divided=False, camera="front")
+    listing = json.loads((folder / "transforms.json").read_text())
+    aside = np.array(listing["frames"][0]["transform_matrix"])
+    aside[:3, :3] = cv2.Rodrigues(np.array([0, 1.2, 0]))[0] @ aside[:3, :3]
+    listing["frames"] += [
+        entry | {"camera_id": "aside", "transform_matrix": aside.tolist(), "file_path": f"images/{i:05d}_01.png"}
+        for i, entry in enumerate(listing["frames"])
+    ]
+    (folder / "transforms.json").write_text(json.dumps(listing))
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert_same_pictures(subject, original, tracked)
+    assert "note: the folder has 2 cameras; camera front, which sees the face most from the front, is used" in said
+
+
+@pytest.mark.parametrize(("old_intrinsics", "subfolders"), [(False, False), (True, False), (False, True)])
+def test_imavatar(old_intrinsics: bool, subfolders: bool, tracked: Path, original: Subject, tmp_path: Path) -> None:
+    folder = write_imavatar(tracked, tmp_path / "ima", old_intrinsics=old_intrinsics, subfolders=subfolders)
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert said[0] == "format: IMavatar"
+    if subfolders:
+        # test/ comes before train/ in the order of the names
+        assert subject.split == (tuple(range(6, FRAMES)), tuple(range(6)))
+        assert [subject.manifest.frames[i].name for i in (0, 6)] == ["test_image_19", "train_image_1"]
+        return
+    assert_same_pictures(subject, original, tracked)
+    assert subject.manifest.head_masks == subject.manifest.mouth_masks == "derived"
+    for index in range(FRAMES):
+        mine, theirs = subject.frame(index), original.frame(index)
+        for kind in ("head_mask", "mouth_mask"):
+            assert torch.equal(getattr(mine, kind), getattr(theirs, kind)), kind
+        assert torch.equal(mine.alpha, theirs.head_mask)
+
+
+@pytest.mark.parametrize("matted", [False, True])
+def test_insta(matted: bool, tracked: Path, original: Subject, tmp_path: Path) -> None:
+    folder = write_insta(tracked, tmp_path / "insta", matted=matted)
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert said[0] == "format: INSTA" and not any("renumbered" in sentence for sentence in said)
+    assert_same_pictures(subject, original, tracked)
+    assert subject.split == (tuple(range(18)), tuple(range(18, FRAMES)))
+    for index in range(FRAMES):
+        mine, theirs = subject.frame(index), original.frame(index)
+        assert torch.equal(mine.alpha, theirs.head_mask)
+        assert torch.equal(mine.head_mask[:-2], theirs.head_mask[:-2]) and not mine.head_mask[-2:].any()
+        assert torch.equal(mine.mouth_mask[:-2], theirs.mouth_mask[:-2])
+
+
+def test_insta_with_its_tracking_elsewhere(tracked: Path, original: Subject, tmp_path: Path) -> None:
+    folder = write_insta(tracked, tmp_path / "insta", checkpoint=False)
+    with pytest.raises(UserError, match=r"checkpoint holds no \.frame files; INSTA's own files lack jaw, eyes"):
+        import_folder(folder, tracked, tmp_path / "out")
+    subject, _ = import_folder(folder, tracked, tmp_path / "out", tracking=tracked)
+    assert_same_pictures(subject, original, tracked)
+
+
+def test_sizes_that_are_asked_for_override_the_division(tracked: Path, tmp_path: Path) -> None:
+    folder = write_vhap(tracked, tmp_path / "vhap")
+    subject, _ = import_folder(folder, tracked, tmp_path / "out", split=SplitSizes(test=3))
+    assert subject.split == (tuple(range(21)), tuple(range(21, 24)))
+
+
+def test_a_format_can_be_asked_for(tracked: Path, tmp_path: Path) -> None:
+    folder = write_insta(tracked, tmp_path / "both")
+    shutil.copytree(tracked / "imgs", folder / "imgs")
+    with pytest.raises(UserError, match="could be a folder of metrical-tracker or INSTA; say which with --format"):
+        import_folder(folder, tracked, tmp_path / "out")
+    for name in ("INSTA", "metrical-tracker"):
+        subject, said = import_folder(folder, tracked, tmp_path / name, format=name)
+        assert said[0] == f"format: {name}" and len(subject) == FRAMES
+    with pytest.raises(UserError, match="is not a folder of VHAP's"):
+        import_folder(folder, tracked, tmp_path / "out", format="VHAP")
+    with pytest.raises(
+        UserError, match="--format must be one of metrical-tracker, VHAP, INSTA, IMavatar, not 'NeRFace'"
+    ):
+        import_folder(folder, tracked, tmp_path / "out", format="NeRFace")
+
+
+def test_prepared_again_when_a_listing_or_a_late_mask_changes_it(tracked: Path, tmp_path: Path) -> None:
+    folder = write_vhap(tracked, tmp_path / "vhap", divided=False)
+    import_folder(folder, tracked, tmp_path / "out")
+    assert import_folder(folder, tracked, tmp_path / "out")[1] == [f"using the prepared subject {tmp_path / 'out'}"]
+    listing = json.loads((folder / "transforms.json").read_text())
+    listing["fl_x"] *= 1.01
+    (folder / "transforms.json").write_text(json.dumps(listing))
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert said[0] == "format: VHAP" and subject.manifest.intrinsics[0] == pytest.approx(2.8 * SIZE * 1.01)
+
+
+Edit = Callable[[dict], object]
+
+
+def edit_frame(**values: object) -> Edit:
+    return lambda listing: listing["frames"][5].update(values)
+
+
+def edit_all(**values: object) -> Edit:
+    return lambda listing: [entry.update(values) for entry in listing["frames"]]
+
+
+NAN = float("nan")
+BAD_LISTINGS: dict[str, tuple[Edit, str]] = {
+    "path up": (
+        edit_frame(file_path="../x.png"),
+        r"file_path of frame 5 is '../x.png', which leaves .*vhap; give",
+    ),
+    "path absolute": (
+        edit_frame(flame_param_path="/etc/passwd"),
+        r"flame_param_path of frame 5 is '/etc/passwd', which",
+    ),
+    "path of Windows": (
+        edit_frame(fg_mask_path="C:\\x.png"),
+        r"fg_mask_path of frame 5 is 'C:\\\\x.png', which leaves",
+    ),
+    "path is a number": (edit_frame(file_path=7), r"transforms.json: file_path of frame 5 is not a path"),
+    "path missing": (edit_frame(file_path=None), r"transforms.json: frame 5 has no file_path"),
+    "parameters missing": (
+        edit_frame(flame_param_path=None),
+        r"frame 5 has no flame_param_path; export the folder again",
+    ),
+    "image twice": (
+        edit_frame(file_path="images/00003_00.png"),
+        r"frames 3 and 5 are both images/00003_00.png; remove",
+    ),
+    "frames is no list": (lambda li: li.update(frames=3), r"transforms.json has no list of at most 200000 frames"),
+    "a frame is no object": (lambda li: li["frames"].append([1]), r"frame 24 is not an object with values"),
+    "focal length not finite": (
+        lambda li: li.update(fl_x=NAN),
+        r"24 of 24 tracking files .*fl_x is not finite \(1 of 1",
+    ),
+    "focal length negative": (lambda li: li.update(fl_x=-100.0), r"focal lengths fl_x and fl_y are not positive"),
+    "no focal length": (lambda li: li.pop("fl_x"), r"camera_angle_x is missing in transforms.json"),
+    "size absurd": (lambda li: li.update(w=1e9), r"w and h are 1e\+09 and 56, which no image is"),
+    "tracked at another size": (
+        lambda li: li.update(w=640, h=560),
+        r"made on 640x560 images, but those in .*images are",
+    ),
+    "pose not finite": (
+        edit_all(transform_matrix=[[NAN] * 4] * 4),
+        r"transform_matrix is not finite \(16 of 16 values\)",
+    ),
+    "pose ragged": (edit_all(transform_matrix=[[1, 2], [3]]), r"transform_matrix is not numbers"),
+    "pose of text": (edit_all(transform_matrix=["1"] * 16), r"transform_matrix is not numbers"),
+    "pose too short": (edit_all(transform_matrix=[1.0] * 12), r"transform_matrix has 12 values, not 16"),
+    "pose scaled": (edit_all(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), r"transform_matrix is not a rotation"),
+    "pose projective": (
+        edit_all(transform_matrix=np.ones((4, 4)).tolist()),
+        r"the last row of transform_matrix is not 0",
+    ),
+    "image missing": (edit_all(file_path="images/a.png"), r"are both images/a.png"),
+    "camera changes": (edit_frame(fl_x=999.0), r"the intrinsics change within the clip"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_LISTINGS)
+def test_bad_listing(name: str, tracked: Path, tmp_path: Path) -> None:
+    edit, sentence = BAD_LISTINGS[name]
+    folder = write_vhap(tracked, tmp_path / "vhap", divided=False)
+    listing = json.loads((folder / "transforms.json").read_text())
+    edit(listing)
+    (folder / "transforms.json").write_text(json.dumps(listing))
+    with pytest.raises(UserError, match=sentence) as error:
+        import_folder(folder, tracked, tmp_path / "out")
+    assert "\n" not in str(error.value) and {path.name for path in tmp_path.iterdir()} == {"vhap"}
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", r"transforms.json cannot be read as JSON"),
+        (b"[" * 100_000, r"transforms.json cannot be read as JSON"),
+        (b'{"frames": [' + b"9" * 5000 + b"]}", r"transforms.json cannot be read as JSON"),
+        (b"\xff\xfe\x00", r"transforms.json cannot be read as JSON"),
+        (b"[]", r"transforms.json has no list of at most"),
+        (
+            json.dumps({"frames": [{"file_path": "a", "expression": [0] * 76, "transform_matrix": []}]}).encode(),
+            r"its `expression` is not FLAME's, as in NeRFace's data; track the video with one of the programs below: ",
+        ),
+        (json.dumps({"frames": [{"file_path": "a"}]}).encode(), r"it has no FLAME parameters of VHAP, INSTA, IMavatar"),
+    ],
+)
+def test_a_file_that_is_no_listing(content: bytes, sentence: str, tracked: Path, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "transforms.json").write_bytes(content)
+    with pytest.raises(UserError, match=sentence):
+        import_folder(tmp_path / "folder", tracked, tmp_path / "out")
+
+
+def test_one_bad_parameter_file_is_left_out_and_two_are_refused(tracked: Path, tmp_path: Path) -> None:
+    def spoil(*numbers: int) -> Callable[[int, dict[str, np.ndarray]], None]:
+        return lambda number, values: values["expr"].fill(np.inf) if number in numbers else None
+
+    subject, said = import_folder(write_vhap(tracked, tmp_path / "one", edit=spoil(4)), tracked, tmp_path / "out")
+    assert subject.manifest.left_out == {"00004_00": "expr is not finite (100 of 100 values)"}
+    assert subject.split.train == tuple(range(15)) and any(s.startswith("warning: left out 1 of 24") for s in said)
+    with pytest.raises(UserError, match=r"2 of 24 tracking files .*00004, 00007 \(expr is not finite \(100 of 100"):
+        import_folder(write_vhap(tracked, tmp_path / "two", edit=spoil(4, 7)), tracked, tmp_path / "out2")
+
+
+def test_pickled_objects_in_a_parameter_file_are_refused(tracked: Path, tmp_path: Path) -> None:
+    folder = write_vhap(tracked, tmp_path / "vhap")
+    for number in (1, 2):
+        np.savez(folder / "flame_param" / f"{number:05d}.npz", expr=np.array([{}], dtype=object))
+    with pytest.raises(UserError, match=r"00001-00002 \(holds pickled Python objects"):
+        import_folder(folder, tracked, tmp_path / "out")
+
+
+def test_more_coefficients_than_directions_are_an_error_unless_zero(tracked: Path, tmp_path: Path) -> None:
+    """In a metrical-tracker folder too, where the masks are compared with the mesh before."""
+    folder = tmp_path / "subject"
+    shutil.copytree(tracked, folder)
+    for file in (folder / "checkpoint").iterdir():
+        content = torch.load(file, weights_only=False)
+        content["flame"]["exp"] = np.pad(content["flame"]["exp"], ((0, 0), (0, 40)))
+        torch.save(content, file)
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert (
+        "note: the tracking has 50 expression coefficients, the head model 10; the others are zero and left out" in said
+    )
+    assert subject.tracks["expression"].shape == (FRAMES, 10)
+    spoiled = write_vhap(tracked, tmp_path / "vhap", edit=lambda n, values: values["expr"].__setitem__((0, 50), 0.5))
+    with pytest.raises(
+        UserError, match="has 100 expression coefficients but the head model has 10 expression directions"
+    ):
+        import_folder(spoiled, tracked, tmp_path / "out2")
+
+
+def test_another_convention_is_noticed_by_the_masks(tracked: Path, tmp_path: Path) -> None:
+    """A camera in OpenCV's axes where OpenGL's belong puts the head behind the camera or beside its masks."""
+    folder = write_vhap(tracked, tmp_path / "vhap", edit=lambda n, values: values["translation"].__iadd__([0.3, 0, 0]))
+    with pytest.raises(UserError, match=r"the tracked head does not lie on the masks \(overlap 0\.[0-2]"):
+        import_folder(folder, tracked, tmp_path / "out")
+    subject, said = import_folder(folder, tracked, tmp_path / "out", frame_offset=0)
+    assert len(subject) == FRAMES and "--frame-offset 0: not confirmed" in said[1]
+    with pytest.raises(UserError, match="--frame-offset 2: transforms_train.json itself says which image"):
+        import_folder(folder, tracked, tmp_path / "out", frame_offset=2)
