@@ -109,6 +109,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     check = commands.add_parser("check", help="say everything that is wrong with a tracked folder, before training")
     add_source(check)
+    check.add_argument(
+        "--out", type=Path, metavar="DIR", help="write a page with pictures and plots, and a table of frames"
+    )
     check.add_argument("--json", action="store_true", help="print the findings as JSON, and nothing else, to stdout")
 
     demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")

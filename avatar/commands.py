@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from argparse import Namespace
 from importlib import import_module
@@ -22,6 +23,7 @@ from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
+from avatar.quality.cost import measure_cost
 from avatar.quality.folder import as_text, check_folder
 from avatar.reenact import Choices
 from avatar.reenact import reenact as drive
@@ -177,6 +179,14 @@ def check(arguments: Namespace) -> int:
         progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False),
     )
     print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))
+    if arguments.out is not None:
+        from avatar.quality.page import write_page  # imports matplotlib, which takes half a second
+
+        cost = None
+        if outcome.clip is not None and outcome.coverage is not None:
+            cost = measure_cost(outcome.clip, outcome.coverage, load_config())
+        page = write_page(outcome, cost, arguments.out)
+        print(f"Page   {page}", file=sys.stderr if arguments.json else sys.stdout)
     return outcome.status
 
 

@@ -11,14 +11,14 @@ from avatar.data.subject import FramePixels, Subject
 from avatar.types import Frame
 
 DEFAULT_CACHE_BYTES = 2**30
-_BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
+BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
 _AHEAD_PER_WORKER = 3
 
 
 def cache_estimate(subject: Subject, size: int | None = None, count: int | None = None) -> int:
     """Bytes that `count` decoded frames (all of them by default) take in the cache."""
     width, height = subject.image_size(size)
-    return width * height * _BYTES_PER_PIXEL * (len(subject) if count is None else count)
+    return width * height * BYTES_PER_PIXEL * (len(subject) if count is None else count)
 
 
 class FrameLoader:

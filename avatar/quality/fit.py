@@ -15,7 +15,7 @@ from avatar.head.model import HeadModel
 from avatar.quality.view import measured_size
 
 _ON = 127
-_CONTOUR_PERCENTILE = 95  # of the distances by which the mesh sticks out: one stray triangle must not decide
+_STICKING_SHARE = 0.05  # whose mean is the overhang: one stray triangle must not decide
 _NECK = ("neck", "boundary")
 
 
@@ -91,7 +91,7 @@ def measure_fit(mesh: Mesh, head: np.ndarray, mouth: np.ndarray | None, scale: f
     return Fit(
         overlap=float((body & head).sum() / max(int((body | head).sum()), 1)),
         inside=float((skin & head).sum() / area),
-        overhang=float(np.percentile(sticking, _CONTOUR_PERCENTILE)) * scale,
+        overhang=float(np.sort(sticking)[-max(1, round(_STICKING_SHARE * len(sticking))) :].mean()) * scale,
         mouth=distance * scale,
         mask_ratio=float(head.sum() / area),
         size=float(np.sqrt(area)) * scale,

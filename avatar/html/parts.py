@@ -1,0 +1,88 @@
+"""What pages are made of: tables, tiles, pictures, plots."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from avatar.html.document import Content, Markup, element
+
+INK, GRID = "#1d2733", "#d9dee5"  # of style.css
+SERIES = ("#2563a8", "#c4572b", "#3d8a5c", "#7a4fa3")  # colours of lines and points, readable by the colour-blind
+
+
+def data_table(head: Sequence[Content], rows: Iterable[Sequence[Content]]) -> Markup:
+    """A table whose cells that are numbers stand to the right."""
+    lines = [element("tr", *(element("td", cell, class_=_kind(cell)) for cell in row)) for row in rows]
+    heading = element("thead", element("tr", *(element("th", cell) for cell in head))) if head else ""
+    return element("div", element("table", heading, element("tbody", *lines)), class_="scroll")
+
+
+def tiles(values: Mapping[str, Content]) -> Markup:
+    """Name and value pairs as a grid of small cards."""
+    return element(
+        "dl",
+        *(element("div", element("dt", name), element("dd", value)) for name, value in values.items()),
+        class_="tiles",
+    )
+
+
+def fold(summary: Content, *content: Content) -> Markup:
+    """Content that opens with a click."""
+    return element("details", element("summary", summary), *content)
+
+
+def picture(
+    image: np.ndarray, caption: Content = None, *, format: Literal["jpeg", "png"] = "jpeg", quality: int = 88
+) -> Markup:
+    """A figure of a uint8 image [H, W, 3] (red first) or [H, W]."""
+    caption_text = element("figcaption", caption) if caption else ""
+    return element("figure", element("img", src=data_uri(image, format, quality), alt=caption or ""), caption_text)
+
+
+def data_uri(image: np.ndarray, format: Literal["jpeg", "png"] = "jpeg", quality: int = 88) -> str:
+    """The image inside a URL. Raises ValueError unless it is uint8 [H, W, 3] or [H, W]."""
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise ValueError(f"the image must be uint8 [H, W] or [H, W, 3], got {image.dtype} {list(image.shape)}")
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if format == "jpeg" else []
+    encoded = cv2.imencode(f".{format}", pixels, options)[1].tobytes()
+    return f"data:image/{format};base64,{base64.b64encode(encoded).decode()}"
+
+
+def figure_of(columns: int = 1, *, width: float = 5.4, height: float = 3.0) -> tuple[Figure, list]:
+    """A matplotlib figure in the page's style with `columns` axes side by side; the sizes are of one of them, in inches."""
+    figure = Figure(figsize=(columns * width, height), layout="constrained")
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    for one in axes:
+        one.grid(color=GRID, linewidth=0.6)
+        one.set_axisbelow(True)
+        one.spines[["top", "right"]].set_visible(False)
+        one.spines[["left", "bottom"]].set_color(GRID)
+        one.tick_params(colors=INK, labelsize=8, length=0)
+        one.xaxis.label.set(color=INK, fontsize=9)
+        one.yaxis.label.set(color=INK, fontsize=9)
+    return figure, list(axes)
+
+
+def plot(figure: Figure, caption: Content = None, alt: str = "plot") -> Markup:
+    """A matplotlib figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=144, facecolor="white")
+    source = f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    caption_text = element("figcaption", caption) if caption else ""
+    return element("figure", element("img", src=source, alt=alt), caption_text, class_="plot")
+
+
+def section(title: str, *content: Content) -> Markup:
+    return element("section", element("h2", title), *content)
+
+
+def _kind(cell: Content) -> str | None:
+    return "number" if isinstance(cell, (int, float)) and not isinstance(cell, bool) else None

@@ -1,0 +1,98 @@
+"""What training on this folder will take, measured on a few steps of the real thing."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from avatar.config import Config
+from avatar.data.images import read_image, read_mask
+from avatar.data.loader import BYTES_PER_PIXEL
+from avatar.data_prep.projection import head_params
+from avatar.model import Avatar
+from avatar.quality.clip import Clip
+from avatar.quality.coverage import Coverage
+from avatar.train.optim import make_optimizer
+from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.types import Camera, Frame
+
+MEASURED_STEPS = 3  # after one that is not counted
+_COPIES = 4  # of every parameter: itself, its gradient, Adam's two moments
+
+
+@dataclass(frozen=True)
+class Cost:
+    gaussians: int
+    parameters: int
+    step_seconds: float  # median, on this machine, with all terms of the loss
+    iterations: int
+    cache_bytes: int  # decoded frames, at most what the configuration allows
+    parameter_bytes: int  # with gradients and the optimizer's state
+
+    def facts(self) -> dict[str, str]:
+        hours, minutes = divmod(round(self.step_seconds * self.iterations / 60), 60)
+        return {
+            "Gaussians": f"{self.gaussians:,}",
+            "one training step on this machine": f"{self.step_seconds:.3f} s ({torch.get_num_threads()} threads)",
+            f"the recipe's {self.iterations:,} steps": f"{hours} h {minutes} min" if hours else f"{minutes} min",
+            "memory for decoded frames": f"{self.cache_bytes / 2**20:,.0f} MiB",
+            "memory for parameters and optimizer": f"{self.parameter_bytes / 2**20:,.0f} MiB",
+        }
+
+
+def measure_cost(clip: Clip, coverage: Coverage, config: Config) -> Cost:
+    """Train an avatar of this head on one of its frames for a few steps, and throw it away."""
+    assert clip.head is not None
+    torch.manual_seed(config.trainer.seed)
+    frame = _frame(clip, coverage.images[coverage.split.train[0]])
+    identity = torch.from_numpy(next(iter(clip.tracking.frames.values())).shape[:300].astype(np.float32))
+    avatar = Avatar(clip.head.assets, identity, config.model)
+    optimizer = make_optimizer(avatar, config.trainer)
+    objective = Objective(
+        config.trainer, torch.tensor(config.data.background), choose_perceptual(config.trainer, lambda _: None)
+    )
+    vertices = clip.head.vertices(frame.params)
+    seconds = []
+    last = config.trainer.iterations - 1  # when all of the loss and of the colour takes part
+    for _ in range(1 + MEASURED_STEPS):
+        begin = time.perf_counter()
+        training_step(avatar, optimizer, objective, last, frame, vertices)
+        seconds.append(time.perf_counter() - begin)
+    height, width = frame.image.shape[:2]
+    parameters = sum(p.numel() for p in avatar.parameters())
+    return Cost(
+        gaussians=len(avatar),
+        parameters=parameters,
+        step_seconds=float(np.median(seconds[1:])),
+        iterations=config.trainer.iterations,
+        cache_bytes=min(width * height * BYTES_PER_PIXEL * len(coverage.images), config.data.cache_mb << 20),
+        parameter_bytes=4 * _COPIES * parameters,
+    )
+
+
+def _frame(clip: Clip, number: int) -> Frame:
+    track = dict(clip.tracked())[number]
+    image = torch.from_numpy(read_image(clip.files.images[number])).float() / 255
+    height, width = image.shape[:2]
+
+    def mask(found: dict, default: float) -> torch.Tensor:
+        if number not in found:
+            return torch.full((height, width), default)
+        return torch.from_numpy(read_mask(found[number])).float() / 255
+
+    R, t = (torch.from_numpy(value).float() for value in (track.R, track.t))
+    fx, fy, cx, cy = track.intrinsics.tolist()
+    files = clip.files
+    return Frame(
+        index=0,
+        name=files.images[number].stem,
+        camera=Camera(R, t, fx, fy, cx, cy, width, height),
+        params=head_params(track),
+        image=image,
+        alpha=mask(files.alphas, 1.0),
+        head_mask=mask(files.head_masks, 1.0),
+        mouth_mask=mask(files.mouth_masks, 0.0),
+    )

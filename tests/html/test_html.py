@@ -1,0 +1,55 @@
+"""Pages: nothing gets in unescaped, nothing is fetched."""
+
+from __future__ import annotations
+
+import base64
+
+import cv2
+import numpy as np
+import pytest
+
+from avatar.html import data_table, document, element, join, picture, tiles
+from avatar.html.parts import data_uri
+
+NASTY = "<script>alert(\"x\")</script> & 'y'"
+SAFE = "&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt; &amp; &#x27;y&#x27;"
+
+
+def test_text_and_attributes_are_escaped_once() -> None:
+    assert element("p", NASTY) == f"<p>{SAFE}</p>"
+    assert element("p", element("b", NASTY)) == f"<p><b>{SAFE}</b></p>"
+    assert element("a", title=NASTY) == f'<a title="{SAFE}"></a>'
+    assert join(("<", element("i", ">"))) == "&lt;<i>&gt;</i>"
+    assert SAFE in tiles({"name": NASTY}) and SAFE in data_table([NASTY], []) and SAFE in data_table([], [[NASTY]])
+    page = document(NASTY, [NASTY])
+    assert "<script>" not in page and page.count(SAFE) == 2
+
+
+def test_attribute_names_and_values() -> None:
+    assert element("img", src="x", hidden=True, alt=None, draggable=False) == '<img src="x" hidden>'
+    assert element("input", class_="a", data_index=3) == '<input class="a" data-index="3">'
+
+
+def test_numbers_stand_to_the_right() -> None:
+    assert '<td class="number">1.5</td><td>a</td>' in data_table(["x", "y"], [[1.5, "a"]])
+
+
+def test_an_image_comes_back_from_its_url() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    head, _, data = data_uri(image, "png").partition(",")
+    assert head == "data:image/png;base64"
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(decoded[..., ::-1], image)
+    assert data_uri(image).startswith("data:image/jpeg;base64,")
+    assert SAFE in picture(image, NASTY)
+    with pytest.raises(ValueError, match=r"must be uint8 \[H, W\] or \[H, W, 3\], got float64 \[5, 7, 3\]"):
+        data_uri(image / 255)
+
+
+def test_the_policy_forbids_all_but_the_pages_own_script() -> None:
+    assert "default-src &#x27;none&#x27;" in document("t", [])
+    assert "script-src" not in document("t", [])
+    assert "script-src &#x27;sha256-" in document("t", [], "let a = 1 < 2;")
+    assert "let a = 1 < 2;" in document("t", [], "let a = 1 < 2;")
+    with pytest.raises(ValueError, match="must not contain"):
+        document("t", [], "'</SCRIPT>'")
