@@ -84,8 +84,8 @@ class Frame:
 
         Source: FlashAvatar and HyperGaussians, data loading (`img*alpha + bg*(1-alpha)`, then `*mask + bg*(1-mask)`).
         """
-        weight = (self.alpha * self.head_mask)[..., None]
-        return self.image * weight + background * (1.0 - weight)
+        # The weight times (image - background), in one pass; exact where the weight is 0 or 1.
+        return torch.lerp(background, self.image, (self.alpha * self.head_mask)[..., None])
 
 
 class Gaussians(NamedTuple):
