@@ -57,7 +57,7 @@ def test_value_and_gradient_agree_with_float64(rows: slice, columns: slice) -> N
     assert_like_the_oracle(*pair(70, 53), boxed(70, 53, rows, columns))
 
 
-@pytest.mark.parametrize("size", [(11, 11), (11, 12), (12, 11), (13, 64), (31, 17), (65, 33)])
+@pytest.mark.parametrize("size", [(11, 11), (11, 12), (12, 11), (13, 64), (31, 17), (65, 33), (133, 29)])
 def test_odd_sizes(size: tuple[int, int]) -> None:
     assert_like_the_oracle(*pair(*size), torch.rand(size))
 
@@ -89,8 +89,8 @@ def test_an_empty_mask_gives_zero_and_a_zero_gradient() -> None:
 
 
 def test_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    image, target = pair(90, 71)
-    mask = boxed(90, 71, slice(5, 80), slice(9, 71))
+    image, target = pair(210, 71)
+    mask = boxed(210, 71, slice(5, 200), slice(9, 71))
     results = []
     for threads in (1, 2, 5):
         monkeypatch.setenv("AVATAR_THREADS", str(threads))

@@ -27,17 +27,21 @@ constexpr double kGaussian[kTaps] = {
     0.2130055377112537,  0.26601172486179436,  0.2130055377112537,   0.10936068950970002,
     0.03600077212843083, 0.007598758135239185, 0.00102838008447911};
 
-double window_row(const Rows& rows, int row, double* scratch, double* coefficients) {
+double window_row(const Rows& rows, int row, bool with_coefficients) {
     const std::ptrdiff_t stride = rows.stride, part = stride + kPadding;
     const int values = rows.values, windows = values - kReach;
-    double *mean_u = scratch, *mean_v = mean_u + part, *square_u = mean_v + part, *square_v = square_u + part;
+    double *mean_u = rows.scratch, *mean_v = mean_u + part, *square_u = mean_v + part, *square_v = square_u + part;
     double *by_one = square_v + part, *by_u = by_one + part, *by_v = by_u + part;
 
+    const double *us[kTaps], *vs[kTaps];
+    for (int k = 0; k < kTaps; ++k) {
+        us[k] = rows.sum + (row + k) % kTaps * stride;
+        vs[k] = rows.difference + (row + k) % kTaps * stride;
+    }
     for (int i = 0; i < values; i += kLanes) {
         Doubles mu{}, mv{}, uu{}, vv{};
         for (int k = 0; k < kTaps; ++k) {
-            const std::ptrdiff_t at = (row + k) * stride + i;
-            const Doubles u = load(rows.sum + at), v = load(rows.difference + at);
+            const Doubles u = load(us[k] + i), v = load(vs[k] + i);
             const Doubles gu = kGaussian[k] * u, gv = kGaussian[k] * v;
             mu += gu;
             mv += gv;
@@ -69,7 +73,7 @@ double window_row(const Rows& rows, int row, double* scratch, double* coefficien
             total += dissimilarity;
         else
             for (int lane = 0; lane < windows - i; ++lane) rest += dissimilarity[lane];
-        if (coefficients == nullptr) continue;
+        if (!with_coefficients) continue;
         // By the means at fixed mean squares, and by the mean squares; m_u and m_v have the same derivative by x.
         const Doubles by_uu = (a - 1.0) * b * q, by_vv = (1.0 - a) * (2.0 - b) * q;
         store(by_u + kReach + i, by_uu);
@@ -77,9 +81,10 @@ double window_row(const Rows& rows, int row, double* scratch, double* coefficien
         store(by_one + kReach + i, ((2.0 - a) * mv - a * mu) * (1.0 - b) * p - by_uu * mu - by_vv * mv);
     }
     for (int lane = 0; lane < kLanes; ++lane) rest += total[lane];
-    if (coefficients == nullptr) return rest;
+    if (!with_coefficients) return rest;
 
     double* const sources[3] = {by_one, by_u, by_v};
+    double* coefficients = rows.coefficients + row % kTaps * 3 * stride;
     for (int c = 0; c < 3; ++c) {
         // Windows beyond the last one are not: the vectors may have reached over the end.
         for (int i = 0; i < kReach + kLanes; ++i) sources[c][kReach + windows + i] = 0.0;
@@ -92,20 +97,21 @@ double window_row(const Rows& rows, int row, double* scratch, double* coefficien
     return rest;
 }
 
-void gradient_row(const Rows& rows, int row, const double* coefficients, int windows, double* gradient) {
+void gradient_row(const Rows& rows, int row, int first, int last, double* gradient) {
     const std::ptrdiff_t stride = rows.stride;
-    const int first = row < kTaps ? 0 : row - kTaps + 1, last = row < windows ? row : windows - 1;
-    for (int i = 0; i < rows.values; i += kLanes) {
+    const int values = rows.values, count = last - first + 1;
+    const double *us = rows.sum + row % kTaps * stride, *vs = rows.difference + row % kTaps * stride;
+    const double *sources[kTaps], *weights = kGaussian + row - last;
+    for (int k = 0; k < count; ++k) sources[k] = rows.coefficients + (last - k) % kTaps * 3 * stride;
+    for (int i = 0; i < values; i += kLanes) {
         Doubles by_one{}, by_u{}, by_v{};
-        for (int window = first; window <= last; ++window) {
-            const double* source = coefficients + window * 3 * stride + i;
-            const double weight = kGaussian[row - window];
-            by_one += weight * load(source);
-            by_u += weight * load(source + stride);
-            by_v += weight * load(source + 2 * stride);
+        for (int k = 0; k < count; ++k) {
+            const double* source = sources[k] + i;
+            by_one += weights[k] * load(source);
+            by_u += weights[k] * load(source + stride);
+            by_v += weights[k] * load(source + 2 * stride);
         }
-        const Doubles u = load(rows.sum + row * stride + i), v = load(rows.difference + row * stride + i);
-        store(gradient + i, by_one + u * by_u + v * by_v);
+        store(gradient + i, by_one + load(us + i) * by_u + load(vs + i) * by_v);
     }
 }
 

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 #include "instruction_set.h"
@@ -31,7 +30,8 @@ const Kernels& select_kernels(const char* name) {
 
 namespace {
 
-constexpr std::int64_t kGrain = 8;  // rows handed to a thread at a time
+// A thread gets at least so many rows at a time; it computes the kTaps - 1 rows of windows above them once more.
+constexpr int kMinRows = 32;
 
 struct Box {
     int left, top, right, bottom;  // right and bottom not included
@@ -68,63 +68,79 @@ Box windows_box(const Images& images) {
             std::min(box.right + 2 * kRadius, images.width), std::min(box.bottom + 2 * kRadius, images.height)};
 }
 
+// The work on one box, from its top down; rows count from there.
+struct Slide {
+    const Images& images;
+    const Kernels& kernels;
+    Box box;
+    double scale;     // of the gradient
+    float* gradient;  // of the whole frame, may be null
+
+    int values() const { return (box.right - box.left) * kChannels; }
+    int height() const { return box.bottom - box.top; }
+    int windows() const { return height() - 2 * kRadius; }
+
+    // The sums of the windows whose first rows are [begin, end), and the gradient of these rows.
+    void run(int begin, int end, double* row_sums) const {
+        const std::ptrdiff_t stride = values() + kPadding, part = kTaps * stride;
+        std::vector<double> memory(5 * part + 7 * (stride + kPadding)), by_masked(stride);
+        double* const start = memory.data();
+        const Rows rows{values(), stride, start, start + part, start + 2 * part, start + 5 * part};
+        const int above = gradient == nullptr ? begin : std::max(begin - kTaps + 1, 0);
+        int read = above;
+        for (int row = above; row < end; ++row) {
+            if (row < windows()) {
+                while (read < row + kTaps) read_row(rows, read++);
+                const double sum = kernels.window_row(rows, row, gradient != nullptr);
+                if (row >= begin) row_sums[row] = sum;
+            }
+            if (gradient == nullptr || row < begin) continue;
+            const int first = std::max(row - kTaps + 1, 0), last = std::min(row, windows() - 1);
+            kernels.gradient_row(rows, row, first, last, by_masked.data());
+            write_row(by_masked, row);
+        }
+    }
+
+    void read_row(const Rows& rows, int row) const {
+        const std::int64_t first = std::int64_t{box.top + row} * images.width + box.left;
+        const float *x = images.image + first * kChannels, *t = images.target + first * kChannels;
+        double *u = rows.sum + row % kTaps * rows.stride, *v = rows.difference + row % kTaps * rows.stride;
+        for (int i = 0; i < rows.values; i += kChannels) {
+            const double weight = images.mask[first + i / kChannels];
+            for (int c = i; c < i + kChannels; ++c) {
+                u[c] = (double{x[c]} + double{t[c]}) * weight;
+                v[c] = (double{x[c]} - double{t[c]}) * weight;
+            }
+        }
+    }
+
+    void write_row(const std::vector<double>& by_masked, int row) const {
+        const std::int64_t first = std::int64_t{box.top + row} * images.width + box.left;
+        float* to = gradient + first * kChannels;
+        for (int i = 0; i < values(); i += kChannels) {
+            const double weight = images.mask[first + i / kChannels] * scale;
+            for (int c = i; c < i + kChannels; ++c) to[c] = static_cast<float>(by_masked[c] * weight);
+        }
+    }
+};
+
 }  // namespace
 
 double dssim(const Images& images, const Kernels& kernels, int threads, float* gradient) {
+    if (gradient != nullptr) std::fill_n(gradient, std::int64_t{images.height} * images.width * kChannels, 0.0f);
     const Box box = windows_box(images);
-    const std::int64_t width = images.width;
-    if (box.empty()) {
-        if (gradient != nullptr) std::fill_n(gradient, images.height * width * kChannels, 0.0f);
-        return 0.0;
-    }
-    const int height = box.bottom - box.top, windows = height - 2 * kRadius;
-    const int values = (box.right - box.left) * kChannels;
-    const std::ptrdiff_t stride = values + kPadding;
-
-    const std::unique_ptr<double[]> sum(new double[height * stride]), difference(new double[height * stride]);
-    const Rows rows{sum.get(), difference.get(), values, stride};
-    parallel_for(threads, height, kGrain, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t y = begin; y < end; ++y) {
-            const std::int64_t first = (box.top + y) * width + box.left;
-            const float *x = images.image + first * kChannels, *t = images.target + first * kChannels;
-            double *u = sum.get() + y * stride, *v = difference.get() + y * stride;
-            for (int i = 0; i < values; ++i) {
-                const double weight = images.mask[first + i / kChannels];
-                u[i] = (double{x[i]} + double{t[i]}) * weight;
-                v[i] = (double{x[i]} - double{t[i]}) * weight;
-            }
-            std::fill(u + values, u + stride, 0.0);
-            std::fill(v + values, v + stride, 0.0);
-        }
-    });
-
-    std::vector<double> row_sums(windows);
-    const std::unique_ptr<double[]> coefficients(gradient == nullptr ? nullptr : new double[windows * 3 * stride]);
-    parallel_for(threads, windows, kGrain, [&](std::int64_t begin, std::int64_t end) {
-        std::vector<double> scratch(7 * (stride + kPadding));
-        for (std::int64_t y = begin; y < end; ++y)
-            row_sums[y] = kernels.window_row(rows, static_cast<int>(y), scratch.data(),
-                                             coefficients ? coefficients.get() + y * 3 * stride : nullptr);
+    if (box.empty()) return 0.0;
+    const double all_windows = double(images.height - 2 * kRadius) * double(images.width - 2 * kRadius);
+    const Slide slide{images, kernels, box, 1.0 / (2.0 * kChannels * all_windows), gradient};
+    std::vector<double> row_sums(slide.windows());
+    const int count = gradient == nullptr ? slide.windows() : slide.height();
+    const int grain = std::max(kMinRows, (count + 2 * threads - 1) / (2 * threads));  // two for each thread, if one is late
+    parallel_for(threads, count, grain, [&](std::int64_t begin, std::int64_t end) {
+        slide.run(static_cast<int>(begin), static_cast<int>(end), row_sums.data());
     });
     double total = 0;
     for (const double row_sum : row_sums) total += row_sum;
-    const double all_windows = double(images.height - 2 * kRadius) * double(images.width - 2 * kRadius);
-    const double scale = 1.0 / (2.0 * kChannels * all_windows);
-    if (gradient == nullptr) return total * scale;
-
-    parallel_for(threads, images.height, kGrain, [&](std::int64_t begin, std::int64_t end) {
-        std::vector<double> by_masked(stride);
-        for (std::int64_t y = begin; y < end; ++y) {
-            float* row = gradient + y * width * kChannels;
-            std::fill_n(row, width * kChannels, 0.0f);
-            if (y < box.top || y >= box.bottom) continue;
-            kernels.gradient_row(rows, static_cast<int>(y) - box.top, coefficients.get(), windows, by_masked.data());
-            const float* mask = images.mask + y * width + box.left;
-            for (int i = 0; i < values; ++i)
-                row[box.left * kChannels + i] = static_cast<float>(by_masked[i] * mask[i / kChannels] * scale);
-        }
-    });
-    return total * scale;
+    return total * slide.scale;
 }
 
 }  // namespace avatar::ssim

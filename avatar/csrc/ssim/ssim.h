@@ -14,21 +14,25 @@ constexpr int kReach = 2 * kRadius * kChannels;  // from a window's first value 
 constexpr int kMaxLanes = 8;                     // rows are padded so that a kernel may read and write whole vectors
 constexpr int kPadding = kReach + 2 * kMaxLanes;
 
-// The rows that the kernels work on: `values` doubles, three a pixel, of `stride` that may be read.
+// What slides down the frame: the last kTaps rows of pixels and of windows, row y in place y % kTaps. A row holds `values`
+// doubles, three a pixel, and `stride` may be read and written.
 struct Rows {
-    const double *sum, *difference;  // u and v, times the mask
     int values;
     std::ptrdiff_t stride;
+    double *sum, *difference;  // [kTaps, stride] u and v, times the mask
+    // [kTaps, 3, stride] derivatives of the windows' 1 - SSIM by the windows' moments, spread along the row: those that
+    // multiply 1, u and v.
+    double* coefficients;
+    double* scratch;  // [7, stride + kPadding], zero when it is new
 };
 
 struct Kernels {
-    // The sum of 1 - SSIM over the windows whose first row is `row`. `scratch` holds 7 * (stride + kPadding) doubles,
-    // zero when it is new. `coefficients` [3, stride], if not null, gets the derivatives of that sum by the windows'
-    // moments, spread along the row: those that gradient_row multiplies by 1, u and v.
-    double (*window_row)(const Rows& rows, int row, double* scratch, double* coefficients);
+    // The sum of 1 - SSIM over the windows whose first row is `row`; also their coefficients, if asked for.
+    double (*window_row)(const Rows& rows, int row, bool with_coefficients);
 
-    // The derivative of the sum of all 1 - SSIM by x in row `row`, [stride]; `coefficients` [windows, 3, stride].
-    void (*gradient_row)(const Rows& rows, int row, const double* coefficients, int windows, double* gradient);
+    // The derivative of the sum of all 1 - SSIM by x in row `row`, [stride]. The windows that read the row are those of
+    // which `first` to `last` are the first rows.
+    void (*gradient_row)(const Rows& rows, int row, int first, int last, double* gradient);
 };
 
 // As avatar::choose_instruction_set.
