@@ -129,20 +129,31 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, const TileGr
     const auto splats_of = [&](std::int64_t chunk) {
         return std::pair(std::min(chunk * chunk_size, count), std::min((chunk + 1) * chunk_size, count));
     };
+    struct Span {
+        std::uint32_t first, last;  // tiles next to each other in a row
+    };
+    std::vector<std::vector<Span>> spans(chunks);
+    std::vector<std::uint32_t> span_count(count);
     lists.slot_begin.assign(count + 1, 0);
     parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
         std::uint32_t* counts = next.data() + chunk * tiles;
         const auto [begin, end] = splats_of(chunk);
+        std::vector<Span> found;
+        found.reserve(4 * (end - begin));
         std::int64_t total = 0;
         for (std::int64_t i = begin; i < end; ++i) {
             const std::int64_t before = total;
+            const std::size_t spans_before = found.size();
             for_each_tile_row(splats[i], grid, [&](std::int64_t first, std::int64_t last) {
                 total += last - first + 1;
                 if (total > max_pairs) return;  // refused below: only the number still matters
+                found.push_back({static_cast<std::uint32_t>(first), static_cast<std::uint32_t>(last)});
                 for (std::int64_t tile = first; tile <= last; ++tile) ++counts[tile];
             });
+            span_count[i] = static_cast<std::uint32_t>(found.size() - spans_before);
             lists.slot_begin[i + 1] = total - before;
         }
+        spans[chunk] = std::move(found);
     });
     for (std::int64_t i = 0; i < count; ++i) lists.slot_begin[i + 1] += lists.slot_begin[i];
     lists.pair_count = lists.slot_begin[count];
@@ -172,12 +183,12 @@ TileLists build_tile_lists(const Splat* splats, std::int64_t count, const TileGr
     parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
         std::uint32_t* position = next.data() + chunk * tiles;
         const auto [begin, end] = splats_of(chunk);
+        const Span* span = spans[chunk].data();
         for (std::int64_t i = begin; i < end; ++i) {
             std::uint32_t slot = static_cast<std::uint32_t>(lists.slot_begin[i]);
-            for_each_tile_row(splats[i], grid, [&](std::int64_t first, std::int64_t last) {
-                for (std::int64_t tile = first; tile <= last; ++tile)
+            for (const Span* const last_span = span + span_count[i]; span != last_span; ++span)
+                for (std::uint32_t tile = span->first; tile <= span->last; ++tile)
                     lists.pairs[position[tile]++] = {static_cast<std::uint32_t>(i), slot++};
-            });
         }
     });
     return lists;

@@ -15,7 +15,8 @@ using namespace avatar::splat;
 namespace {
 
 using Floats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using Integers = nb::ndarray<std::int64_t, nb::shape<sizeof(Counts) / sizeof(std::int64_t)>, nb::c_contig, nb::device::cpu>;
+constexpr std::size_t kCounts = sizeof(Counts) / sizeof(std::int64_t);
+using Integers = nb::ndarray<std::int64_t, nb::shape<kCounts>, nb::c_contig, nb::device::cpu>;
 using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 
 Gaussians gaussians_of(const ConstFloats& means, const ConstFloats& quats, const ConstFloats& scales,
@@ -62,8 +63,9 @@ void bind_splat(nb::module_& m) {
     m.def(
         "splat_backward",
         [](const Drawing& drawing, ConstFloats means, ConstFloats quats, ConstFloats scales, ConstFloats opacities,
-           ConstFloats sh, std::optional<ConstFloats> grad_image, std::optional<ConstFloats> grad_alpha, Floats grad_means, Floats grad_quats, Floats grad_scales,
-           Floats grad_opacities, Floats grad_sh, Floats grad_background) {
+           ConstFloats sh, std::optional<ConstFloats> grad_image, std::optional<ConstFloats> grad_alpha,
+           Floats grad_means, Floats grad_quats, Floats grad_scales, Floats grad_opacities, Floats grad_sh,
+           Floats grad_background) {
             const GaussianGradients gradients{grad_means.data(), grad_quats.data(), grad_scales.data(),
                                               grad_opacities.data(), grad_sh.data()};
             const nb::gil_scoped_release unlocked;

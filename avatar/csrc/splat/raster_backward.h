@@ -4,11 +4,11 @@
 namespace avatar::splat {
 namespace {
 
-// Back to front, from the last splat that each pixel shows. With g = dL/dcolour of a pixel, T_k the transmittance in front
-// of splat k and A = 1 - T_end the alpha output, splat k's alpha has the gradient
+// Back to front, from the last splat that each pixel shows. With g = dL/dcolour of a pixel, T_k the transmittance in
+// front of splat k and A = 1 - T_end the alpha output, splat k's alpha has the gradient
 //     T_k g.c_k - behind_k / (1 - alpha_k) = (T_{k+1} g.c_k - behind_k) / (1 - alpha_k),
 //     behind_k = sum over j > k of T_j alpha_j g.c_j + T_end (g.background - dL/dA).
-// `behind` only grows by what is added to it, so nothing cancels, and T_k = T_{k+1} / (1 - alpha_k) has a relative error
+// `behind` is what was added to it, with nothing taken off again, and T_k = T_{k+1} / (1 - alpha_k) has a relative error
 // of about 1e-7 for each splat, however small it is: 1 - alpha is exact or nearly so, and t_min keeps T_end in range.
 void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& source, const BackwardTarget& target) {
     const TileArea area(r, tile);

@@ -19,8 +19,8 @@ inline bool is_empty(const Word set[kWords]) {
 template <bool kCount>
 void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& target) {
     const TileArea area(r, tile);
-    // A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance; nothing is
-    // drawn there any more.
+    // A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance; nothing
+    // is drawn there any more.
     alignas(64) float transmittance[kTilePixels];
     alignas(64) float red[kTilePixels] = {}, green[kTilePixels] = {}, blue[kTilePixels] = {};
     alignas(64) int stops[kTilePixels];

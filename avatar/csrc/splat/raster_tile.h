@@ -7,13 +7,13 @@
 namespace avatar::splat {
 namespace {
 
-// A vector holds a block of pixels, as square as it can be: 4x1, 4x2 or 4x4. Of vectors of 16x1 a splat of the usual size
-// would leave three quarters of the lanes without work.
+// A vector holds a block of pixels, as square as it can be: 4x1, 4x2 or 4x4. Of vectors of 16x1 a splat of the usual
+// size would leave three quarters of the lanes without work.
 constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlocksAcross = kTileWidth / kBlockWidth, kBlocksDown = kTileHeight / kBlockHeight;
 constexpr int kBlocks = kBlocksAcross * kBlocksDown;
 constexpr int kWords = kBlocks / 64;  // sets of blocks are kept as bits
-static_assert(kBlocksAcross == 8 && kBlocks % 64 == 0 && kBlocks <= kMaxBlocks);
+static_assert(kBlocksAcross == 8 && kLanes <= 2 * kBlocksAcross && kBlocks % 64 == 0 && kBlocks <= kMaxBlocks);
 
 // The per-pixel arrays of a tile hold block after block, rows of blocks from the top.
 inline int pixel_at(int row, int column) {
@@ -84,15 +84,8 @@ struct SplatInTile {
         const Floats u0 = broadcast(float(s.a * dx + s.b * dy)), v0 = broadcast(float(s.c * dy));
         const Floats reach = broadcast(s.reach), zero{};
         for (int w = 0; w < kWords; ++w) blocks[w] = 0;
-        Word rows = 0;  // of blocks, by v alone: most splats are much smaller than a tile
-        for (int y = 0; y < kBlocksDown; y += kLanes) {
-            const Floats v = fma(c_step, remainders(kLanes) + broadcast(float(y)), v0);
-            const Floats nearest_v = max(v, zero) + min(v + v_more, zero);
-            rows |= Word(signs(nearest_v * nearest_v <= reach)) << y;
-        }
         const Floats u_first = fma(broadcast(a * kBlockWidth), remainders(kBlocksAcross), u0);
-        for (rows = groups_of(rows); rows != 0; rows &= rows - 1) {
-            const int row = first_bit(rows);
+        const auto test_rows = [&](int row) {  // this row of blocks, and the next where a vector holds two
             const Floats y = quotients(kBlocksAcross) + broadcast(float(row));
             const Floats v = fma(c_step, y, v0), nearest_v = max(v, zero) + min(v + v_more, zero);
             for (int column = 0; column < kBlocksAcross; column += kLanes) {
@@ -104,6 +97,17 @@ struct SplatInTile {
                 const Ints reached = fma(nearest_u, nearest_u, nearest_v * nearest_v) <= reach;
                 blocks[block / 64] |= Word(signs(reached)) << (block % 64);
             }
+        };
+        if (kLanes > kBlocksAcross) {
+            for (int row = 0; row < kBlocksDown; row += 2) test_rows(row);
+        } else {
+            Word rows = 0;  // by v alone: most splats are much smaller than a tile
+            for (int y = 0; y < kBlocksDown; y += kLanes) {
+                const Floats v = fma(c_step, remainders(kLanes) + broadcast(float(y)), v0);
+                const Floats nearest_v = max(v, zero) + min(v + v_more, zero);
+                rows |= Word(signs(nearest_v * nearest_v <= reach)) << y;
+            }
+            for (; rows != 0; rows &= rows - 1) test_rows(first_bit(rows));
         }
     }
 
@@ -116,13 +120,6 @@ struct SplatInTile {
 private:
     static Floats lane_columns() { return remainders(kBlockWidth); }
     static Floats lane_rows() { return quotients(kBlockWidth); }
-
-    // The first rows of the groups of rows that have as many blocks as a vector has lanes.
-    static Word groups_of(Word rows) {
-        constexpr int kGroup = kLanes > kBlocksAcross ? kLanes / kBlocksAcross : 1;
-        static_assert(kGroup <= 2);
-        return kGroup == 1 ? rows : (rows | rows >> 1) & 0x5555555555555555u & ((Word{1} << kBlocksDown) - 1);
-    }
 };
 
 }  // namespace

@@ -95,7 +95,7 @@ inline unsigned signs(Ints v) {
 
 constexpr unsigned kAllLanes = (1u << kLanes) - 1;
 
-// The sums of the lanes of four vectors. In few instructions: the backward pass takes nine sums for each splat in a tile.
+// The sums of the lanes of four vectors. In few instructions: the backward pass takes nine for each splat in a tile.
 typedef float Four __attribute__((vector_size(16)));
 
 #if defined(__SSE2__)

@@ -14,6 +14,7 @@ namespace {
 // 8 bytes a pair in the forward pass and 36 more in the backward pass: 3 GB at most.
 constexpr std::int64_t kMaxPairs = std::int64_t{1} << 26;
 constexpr std::int64_t kGrain = 256;  // Gaussians handed to a thread at a time
+constexpr std::int64_t kAhead = 8;    // Gaussians, for which moments are fetched early: they lie by depth
 constexpr std::int64_t kRows = 64;    // rows of the image handed to a thread at a time
 
 bool all_finite(const float* values, std::int64_t count) {
@@ -234,6 +235,11 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     parallel_for(drawing.threads, gaussians.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t i = begin; i < end; ++i) {
             const std::int32_t rank = drawing.rank_of[i];
+            if (i + kAhead < end && drawing.rank_of[i + kAhead] >= 0) {
+                const float* next = &moments[lists.slot_begin[drawing.rank_of[i + kAhead]] * kMoments];
+                __builtin_prefetch(next);
+                __builtin_prefetch(next + kMoments);
+            }
             double sums[kMoments] = {};
             if (rank >= 0)
                 for (std::int64_t slot = lists.slot_begin[rank]; slot < lists.slot_begin[rank + 1]; ++slot)
