@@ -30,6 +30,7 @@ class Request:
 
 PARTS = {
     "splat": Part("avatar.bench.splat_report"),
+    "hyper": Part("avatar.bench.hyper_report"),
     "render": Part("avatar.bench.render", "RUN"),
     "train": Part("avatar.bench.train_report", "FOLDER"),
     "quality": Part("avatar.bench.quality_report", "RUN..."),

@@ -26,6 +26,12 @@ class Factor(NamedTuple):
     L21: Float[Tensor, "N n m"]
 
 
+def factor_of(lower: Float[Tensor, "N m m"], cross: Float[Tensor, "N n m"]) -> Factor:
+    """The factor from a head's parameters: the strictly lower part as it is, the diagonal through exp."""
+    log_diagonal = torch.diagonal(lower, dim1=-2, dim2=-1)
+    return Factor(torch.tril(lower, diagonal=-1) + torch.diag_embed(torch.exp(log_diagonal)), cross)
+
+
 def conditional_mean(
     mean_a: Float[Tensor, "N m"],
     mean_b: Float[Tensor, "N n"],
@@ -67,8 +73,7 @@ class HyperHead(nn.Module):
         self.cross = nn.Parameter(torch.zeros(num_gaussians, latent_size, attribute_size))
 
     def factor(self) -> Factor:
-        log_diagonal = torch.diagonal(self.lower, dim1=-2, dim2=-1)
-        return Factor(torch.tril(self.lower, diagonal=-1) + torch.diag_embed(torch.exp(log_diagonal)), self.cross)
+        return factor_of(self.lower, self.cross)
 
     def forward(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N m"]:
         mean_a, mean_b = self.mean.split((self.attribute_size, self.latent_size), dim=-1)

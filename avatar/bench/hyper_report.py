@@ -1,0 +1,99 @@
+"""What `avatar bench hyper` leaves: a table on the terminal, bench_hyper.json and bench_hyper.png."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from avatar.bench import Request
+from avatar.bench.hyper import LATENT_SIZES, QUICK_LATENT_SIZES, Row, measure
+from avatar.bench.machine import describe_machine
+
+
+def run(request: Request) -> None:
+    """Measure, print and write; `quick` takes too few Gaussians to say anything."""
+    rows = measure(QUICK_LATENT_SIZES, count=300, repeats=3) if request.quick else measure(LATENT_SIZES)
+    for line in (*table(rows), "", *comparisons(rows)):
+        print(line)
+    figures, plot = request.out / "bench_hyper.json", request.out / "bench_hyper.png"
+    content = {"machine": describe_machine(), "rows": [asdict(row) for row in rows]}
+    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_plot(rows, plot)
+    print(f"\nFigures  {figures}\nPlot     {plot}")
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Milliseconds as median (95th percentile); errors against float64."""
+    lines = [
+        f"{'n':>3} {'way':>16} {'Gaussians':>9} {'forward ms':>17} {'backward ms':>17} {'sum':>8} {'floor':>6} "
+        f"{'ns each':>9} {'error':>8} {'gradients':>9}"
+    ]
+    for row in rows:
+        forward = f"{row.forward.median:.2f} ({row.forward.p95:.2f})"
+        backward = f"{row.backward.median:.2f} ({row.backward.p95:.2f})"
+        floor = "" if row.floor is None else f"{row.floor:.2f}"
+        lines.append(
+            f"{row.latent_size:3} {row.way:>16} {row.gaussians:9,} {forward:>17} {backward:>17} {total(row):8.2f} "
+            f"{floor:>6} {each(row):9,.0f} {row.offsets_error:8.1e} {row.gradient_error:9.1e}"
+        )
+    return lines
+
+
+def comparisons(rows: Sequence[Row]) -> Iterator[str]:
+    """The compiled operator against each other way and against the floor, and how straight its line over n is."""
+    own = {row.latent_size: row for row in rows if row.way == "fused"}
+    others = [name for name in dict.fromkeys(row.way for row in rows) if name != "fused"]
+    yield f"{'n':>3} {'times the floor':>16} " + " ".join(f"{f'{name} / fused':>24}" for name in others)
+    for n, row in own.items():
+        ratios = [
+            each(other) / each(row) for name in others for other in rows if (other.way, other.latent_size) == (name, n)
+        ]
+        floor = total(row) / (row.floor or float("nan"))
+        yield f"{n:3} {floor:16.1f} " + " ".join(f"{ratio:24.1f}" for ratio in ratios)
+    slope, start, deviation = straight_line({n: each(row) for n, row in own.items()})
+    yield (
+        f"fused: {start:.0f} ns + {slope:.1f} ns for each latent dimension, for each Gaussian, forward and backward; "
+        f"no n is off that line by more than {deviation:.0%}"
+    )
+
+
+def straight_line(values: dict[int, float]) -> tuple[float, float, float]:
+    """Slope and start of the line with the least squares of relative deviations, and the largest of these."""
+    import numpy as np
+
+    x, y = np.array(list(values)), np.array(list(values.values()))
+    slope, start = np.polyfit(x, y, 1, w=1 / y)
+    return float(slope), float(start), float(np.abs((start + slope * x) / y - 1).max())
+
+
+def write_plot(rows: Sequence[Row], path: Path) -> None:
+    """Time of one Gaussian over the number of latent dimensions."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for way in dict.fromkeys(row.way for row in rows):
+        points = [(row.latent_size, each(row)) for row in rows if row.way == way]
+        axes.plot(*zip(*points, strict=True), marker="o", ms=4, label=way)
+    floors = [(row.latent_size, 1e6 * row.floor / row.gaussians) for row in rows if row.way == "fused" and row.floor]
+    axes.plot(*zip(*floors, strict=True), "k--", label="copying the same bytes")
+    axes.set(xscale="log", yscale="log", xlabel="latent dimensions n", ylabel="forward + backward, ns per Gaussian")
+    shown = sorted({row.latent_size for row in rows})
+    axes.set_xticks(shown, [str(n) for n in shown])
+    axes.set_xticks([], minor=True)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def total(row: Row) -> float:
+    return row.forward.median + row.backward.median
+
+
+def each(row: Row) -> float:
+    """Nanoseconds per Gaussian, forward and backward."""
+    return 1e6 * total(row) / row.gaussians
