@@ -25,7 +25,7 @@ test: setup ## run all tests
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress
 
-sanitize: setup ## run the splatter's tests with AddressSanitizer and UndefinedBehaviorSanitizer
+sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh
 
 check: setup ## lint, formatting and types

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Build the compiled core with AddressSanitizer and UndefinedBehaviorSanitizer, beside the ordinary build, and run the
-# splatter's tests on it. Arguments go to pytest instead of the two test folders. Needs GCC or Clang on Linux.
+# tests of all its parts on it. Arguments go to pytest instead of those. Needs GCC or Clang on Linux.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$PWD/.venv/bin/python
@@ -20,5 +20,5 @@ export ASAN_OPTIONS=detect_leaks=0:abort_on_error=1 UBSAN_OPTIONS=print_stacktra
 packages=$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 export PYTHONPATH=$site:$packages
 (cd / && "$python" -S -c 'import avatar._core, sys; sys.exit(not avatar._core.__file__.startswith(sys.argv[1]))' "$site/")
-[ $# -gt 0 ] || set -- tests/stress tests/splat
+[ $# -gt 0 ] || set -- tests/stress tests/splat tests/gaussians tests/head tests/test_dssim_cpu.py
 "$python" -S "$(dirname "$python")/pytest" --timeout=0 "$@"

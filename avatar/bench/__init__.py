@@ -34,4 +34,5 @@ PARTS = {
     "render": Part("avatar.bench.render", "RUN"),
     "train": Part("avatar.bench.train_report", "FOLDER"),
     "quality": Part("avatar.bench.quality_report", "RUN..."),
+    "stability": Part("avatar.bench.stability"),
 }
