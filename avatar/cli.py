@@ -1,4 +1,4 @@
-"""The command line: `avatar train | eval | reenact | check | prepare | demo-data | demo | bench | doctor`."""
+"""The command line: `avatar train | eval | reenact | drive-file | check | prepare | demo-data | demo | bench | doctor`."""
 
 from __future__ import annotations
 
@@ -89,7 +89,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
     add_run(reenact)
-    reenact.add_argument("--driver", type=Path, required=True, metavar="FOLDER", help="tracked folder of the driver")
+    reenact.add_argument(
+        "--driver", type=Path, required=True, metavar="DRIVER", help="tracked folder, or a drive file (.npz, .csv)"
+    )
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
     reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
     reenact.add_argument("--transfer", choices=("raw", "relative", "mean", "pca"), default="relative")
@@ -102,6 +104,10 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument(
         "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
     )
+
+    drive_file = commands.add_parser("drive-file", help="write a tracked folder's motion as a drive file")
+    add_source(drive_file)
+    drive_file.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
     prepare = commands.add_parser("prepare", help="check and import a tracked folder; train does it by itself")
     add_source(prepare)

@@ -19,9 +19,12 @@ from avatar.data.subject import Subject
 from avatar.data_prep.prepare import prepare as prepare_folder
 from avatar.demo import make_subject
 from avatar.doctor import report
+from avatar.drive import Drive, subject_drive
+from avatar.drive_file import read_drive, write_drive
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.expression_names import load_expression_names
 from avatar.model import Avatar
 from avatar.quality.cost import measure_cost
 from avatar.quality.folder import as_text, check_folder
@@ -132,11 +135,31 @@ def eval(arguments: Namespace) -> int:
 
 def reenact(arguments: Namespace) -> int:
     run = load_run(arguments.run, arguments.head)
-    driver = open_driver(arguments.driver, run, arguments.head, arguments.driver_tracking, arguments.frame_offset)
+    if arguments.driver.suffix.lower() in (".npz", ".csv"):
+        driver = open_drive_file(arguments.driver, run)
+    else:
+        driver = open_driver(arguments.driver, run, arguments.head, arguments.driver_tracking, arguments.frame_offset)
     choices = Choices(
         arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
     )
     drive(run, driver, choices, out=arguments.out)
+    return OK
+
+
+def open_drive_file(path: Path, run: Run) -> Drive:
+    assets, width = run.avatar.head.assets, run.subject.image_size(run.config.data.size)[0]
+    return read_drive(path, assets, load_expression_names(run.source.head, assets.num_expressions), width)
+
+
+def drive_file(arguments: Namespace) -> int:
+    if arguments.out.suffix.lower() != ".npz":
+        raise UserError(f"a drive file is written as .npz, not as {arguments.out}")
+    head = find_head(arguments.folder, arguments.head)
+    subject, assets = open_subject(
+        Source(arguments.folder, head, arguments.tracking, arguments.frame_offset), None, print
+    )
+    write_drive(arguments.out, subject_drive(subject, None), assets.fingerprint)
+    print(f"{len(subject)} frames written to {arguments.out}")
     return OK
 
 

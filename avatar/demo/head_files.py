@@ -2,16 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from pathlib import Path
 
 import numpy as np
 
 from avatar.demo.head import NUM_EXPRESSION, NUM_IDENTITY, PARENTS, DemoHead
+from avatar.head.expression_names import NAMES_FILE
+
+# What ARKit's blendshapes are on this head; those of one side are written for the left one.
+_ARKIT: dict[str, dict[str, float]] = {
+    "BrowDownLeft": {"brow_down_left": 1.0},
+    "BrowInnerUp": {"brow_inner_up_left": 1.0, "brow_inner_up_right": 1.0},
+    "BrowOuterUpLeft": {"brow_outer_up_left": 1.0},
+    "CheekPuff": {"cheek_puff": 1.0},
+    "CheekSquintLeft": {"cheek_up_left": 1.0},
+    "EyeSquintLeft": {"squint_left": 1.0},
+    "JawForward": {"jaw_back": -1.0},
+    "MouthDimpleLeft": {"dimple_left": 1.0},
+    "MouthFrownLeft": {"frown_left": 1.0},
+    "MouthFunnel": {"funnel": 1.0},
+    "MouthLeft": {"mouth_left": 1.0},
+    "MouthRight": {"mouth_left": -1.0},
+    "MouthLowerDownLeft": {"lower_lip_down_left": 1.0},
+    "MouthPressLeft": {"lip_press": 0.5},
+    "MouthPucker": {"pucker": 1.0},
+    "MouthRollLower": {"lip_roll_in": 0.5},
+    "MouthRollUpper": {"lip_roll_in": 0.5},
+    "MouthShrugLower": {"chin_raise": 1.0},
+    "MouthSmileLeft": {"smile_left": 1.0},
+    "MouthStretchLeft": {"stretch_left": 1.0},
+    "MouthUpperUpLeft": {"upper_lip_up_left": 1.0},
+    "NoseSneerLeft": {"sneer_left": 1.0},
+}
 
 
 def write_head_model(folder: Path, head: DemoHead) -> None:
-    """Write generic_model.pkl (plain numpy arrays), head_template.obj, the eyelids and FLAME_masks.pkl into `folder`."""
+    """Write generic_model.pkl (plain numpy arrays), head_template.obj, the eyelids, FLAME_masks.pkl and the names of the
+    expressions into `folder`."""
     folder.mkdir(parents=True)
     V = len(head.template)
     shape_dirs = np.zeros((V, 3, NUM_IDENTITY + NUM_EXPRESSION), np.float32)
@@ -39,3 +68,14 @@ def write_head_model(folder: Path, head: DemoHead) -> None:
     corners = np.stack((head.mesh.faces, head.mesh.uv_faces), -1) + 1
     lines += ["f " + " ".join(f"{v}/{vt}" for v, vt in face) for face in corners]
     (folder / "head_template.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
+    names = {"names": head.expression_names, "arkit": _both_sides(_ARKIT)}
+    (folder / NAMES_FILE).write_text(json.dumps(names, indent=1) + "\n", encoding="utf-8")
+
+
+def _both_sides(weights: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    mirrored = {
+        name.replace("Left", "Right"): {target.replace("_left", "_right"): w for target, w in own.items()}
+        for name, own in weights.items()
+        if name.endswith("Left") and name != "MouthLeft"
+    }
+    return weights | mirrored

@@ -15,6 +15,7 @@ import urllib.error
 from pathlib import Path
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 from small_runs import SMALL
@@ -49,7 +50,7 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def test_help_and_version_answer_for_every_command() -> None:
     overview = avatar("--help")
-    for command in ("train", "eval", "reenact", "check", "prepare", "demo-data", "demo", "doctor"):
+    for command in ("train", "eval", "reenact", "drive-file", "check", "prepare", "demo-data", "demo", "doctor"):
         assert command in overview
         assert "usage: avatar" in avatar(command, "--help")
     assert avatar("--version").startswith("avatar ")
@@ -125,6 +126,34 @@ def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, dr
     for option, value in (("--strength", -1), ("--strength", "nan"), ("--smoothing", -0.5)):
         output = avatar("reenact", trained, "--driver", driver, "--frame-offset", 1, option, value, status=1)
         assert f"{option} must be from 0 to" in output
+
+
+def test_a_drive_file_drives_like_the_folder_that_it_was_made_from(trained: Path, driver: Path, tmp_path: Path) -> None:
+    file, video = tmp_path / "driver.npz", tmp_path / "file.mp4"
+    assert str(file) in avatar("drive-file", driver, "--frame-offset", 1, "--out", file)
+    avatar("reenact", trained, "--driver", file, "--out", video)
+    avatar("reenact", trained, "--driver", driver, "--frame-offset", 1, "--out", tmp_path / "folder.mp4")
+    from_file, from_folder = iio.imread(video).astype(float), iio.imread(tmp_path / "folder.mp4").astype(float)
+    assert len(from_file) == 8
+    width = from_file.shape[2]
+    assert width * 2 == from_folder.shape[2], "there is no picture of the driver"
+    a, b = from_file[:, 16:56], from_folder[:, 16:56, width:]
+    # The encoder makes of the same pictures slightly different ones; other frames differ by far more.
+    assert 2 * abs(a - b).mean() < abs(a - np.roll(b, 4, axis=0)).mean()
+    files = [video.with_suffix(".csv"), tmp_path / "folder.csv"]
+    assert files[0].read_text() == files[1].read_text()
+    assert "is written as .npz" in avatar("drive-file", driver, "--out", tmp_path / "x.csv", status=1)
+
+
+def test_a_csv_without_cameras_shows_the_avatars_own(trained: Path, tmp_path: Path) -> None:
+    file = tmp_path / "talk.csv"
+    file.write_text("time,expression_0,jaw_x,jaw_y,jaw_z\n0,0,0,0,0\n0.1,0.5,0.1,0,0\n0.2,1,0.2,0,0\n")
+    output = avatar("reenact", trained, "--driver", file)
+    assert "has 1 of 10 expression coefficients; the rest are zero" in output
+    recorded = json.loads((trained / "reenact" / "talk-relative.json").read_text())
+    assert recorded["driver"] == {"name": "talk", "frames": 3, "fps": pytest.approx(10.0), "has_cameras": False}
+    assert recorded["intrinsics"]["shown"] == recorded["intrinsics"]["avatar"]
+    assert len(iio.imread(trained / "reenact" / "talk-relative.mp4")) == 3
 
 
 def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(

@@ -57,6 +57,7 @@ def test_folder_has_the_layout_of_a_tracked_video(folder: Path) -> None:
     assert sorted(p.name for p in (folder / "parsing").iterdir()) == masks
     assert sorted(p.name for p in (folder / "checkpoint").iterdir()) == [f"{k:05d}.frame" for k in range(FRAMES)]
     assert {p.name for p in (folder / "head_model").iterdir()} == {
+        "expression_names.json",
         "generic_model.pkl",
         "head_template.obj",
         "l_eyelid.npy",

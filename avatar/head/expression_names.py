@@ -1,0 +1,96 @@
+"""What a head model's expression coefficients are called, and how ARKit's blendshapes map to them.
+
+`expression_names.json` beside the model file holds
+
+    {"names": ["smile_left", null, ...],                      one for each coefficient, null where it has none
+     "arkit": {"MouthSmileLeft": {"smile_left": 1.0, "17": 0.2},   optional: weights of coefficients, by name or number
+               "JawOpen": {"jaw_x": 0.3}}}                     or of the jaw's rotation vector, radians
+
+or the list of names alone. Without an entry of "arkit", a blendshape moves the coefficient of the same name
+(`MouthSmileLeft`, `mouthSmile_L` and `mouth_smile_left` are the same), or the pair of left and right ones.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from avatar.errors import UserError
+from avatar.head.assets import find_model_file
+
+NAMES_FILE = "expression_names.json"
+JAW_TARGETS = ("jaw_x", "jaw_y", "jaw_z")
+_MAX_BYTES = 2**24
+
+
+@dataclass(frozen=True)
+class ExpressionNames:
+    names: tuple[str | None, ...] = ()  # of the coefficients
+    arkit: dict[str, dict[str, float]] = field(default_factory=dict)  # plain blendshape name -> coefficient -> weight
+
+    def index(self, name: str) -> int | None:
+        """The coefficient of a name, whatever its style of writing."""
+        wanted = plain(name)
+        return next((i for i, own in enumerate(self.names) if own is not None and plain(own) == wanted), None)
+
+    def targets(self, blendshape: str) -> dict[int | str, float]:
+        """Coefficients (by number) and jaw axes that one of ARKit's blendshapes moves; nothing where none does."""
+        if (given := self.arkit.get(plain(blendshape))) is not None:
+            return {self._target(name): weight for name, weight in given.items()}
+        found = [self.index(name) for name in (blendshape, f"{blendshape}Left", f"{blendshape}Right")]
+        if found[0] is not None:
+            return {found[0]: 1.0}
+        return {index: 1.0 for index in found[1:] if index is not None}
+
+    def _target(self, name: str) -> int | str:
+        if name in JAW_TARGETS:
+            return name
+        index = self.index(name)
+        return int(name) if index is None else index
+
+
+def plain(name: str) -> str:
+    """A name without its style of writing: mouthSmile_L, MouthSmileLeft and mouth_smile_left are mouthsmileleft."""
+    name = re.sub(r"_L$", "left", re.sub(r"_R$", "right", name))
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def load_expression_names(head: Path, num_expressions: int) -> ExpressionNames:
+    """The names that lie beside a head model (file or folder); none where there is no such file.
+
+    Raises UserError for a file that is not of the form above, or that names coefficients that do not exist.
+    """
+    path = find_model_file(head).parent / NAMES_FILE
+    if not path.is_file():
+        return ExpressionNames()
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise UserError(f"{path} is larger than {_MAX_BYTES} bytes; such files are not read")
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({error})") from None
+    raw = {"names": raw} if isinstance(raw, list) else raw
+    names = raw.get("names") if isinstance(raw, dict) else None
+    if not isinstance(names, list) or not all(name is None or isinstance(name, str) for name in names):
+        raise UserError(f'{path} must hold "names", a list of texts and nulls')
+    if len(names) > num_expressions:
+        raise UserError(f"{path} names {len(names)} coefficients, but the head model has {num_expressions}")
+    known = ExpressionNames(tuple(names))
+    return ExpressionNames(known.names, _read_arkit(path, raw.get("arkit", {}), known, num_expressions))
+
+
+def _read_arkit(path: Path, raw: Any, known: ExpressionNames, num_expressions: int) -> dict[str, dict[str, float]]:
+    if not isinstance(raw, dict) or not all(isinstance(weights, dict) for weights in raw.values()):
+        raise UserError(f'{path}: "arkit" must hold, for each blendshape, an object of weights')
+    for blendshape, weights in raw.items():
+        for name, weight in weights.items():
+            exists = name in JAW_TARGETS or known.index(name) is not None
+            if not exists and not (name.isascii() and name.isdigit() and int(name[:9]) < num_expressions):
+                raise UserError(f"{path}: {blendshape} moves {name!r}, which is no coefficient of the head model")
+            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
+                raise UserError(f"{path}: the weight of {name!r} in {blendshape} is {weight!r}, not a number")
+    return {plain(blendshape): dict(weights) for blendshape, weights in raw.items()}
