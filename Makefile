@@ -10,9 +10,9 @@ NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
 
-.PHONY: help setup demo test stress sanitize check format smoke wheel clean
+.PHONY: help setup demo test stress sanitize arm64 check format smoke wheel clean
 help: ## show this list
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z0-9]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
 setup: $(VENV)/.installed ## make .venv with pinned packages and the compiled core
 
@@ -27,6 +27,9 @@ stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRES
 
 sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh
+
+arm64: ## compile the core for 64-bit ARM with a cross compiler (Debian: g++-aarch64-linux-gnu)
+	scripts/check_arm64.sh
 
 check: setup ## lint, formatting and types
 	$(BIN)/ruff check .

@@ -12,6 +12,7 @@ from splat.scenes import (
     SIMD,
     Scene,
     assert_agrees,
+    assert_gradients_close,
     camera,
     expected_of_named,
     gradients,
@@ -55,6 +56,19 @@ def test_image_and_alpha_are_those_of_the_definition_written_as_loops(name: str,
 def test_kernel_agrees_with_the_reference(name: str, simd: str, monkeypatch: pytest.MonkeyPatch) -> None:
     use_simd(monkeypatch, simd)
     assert_agrees(SCENES[name], expected=expected_of_named(name))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
+@pytest.mark.parametrize("name", ["random", "thresholds", "antialiased", "no cut-offs"])
+def test_reference_on_a_gpu_agrees_with_itself_on_the_cpu(name: str) -> None:
+    scene, expected = SCENES[name], expected_of_named(name)
+    gaussians = Gaussians(*(t.cuda() for t in scene.gaussians))
+    on_gpu = in_float64(replace(scene, gaussians=gaussians, background=scene.background.cuda()))
+    found = render(on_gpu, "reference")
+    assert ((found.image.cpu() - expected.rendering.image).abs().amax(-1) <= 1e-10 + expected.jump).all()
+    cotangents = (t.double().cuda() for t in (expected.grad_image, expected.grad_alpha))
+    on_cpu = {name: grad.cpu() for name, grad in gradients(on_gpu, "reference", *cotangents).items()}
+    assert_gradients_close(on_cpu, expected.gradients, 1e-9)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

@@ -72,9 +72,7 @@ struct Pair {
 // `weight` = dL/dalpha * alpha / opacity, summed over pixels; the others are its moments in (u, v).
 enum Moment { kWeight, kU, kUU, kV, kUV, kVV, kRed, kGreen, kBlue, kMoments };
 
-// Pixels. Measured on 14,876 splats at 512x512 and 256x256 (AVX2, one thread, forward + backward): 32x32 36 and 18 ms,
-// 32x16 39 and 19, 16x16 39 and 20, 8x16 43 and 21. Larger tiles repeat less work for a splat; the pixels of one still
-// fit in L1.
+// Pixels. Larger tiles repeat less work for a splat; the pixels of one still fit in L1. docs/splatter.md has measurements.
 constexpr int kTileWidth = 32, kTileHeight = 32, kTilePixels = kTileWidth * kTileHeight;
 
 // The tiles that meet the region. They lie where those of the whole image do, so that a pixel gets the same bits in any
