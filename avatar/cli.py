@@ -1,4 +1,4 @@
-"""The command line: `avatar train | eval | reenact | drive-file | check | prepare | demo-data | demo | bench | doctor`."""
+"""The command line: `avatar COMMAND ...`, one subcommand for each thing that the program does."""
 
 from __future__ import annotations
 
@@ -86,6 +86,9 @@ def build_parser() -> argparse.ArgumentParser:
         help="only this protocol, by name or as FILE.yaml; may be repeated",
     )
     evaluate.add_argument("--frames", action="store_true", help="write every render, truth and mask as PNG too")
+
+    report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
+    add_run(report)
 
     reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
     add_run(reenact)

@@ -18,7 +18,7 @@ from avatar.config import Config, flatten, load_config
 from avatar.data.subject import Subject
 from avatar.data_prep.prepare import prepare as prepare_folder
 from avatar.demo import make_subject
-from avatar.doctor import report
+from avatar.doctor import report as report_installation
 from avatar.drive import Drive, subject_drive
 from avatar.drive_file import read_drive, write_drive
 from avatar.errors import UserError
@@ -130,6 +130,13 @@ def refuse_changes(run: Path, config: Config, overrides: list[str]) -> None:
 def eval(arguments: Namespace) -> int:
     run = load_run(arguments.run, arguments.head)
     evaluate(run, arguments.protocol, write_frames=arguments.frames)
+    return OK
+
+
+def report(arguments: Namespace) -> int:
+    from avatar.report.page import write_report  # imports matplotlib and tensorboard, which take a second
+
+    print(f"Report {write_report(load_run(arguments.run, arguments.head))}")
     return OK
 
 
@@ -263,4 +270,4 @@ def bench(arguments: Namespace) -> int:
 
 
 def doctor(arguments: Namespace) -> int:
-    return report()
+    return report_installation()

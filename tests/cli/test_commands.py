@@ -50,7 +50,18 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def test_help_and_version_answer_for_every_command() -> None:
     overview = avatar("--help")
-    for command in ("train", "eval", "reenact", "drive-file", "check", "prepare", "demo-data", "demo", "doctor"):
+    for command in (
+        "train",
+        "eval",
+        "reenact",
+        "drive-file",
+        "report",
+        "check",
+        "prepare",
+        "demo-data",
+        "demo",
+        "doctor",
+    ):
         assert command in overview
         assert "usage: avatar" in avatar(command, "--help")
     assert avatar("--version").startswith("avatar ")

@@ -1,0 +1,1 @@
+"""`avatar report`: a run as one HTML file."""

@@ -1,0 +1,166 @@
+"""RUN/report.html: figures, curves, held-out frames, uncertainty and configuration of a run in one file."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from avatar.checkpoint import write_atomically
+from avatar.config import flatten
+from avatar.errors import UserError
+from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
+from avatar.html.parts import SERIES, data_uri
+from avatar.report.pictures import frame_panels, uncertainty_map
+from avatar.run import Run, versions
+
+SHOWN_DECIMALS = {"psnr": 2}  # others: 4
+MAX_POINTS = 1000  # of a curve
+SCRIPT = """
+const slider = document.getElementById("frame");
+const panels = [...document.querySelectorAll("#frames figure")];
+function show() { panels.forEach((panel, i) => { panel.hidden = i !== Number(slider.value); }); }
+if (slider) { slider.addEventListener("input", show); show(); }
+"""
+
+
+def write_report(run: Run) -> Path:
+    """Write RUN/report.html and return it. Parts that a run does not have yet (its evaluation, its curves) are named as
+    missing. Raises UserError when the evaluation's results cannot be read, or a frame is gone."""
+    path = run.path / "report.html"
+    write_atomically(path, render_report(run).encode())
+    return path
+
+
+def render_report(run: Run) -> str:
+    results = read_results(run.path / "eval" / "results.json")
+    facts = {
+        "subject": run.subject.name,
+        "method": run.config.model.name,
+        "Gaussians": f"{len(run.avatar):,}",
+        "step": f"{run.step:,}",
+        "training frames": len(run.subject.split.train),
+        "held-out frames": len(run.subject.split.test),
+    }
+    parts = [
+        element("header", element("h1", f"Run {run.path.name}"), element("p", str(run.path), class_="soft")),
+        section("Run", tiles(facts)),
+        section("Held-out figures", *_figures(run, results)),
+        section("Held-out frames", *_frames(run)),
+        section("Training", *_curves(run.path / "tensorboard")),
+        *_uncertainty(run),
+        section("Origin", *_origin(run, results)),
+    ]
+    return document(f"Run {run.path.name}", parts, SCRIPT)
+
+
+def read_results(path: Path) -> dict[str, Any] | None:
+    """What `avatar eval` wrote, or None where it has not run."""
+    if not path.is_file():
+        return None
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read ({error}); run avatar eval again") from None
+    if not isinstance(results, dict) or not isinstance(results.get("protocols"), dict):
+        raise UserError(f"{path} is not a results file of this program; run avatar eval again")
+    return results
+
+
+def means_table(protocols: Mapping[str, Any]) -> Markup:
+    """One line per protocol, one column per figure that any of them has."""
+    columns = list(dict.fromkeys(name for entry in protocols.values() for name in entry.get("means", {})))
+    rows = [
+        [name, len(entry.get("frames", ())), *(_figure(c, entry.get("means", {}).get(c)) for c in columns)]
+        for name, entry in protocols.items()
+    ]
+    return data_table(["protocol", "frames", *(column.replace("_", " ") for column in columns)], rows)
+
+
+def _figure(column: str, value: float | None) -> str:
+    return "-" if value is None else f"{value:.{SHOWN_DECIMALS.get(column.partition('_')[0], 4)}f}"
+
+
+def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
+    if results is None:
+        return [element("p", f"Not measured yet: avatar eval {run.path}", class_="soft")]
+    parts = []
+    if results.get("step") != run.step:
+        text = f"Measured at step {results.get('step')}, while the newest checkpoint is of step {run.step}."
+        parts.append(element("p", text, class_="finding warning"))
+    parts.append(means_table(results["protocols"]))
+    for name, caption in (("curves.png", "The figures along the video"), ("worst.png", "The worst frames")):
+        file = run.path / "eval" / name
+        if file.is_file():
+            source = f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
+            image = element("figure", element("img", src=source, alt=caption), element("figcaption", caption))
+            parts.append(fold(caption, image))
+    choices = {n: e.get("choices", {}).get("summary") for n, e in results["protocols"].items()}
+    rows = [[name, summary] for name, summary in choices.items()]
+    return [*parts, fold("What each protocol measures", data_table([], rows))]
+
+
+def _frames(run: Run) -> list[Markup]:
+    panels = frame_panels(run)
+    figures = [
+        element(
+            "figure",
+            element("img", src=data_uri(image, quality=85), alt=name),
+            element("figcaption", f"frame {name}"),
+            hidden=position > 0,
+        )
+        for position, (name, image) in enumerate(panels)
+    ]
+    slider = element("input", type="range", id="frame", min=0, max=len(panels) - 1, value=0, aria_label="frame")
+    return [element("div", slider, join(figures), id="frames")]
+
+
+def _curves(folder: Path) -> list[Markup]:
+    curves = read_curves(folder)
+    shown = [(tag, title) for tag, title in (("loss/total", "loss"), ("train/psnr", "PSNR, dB")) if curves.get(tag)]
+    if not shown:
+        return [element("p", "No curves were recorded.", class_="soft")]
+    plots = []
+    for tag, title in shown:
+        figure, (axes,) = figure_of()
+        steps, values = zip(*curves[tag], strict=True)
+        axes.plot(steps, values, color=SERIES[0], linewidth=0.9)
+        axes.set(xlabel="step", ylabel=title, yscale="log" if tag.startswith("loss") else "linear")
+        plots.append(plot(figure, f"{title[:1].upper()}{title[1:]} of the training frames as they came", title))
+    return [element("div", *plots, class_="plots")]
+
+
+def read_curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """(step, value) of every scalar that training recorded, at most `MAX_POINTS` of each; empty without a recording."""
+    if not folder.is_dir():
+        return {}
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
+    events.Reload()
+    curves = {}
+    for tag in events.Tags().get("scalars", []):
+        points = [(point.step, point.value) for point in events.Scalars(tag)]
+        curves[tag] = points[:: max(1, -(-len(points) // MAX_POINTS))]
+    return curves
+
+
+def _uncertainty(run: Run) -> list[Markup]:
+    image = uncertainty_map(run)
+    if image is None:
+        return []
+    caption = "sigmoid(2.5 u) of each Gaussian on the UV map: dark is sure, bright is unsure; half-way at the start"
+    return [section("Uncertainty", element("div", picture(image, caption, format="png"), class_="gallery wide"))]
+
+
+def _origin(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
+    known = {
+        "data hash": run.subject.data_hash,
+        "head model": run.avatar.head.assets.fingerprint,
+        **{f"version of {name}": value for name, value in versions().items()},
+    }
+    notes = [element("p", note) for note in (results or {}).get("notes", ())]
+    config = [[key, str(value)] for key, value in flatten(run.config.to_dict()).items()]
+    return [*notes, data_table([], [list(row) for row in known.items()]), fold("Configuration", data_table([], config))]

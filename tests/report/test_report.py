@@ -1,0 +1,117 @@
+"""The page of `avatar report`, as a file and in a browser."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_runs import train_small
+from tracked_folder import write_tracked_folder
+
+from avatar.cli import main
+from avatar.errors import UserError
+from avatar.report.page import means_table, read_curves, read_results
+from avatar.report.pictures import uncertainty_map
+from avatar.run import load_run
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+MOVE_SLIDER = """
+addEventListener("load", () => {
+  const slider = document.getElementById("frame");
+  slider.value = 3;
+  slider.dispatchEvent(new Event("input"));
+  const shown = [...document.querySelectorAll("#frames figure")].filter((one) => !one.hidden);
+  const loaded = [...document.images].filter((one) => one.complete && one.naturalWidth > 0).length;
+  document.title = `shown ${shown.map((one) => one.innerText).join()} loaded ${loaded} of ${document.images.length}`;
+});
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_tracked_folder(tmp_path_factory.mktemp("report") / "someone", frames=30, size=48)
+    train_small(folder, folder.parent / "run")
+    assert main(["eval", str(folder.parent / "run"), "--protocol", "hypergaussians"]) == 0
+    assert main(["report", str(folder.parent / "run")]) == 0
+    return folder.parent / "run"
+
+
+def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: Path) -> None:
+    page = (run / "report.html").read_text(encoding="utf-8")
+    results = read_results(run / "eval" / "results.json")
+    assert results is not None
+    means = results["protocols"]["hypergaussians"]["means"]
+    assert f"{means['psnr']:.2f}" in page and f"{means['ssim']:.4f}" in page
+    sources = re.findall(r'src="([^"]{0,30})', page)
+    assert len(sources) == 6 + 2 + 2 + 1  # held-out frames; curves and worst of the evaluation; training; uncertainty
+    assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)
+    assert results["data_hash"] in page and "trainer.learning_rates.mlp" in page
+    assert len(page) < 8e6
+
+
+def test_curves_are_those_that_training_recorded(run: Path) -> None:
+    curves = read_curves(run / "tensorboard")
+    assert [step for step, _ in curves["loss/total"]] == [2, 4, 6, 8, 10, 12]
+    assert all(np.isfinite(value) for _, value in curves["train/psnr"])
+    assert read_curves(run / "nowhere") == {}
+
+
+def test_uncertainty_is_grey_before_training_and_lies_where_the_gaussians_are(run: Path) -> None:
+    opened = load_run(run)
+    assert opened.avatar.hyper is not None
+    for head in (opened.avatar.hyper.position, opened.avatar.hyper.rotation, opened.avatar.hyper.scale):
+        head.lower.data.zero_()
+    image = uncertainty_map(opened)
+    assert image is not None
+    scale = image.shape[0] // 20
+    painted = (image[::scale, ::scale] != 255).any(axis=-1)
+    assert painted.sum() == len(opened.avatar)
+    assert len(np.unique(image[::scale, ::scale][painted], axis=0)) == 1  # sigmoid(0) everywhere
+
+
+def test_protocols_without_a_figure_have_a_dash() -> None:
+    protocols = {"a": {"means": {"psnr": 30.126, "lpips": None}, "frames": [1, 2]}, "b": {"means": {"ssim_head": 0.91}}}
+    table = means_table(protocols)
+    assert "<td>30.13</td><td>-</td><td>-</td>" in table and "<td>-</td><td>-</td><td>0.9100</td>" in table
+    assert "<th>ssim head</th>" in table
+
+
+def test_a_run_that_was_not_evaluated_says_so(run: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    shutil.rmtree(copy / "eval")
+    assert main(["report", str(copy)]) == 0
+    assert "Not measured yet: avatar eval" in (copy / "report.html").read_text(encoding="utf-8")
+    (copy / "eval").mkdir()
+    (copy / "eval" / "results.json").write_text("[]")
+    with pytest.raises(UserError, match="is not a results file of this program; run avatar eval again"):
+        read_results(copy / "eval" / "results.json")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_in_a_browser_the_slider_moves_and_all_images_load(run: Path, tmp_path: Path) -> None:
+    page = (run / "report.html").read_text(encoding="utf-8")
+    # The policy forbids a second script: the hook needs a copy of the page without it.
+    open_page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
+    hooked = tmp_path / "report.html"
+    hooked.write_text(open_page.replace("</body>", f"<script>{MOVE_SLIDER}</script></body>"), encoding="utf-8")
+    assert "<title>shown frame 00028 loaded 11 of 11</title>" in dump_dom(hooked, tmp_path)
+    dump_dom(run / "report.html", tmp_path)
+
+
+def dump_dom(page: Path, tmp_path: Path) -> str:
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+    options += [
+        "--no-first-run",
+        "--disable-component-update",
+        "--disable-quic",
+        f"--user-data-dir={tmp_path / 'user'}",
+    ]
+    options += ["--virtual-time-budget=5000", "--enable-logging=stderr"]
+    command = [str(CHROMIUM), *options, "--dump-dom", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert "CONSOLE" not in done.stderr
+    return done.stdout
