@@ -12,6 +12,7 @@ from torch import Tensor
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import available_simd, describe_machine, limited_to
 from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
+from avatar.bench.splat_work import Work
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.types import Gaussians, Rendering
@@ -179,6 +180,10 @@ def draw(variant: Variant, gaussians: Gaussians, size: int, function: Draw = spl
         return function(gaussians, head_camera(size), torch.zeros(3), backend=variant.backend)
 
 
-def as_json(rows: Sequence[Row]) -> dict[str, Any]:
-    """All figures, with the machine that they belong to; milliseconds."""
-    return {"machine": describe_machine(), "rows": [asdict(row) for row in rows]}
+def as_json(rows: Sequence[Row], works: Sequence[Work]) -> dict[str, Any]:
+    """All figures, with the machine that they belong to; milliseconds and bytes."""
+    return {
+        "machine": describe_machine(),
+        "rows": [asdict(row) for row in rows],
+        "work": [asdict(work) for work in works],
+    }

@@ -7,8 +7,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from avatar.bench import Request
+from avatar.bench.floor import measured_copy_bandwidth, measured_flops
+from avatar.bench.machine import available_simd
 from avatar.bench.scenes import HEAD_SPLATS
 from avatar.bench.splat import Row, all_variants, as_json, measure
+from avatar.bench.splat_work import Work, floors, work_of
 
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
 USUAL_SIZES, USUAL_COUNTS = (256, 512), (HEAD_SPLATS, 50_000)
@@ -26,8 +29,14 @@ def run(request: Request) -> None:
         rows = measure(all_variants(sizes, counts), repeats=21, validation_size=512)
     for line in table(rows):
         print(line)
+    works = [
+        work_of(*scene, with_memory=not request.quick)
+        for scene in dict.fromkeys((row.variant.count, row.variant.size) for row in rows)
+    ]
+    for line in work_table(rows, works):
+        print(line)
     figures, plot = out / "bench_splat.json", out / "bench_splat.png"
-    figures.write_text(json.dumps(as_json(rows), indent=1) + "\n", encoding="utf-8")
+    figures.write_text(json.dumps(as_json(rows, works), indent=1) + "\n", encoding="utf-8")
     write_plot(rows, plot)
     print(f"\nFigures  {figures}\nPlot     {plot}")
 
@@ -46,6 +55,38 @@ def table(rows: Iterable[Row]) -> list[str]:
         lines.append(
             f"{label(row):>18} {variant.count:7,} {variant.size:5} {variant.threads:7} {forward:>17} {backward:>17} "
             f"{total(row):8.2f} {errors}"
+        )
+    return lines
+
+
+def work_table(rows: Sequence[Row], works: Sequence[Work]) -> list[str]:
+    """What every scene asks for, and which part of the time of the fastest kernel the machine's own limits explain.
+
+    Pairs are of a splat and a tile: by the exact ellipse, and by a square of three standard deviations.
+    """
+    best = [row for row in rows if row.variant.simd == available_simd()[-1]]
+    lines = [
+        "",
+        f"{'splats':>7} {'size':>5} {'pairs':>9} {'by 3 sigma':>10} {'evaluated':>11} {'composited':>11} {'memory MB':>9} "
+        f"{'threads':>7} {'floor ms':>13} {'reached':>13}",
+    ]
+    for work in works:
+        n = work.counters
+        memory = "-" if work.memory is None else f"{work.memory / 1e6:.1f}"
+        for row in (r for r in best if (r.variant.count, r.variant.size) == (work.count, work.size)):
+            limits = floors(work, row.variant.threads)
+            times = row.timing.forward.median, row.timing.backward.median
+            floor_cell = " + ".join(f"{limit:.1f}" for limit in limits)
+            reached = " + ".join(f"{limit / time:.0%}" for limit, time in zip(limits, times, strict=True))
+            lines.append(
+                f"{work.count:7,} {work.size:5} {n['pairs']:9,} {n['pairs_in_squares']:10,} {n['pixels_evaluated']:11,} "
+                f"{n['pixels_composited']:11,} {memory:>9} {row.variant.threads:7} {floor_cell:>13} "
+                f"{reached:>13}"
+            )
+    for threads in sorted({row.variant.threads for row in best}):
+        rates = measured_flops(threads) / 1e9, measured_copy_bandwidth(threads) / 1e9
+        lines.append(
+            f"The floor, threads {threads}: {rates[0]:.1f} GFLOP/s of a matrix product, {rates[1]:.1f} GB/s of a copy"
         )
     return lines
 

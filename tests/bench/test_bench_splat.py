@@ -33,6 +33,12 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
         if row["accuracy"]:
             assert row["accuracy"]["image"] <= 1e-5
             assert row["accuracy"]["gradient"] <= 1e-4
+    scenes = {(row["variant"]["count"], row["variant"]["size"]) for row in written["rows"]}
+    assert {(work["count"], work["size"]) for work in written["work"]} == scenes
+    for work in written["work"]:
+        numbers = work["counters"]
+        assert 0 < numbers["pixels_composited"] <= numbers["pixels_evaluated"]
+        assert numbers["pairs"] <= numbers["pairs_in_boxes"]
     assert (tmp_path / "out" / "bench_splat.png").read_bytes().startswith(b"\x89PNG")
     lines = [line for line in capsys.readouterr().out.splitlines() if line.lstrip().startswith(("cpu", "reference"))]
     assert len(lines) == len(written["rows"])

@@ -1,0 +1,42 @@
+"""What this machine can do at best: the arithmetic and the memory traffic of a function give a time that it cannot beat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import torch
+
+from avatar.bench.clock import paired_medians
+
+MATRIX = 1024  # side of the multiplied matrices
+COPIED = 1 << 26  # bytes, far beyond the caches
+
+
+@cache
+def measured_flops(threads: int) -> float:
+    """Floating-point operations a second of PyTorch's float32 matrix product, the fastest arithmetic there is here."""
+    a, b = torch.randn(MATRIX, MATRIX), torch.randn(MATRIX, MATRIX)
+    return 2 * MATRIX**3 / _seconds(lambda: torch.mm(a, b), threads)
+
+
+@cache
+def measured_copy_bandwidth(threads: int) -> float:
+    """Bytes a second, read and written ones counted, of copying a tensor that fits in no cache."""
+    source = torch.ones(COPIED // 4)
+    target = torch.empty_like(source)
+    return 2 * COPIED / _seconds(lambda: target.copy_(source), threads)
+
+
+def floor_ms(operations: float, moved: float, threads: int) -> float:
+    """Milliseconds for so many floating-point operations and moved bytes, whichever takes longer."""
+    return 1e3 * max(operations / measured_flops(threads), moved / measured_copy_bandwidth(threads))
+
+
+def _seconds(function: Callable[[], object], threads: int) -> float:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        return paired_medians({"": function}, repeats=9)[""].median / 1e3
+    finally:
+        torch.set_num_threads(before)

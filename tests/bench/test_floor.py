@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+
+from avatar.bench.floor import floor_ms, measured_copy_bandwidth, measured_flops
+from avatar.bench.splat_work import operations_and_bytes, peak_memory
+from avatar.splat import Counters
+
+
+def test_the_longer_of_arithmetic_and_traffic_is_the_floor() -> None:
+    flops, bandwidth = measured_flops(1), measured_copy_bandwidth(1)
+    assert 1e8 < flops < 1e14 and 1e8 < bandwidth < 1e13
+    assert floor_ms(flops, 0.5 * bandwidth, 1) == 1e3
+    assert floor_ms(0.5 * flops, 2 * bandwidth, 1) == 2e3
+
+
+def test_measuring_leaves_the_threads_of_torch() -> None:
+    threads = torch.get_num_threads()
+    measured_flops.__wrapped__(threads + 1)
+    assert torch.get_num_threads() == threads
+
+
+def test_work_grows_with_pixels_evaluated_and_with_splats() -> None:
+    nothing = Counters(*(0 for _ in Counters._fields))
+    some = nothing._replace(pixels_evaluated=10, pairs=3, visible=2)
+    assert operations_and_bytes(nothing, 1, 1) == ((0, 252), (0, 504))
+    assert operations_and_bytes(some, 1, 1) == ((320, 252 + 2 * 152), (540, 504 + 152 + 216))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark is Linux's")
+def test_peak_memory_is_that_of_the_drawing() -> None:
+    # A hundred thousand splats have 23.6 MB of gradients alone.
+    assert 23.6e6 < peak_memory(100_000, 64) < 400e6
