@@ -90,6 +90,14 @@ def build_parser() -> argparse.ArgumentParser:
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
     add_run(report)
 
+    compare = commands.add_parser("compare", help="set evaluated runs side by side, with differences to the first")
+    compare.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs that avatar eval has measured")
+    compare.add_argument("--protocol", action="append", metavar="NAME", help="only this protocol; may be repeated")
+    compare.add_argument(
+        "--format", choices=("text", "markdown", "latex", "csv"), default="text", help="what is printed"
+    )
+    compare.add_argument("--out", type=Path, metavar="DIR", help="write compare.txt, .md, .tex and .csv there too")
+
     reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
     add_run(reenact)
     reenact.add_argument(

@@ -22,6 +22,8 @@ from avatar.doctor import report as report_installation
 from avatar.drive import Drive, subject_drive
 from avatar.drive_file import read_drive, write_drive
 from avatar.errors import UserError
+from avatar.evaluation.compare import compare as compare_runs
+from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.expression_names import load_expression_names
@@ -125,6 +127,16 @@ def refuse_changes(run: Path, config: Config, overrides: list[str]) -> None:
             raise UserError(
                 f"{run} began with {key}={recorded[key]}, not {value}: leave the override out to resume, or start a new run"
             )
+
+
+def compare(arguments: Namespace) -> int:
+    comparison = compare_runs(arguments.runs, arguments.protocol)
+    if arguments.out is not None:
+        write_tables(arguments.out, comparison)
+        print(f"Written to {arguments.out}", file=sys.stderr)  # the table may be piped
+    _, table = FORMATS[arguments.format]
+    print(table(comparison), end="")
+    return OK
 
 
 def eval(arguments: Namespace) -> int:

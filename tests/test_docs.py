@@ -11,7 +11,19 @@ import pytest
 from avatar.cli import parse
 from avatar.config import load_config
 
-COMMANDS = ("train", "eval", "reenact", "drive-file", "report", "check", "prepare", "demo-data", "demo", "bench")
+COMMANDS = (
+    "train",
+    "eval",
+    "compare",
+    "reenact",
+    "drive-file",
+    "report",
+    "check",
+    "prepare",
+    "demo-data",
+    "demo",
+    "bench",
+)
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 

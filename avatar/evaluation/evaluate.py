@@ -12,6 +12,7 @@ Renders and truths are measured as the pictures that the PNG files hold, so that
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -93,7 +94,7 @@ def evaluate(
 
     for protocol in chosen:
         add_jitter(results[protocol.name], jitter[protocol.look], run)
-    summary = {
+    summary: dict[str, Any] = {
         "format": RESULTS_FORMAT,
         "subject": subject.name,
         "data_hash": subject.data_hash,
@@ -111,8 +112,9 @@ def evaluate(
         },
     }
     for protocol in chosen:
-        rows = frames_csv(protocol.columns, results[protocol.name])
-        write_atomically(folder / protocol.name / "frames.csv", rows.encode())
+        rows = frames_csv(protocol.columns, results[protocol.name]).encode()
+        write_atomically(folder / protocol.name / "frames.csv", rows)
+        summary["protocols"][protocol.name]["frames_sha256"] = hashlib.sha256(rows).hexdigest()
     worst = summary["protocols"][chosen[0].name]["worst"]
     (folder / "worst.png").unlink(missing_ok=True)
     if worst:  # none where every frame is drawn without an error

@@ -92,6 +92,11 @@ def test_eval_prints_the_table_and_writes_what_it_says(trained: Path) -> None:
     video = trained / "eval" / "truth_render_error.mp4"
     assert str(video) in output
     assert len(iio.imread(video)) == 6  # 20% of 30 frames
+    compared = avatar("compare", trained, trained, "--format", "csv", "--out", trained / "compared")
+    assert f"strict,psnr,{trained},6,{results['protocols']['strict']['means']['psnr']:.6f},0.000000," in compared
+    assert {path.name for path in (trained / "compared").iterdir()} == {
+        f"compare.{s}" for s in ("txt", "md", "tex", "csv")
+    }
     assert "hypergaussians" in avatar("eval", trained, "--protocol", "hypergaussians")
 
 

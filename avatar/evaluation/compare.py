@@ -1,0 +1,201 @@
+"""Runs side by side: means over the frames that all of them were evaluated on, and paired differences to the first run.
+
+Pairing by frame takes out what makes a frame hard for every avatar, so that a difference can be told from chance where the
+intervals of the two means still overlap.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avatar.errors import UserError
+from avatar.evaluation.bootstrap import BlockBootstrap, Interval
+from avatar.evaluation.evaluate import RESULTS_FORMAT
+
+NEEDED = {"data_hash", "head_fingerprint", "image_size", "protocols"}  # of results.json
+NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What `avatar eval` left in a run."""
+
+    label: str
+    folder: Path  # RUN/eval
+    results: Mapping[str, Any]
+
+    def figures(self, protocol: str) -> dict[str, dict[str, float]]:
+        """Name of the frame -> figures, in the order of the video, as frames.csv holds them."""
+        path = self.folder / protocol / "frames.csv"
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise UserError(f"{path} cannot be read ({error.strerror}); evaluate the run again") from None
+        entry = self.results["protocols"][protocol]
+        if hashlib.sha256(data).hexdigest() != entry["frames_sha256"]:
+            raise UserError(f"{path} is not the file that results.json was written with; evaluate the run again")
+        return {
+            row["name"]: {name: float(row[name]) for name in entry["means"]}
+            for row in csv.DictReader(io.StringIO(data.decode()))
+        }
+
+
+class Cell(NamedTuple):
+    """One figure of one run."""
+
+    mean: float  # over the frames in which it is finite for every run
+    difference: float | None  # to the first run; None for the first run itself
+    interval: Interval | None  # of the difference
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the interval of the difference leaves out 0."""
+        return self.interval is not None and not self.interval[0] <= 0.0 <= self.interval[1]
+
+
+@dataclass(frozen=True)
+class ProtocolComparison:
+    """All runs by one protocol."""
+
+    protocol: str
+    frames: int  # that all runs have
+    block: int  # frames in a block of the bootstrap
+    rows: Mapping[str, Sequence[Cell]]  # figure -> one cell per run
+
+
+@dataclass(frozen=True)
+class Comparison:
+    labels: Sequence[str]  # of the runs
+    protocols: Sequence[ProtocolComparison]
+    notes: Sequence[str]  # for people: what was left out, and why
+
+
+def compare(runs: Sequence[Path], protocols: Sequence[str] | None = None) -> Comparison:
+    """The runs by each protocol that all of them have, or by those named.
+
+    Raises UserError for less than two runs, a run that was not evaluated, runs of other data, head model or image size
+    than the first, and runs that have no protocol or no frame in common.
+    """
+    if len(runs) < 2:
+        raise UserError("there is nothing to compare: give at least two runs")
+    names = [path.resolve().name for path in runs]
+    labels = [name if names.count(name) == 1 else str(path) for name, path in zip(names, runs, strict=True)]
+    evaluations = [read_evaluation(label, path) for label, path in zip(labels, runs, strict=True)]
+    for other in evaluations[1:]:
+        check_same(evaluations[0], other)
+    notes: list[str] = []
+    comparisons = []
+    for name in common_protocols(evaluations, protocols, notes):
+        comparison = compare_protocol(evaluations, name, notes)
+        if comparison is not None:
+            comparisons.append(comparison)
+    if not comparisons:
+        raise UserError(
+            f"{' and '.join(labels)} cannot be compared: {'; '.join(notes) or 'no protocol is in all of them'}"
+        )
+    return Comparison(labels, comparisons, notes)
+
+
+def read_evaluation(label: str, run: Path) -> Evaluation:
+    path = run / "eval" / "results.json"
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{run} was not evaluated (there is no {path}): run avatar eval {run} first") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read ({error}); evaluate the run again") from None
+    if not isinstance(results, dict) or results.get("format") != RESULTS_FORMAT:
+        raise UserError(f"{path} was written by another version of this program; evaluate the run again")
+    if missing := NEEDED - results.keys():
+        raise UserError(f"{path} is damaged ({', '.join(sorted(missing))} missing); evaluate the run again")
+    return Evaluation(label, path.parent, results)
+
+
+def check_same(first: Evaluation, other: Evaluation) -> None:
+    """Figures of other data, another head model or another image size say nothing about which avatar is better."""
+    for key, what in (
+        ("data_hash", "other data"),
+        ("head_fingerprint", "another head model"),
+        ("image_size", "another image size"),
+    ):
+        ours, theirs = first.results[key], other.results[key]
+        if ours != theirs:
+            shown = [
+                str(value)[:12] if isinstance(value, str) else "x".join(map(str, value)) for value in (theirs, ours)
+            ]
+            raise UserError(f"{other.label} was evaluated on {what} than {first.label} ({shown[0]}, not {shown[1]})")
+
+
+def common_protocols(evaluations: Sequence[Evaluation], wanted: Sequence[str] | None, notes: list[str]) -> list[str]:
+    """Names of the protocols that all runs have with the same choices; those that are left out go into `notes`."""
+    first, *others = evaluations
+    chosen = []
+    for name in wanted or first.results["protocols"]:
+        lacking = [each.label for each in evaluations if name not in each.results["protocols"]]
+        differing = {
+            key
+            for other in others
+            if not lacking
+            for key, value in other.results["protocols"][name]["choices"].items()
+            if key not in NOT_COMPARED and value != first.results["protocols"][name]["choices"].get(key)
+        }
+        if lacking:
+            notes.append(f"{name} was not measured for {', '.join(lacking)}")
+        elif differing:
+            notes.append(f"{name} differs between the runs in {', '.join(sorted(differing))}")
+        else:
+            chosen.append(name)
+    return chosen
+
+
+def compare_protocol(evaluations: Sequence[Evaluation], name: str, notes: list[str]) -> ProtocolComparison | None:
+    """The comparison over the frames that all runs have; None, with a note, where there are none."""
+    tables = [evaluation.figures(name) for evaluation in evaluations]
+    frames = [frame for frame in tables[0] if all(frame in table for table in tables)]
+    if not frames:
+        notes.append(f"{name} was measured on frames of which none is in all runs")
+        return None
+    if missing := max(len(table) for table in tables) - len(frames):
+        notes.append(
+            f"{name}: {len(frames)} frames are in all runs, {missing} more in some; only the common ones count"
+        )
+    entries = [evaluation.results["protocols"][name] for evaluation in evaluations]
+    networks = {entry["lpips"]["weights_sha256"] for entry in entries}
+    if len(networks) > 1:
+        notes.append(f"{name}: LPIPS is left out, because the runs were measured with different networks")
+    block = max(1, min(entries[0]["bootstrap"]["block_frames"], len(frames) // 4))
+    bootstrap = BlockBootstrap(len(frames), block)
+    rows: dict[str, list[Cell]] = {}
+    empty = []
+    for figure in entries[0]["means"]:
+        if figure.startswith("lpips") and len(networks) > 1:
+            continue
+        values = np.array([[table[frame][figure] for frame in frames] for table in tables])
+        values[:, ~np.isfinite(values).all(axis=0)] = np.nan
+        if np.isnan(values).all():
+            empty.append(figure)
+            continue
+        first, *others = values
+        rows[figure] = [Cell(_mean(first), None, None), *(_cell(own, first, bootstrap) for own in others)]
+    if empty:
+        notes.append(f"{name}: in no frame of all runs is there {', '.join(empty)}")
+    return ProtocolComparison(name, len(frames), block, rows)
+
+
+def _cell(values: np.ndarray, first: np.ndarray, bootstrap: BlockBootstrap) -> Cell:
+    return Cell(_mean(values), _mean(values - first), bootstrap.interval(values - first))
+
+
+def _mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)].tolist()
+    return math.fsum(finite) / len(finite)
