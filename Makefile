@@ -10,7 +10,7 @@ NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
 
-.PHONY: help setup demo test stress sanitize arm64 check format smoke wheel clean
+.PHONY: help setup demo test stress fuzz sanitize arm64 check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
@@ -24,6 +24,9 @@ test: setup ## run all tests
 
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress
+
+fuzz: setup ## give every reader damaged and hostile files (FUZZ_CASES=20000 in all)
+	AVATAR_FUZZ_CASES=$(FUZZ_CASES) $(BIN)/python -m pytest --timeout=0 -rP tests/fuzz
 
 sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh

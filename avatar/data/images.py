@@ -13,6 +13,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
+MAX_PIXELS = 2**26  # 8192x8192; a decoder allocates what the header says before it looks how much there is
 _TAIL = 4096  # some writers pad after the end marker
 
 
@@ -64,6 +65,9 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
         raise UserError(f"{path} is neither a JPEG nor a PNG file, whatever its name says")
     if not complete:
         raise UserError(f"{path} is cut short; write or copy it again")
+    width, height = _declared_size(data)
+    if width * height > MAX_PIXELS:
+        raise UserError(f"{path} claims to have {width}x{height} pixels; images of more than {MAX_PIXELS} are not read")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:  # absurd dimensions in the header
@@ -71,3 +75,24 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     if image is None:
         raise UserError(f"{path} is damaged and cannot be decoded; write or copy it again")
     return image
+
+
+def _declared_size(data: bytes) -> tuple[int, int]:
+    """The largest (width, height) in the headers of a PNG or JPEG; (0, 0) where there is none, which decoders refuse."""
+    if data.startswith(_PNG_START):
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    largest = (0, 0)
+    at = len(_JPEG_START) - 1
+    while at + 9 <= len(data):
+        if data[at] != 0xFF:
+            at += 1  # image data, or filling between segments
+            continue
+        marker = data[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
+            size = int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+            largest = max(largest, size, key=lambda wh: wh[0] * wh[1])
+        if marker == 0xDA:  # the image data begin, in which no marker but the end's means anything here
+            break
+        has_length = 0xC0 <= marker <= 0xFE and not 0xD0 <= marker <= 0xD9
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big") if has_length else 1
+    return largest

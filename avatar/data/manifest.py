@@ -171,6 +171,7 @@ def _relative_or_none(value: Any) -> str | None:
 def _relative(value: str) -> str:
     """Frame files must stay inside the folder that the manifest names."""
     escapes = any(p.is_absolute() or p.drive or ".." in p.parts for p in (PurePosixPath(value), PureWindowsPath(value)))
+    value.encode()  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
     if not value or escapes or "\0" in value:
         raise ValueError(f"the path {value!r} leaves the subject's folder")
     return value

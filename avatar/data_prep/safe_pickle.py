@@ -8,8 +8,11 @@ in the file are compared with a list and never imported, so there is nothing tha
 from __future__ import annotations
 
 import io
+import math
 import struct
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,8 @@ _MALFORMED = (
     RecursionError,
     struct.error,
 )  # what reading nonsense as a pickle runs into
+
+_BAD_ZIP = (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError)  # the same for an archive
 
 
 class UnsafeFileError(UserError):
@@ -67,24 +72,55 @@ def load_torch_pickle(source: Path | str | bytes, name: str | None = None) -> An
                 return storage_array(identity, lambda key: archive.read(f"{root}data/{key}"), budget)
 
             return _unpickle_all(archive.read(pickles[0]), name, count=1, persistent=load_storage)[0]
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError, struct.error) as error:
-        raise UserError(f"{name} is damaged or cut short ({error}); write or copy it again") from error
+    except (*_BAD_ZIP, *_MALFORMED) as error:
+        raise UserError(f"{name} is damaged or cut short ({_short(error)}); write or copy it again") from error
 
 
 def load_npz(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a .npz file; pickled objects inside are refused. Raises UserError naming the file."""
     try:
-        with zipfile.ZipFile(path) as members:
-            if sum(info.file_size for info in members.infolist()) > MAX_FILE_BYTES:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if sum(info.file_size for info in members) > MAX_FILE_BYTES:
                 raise UserError(f"{path} would unpack to more than {MAX_FILE_BYTES} bytes; such files are not read")
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
+            return {info.filename.removesuffix(".npy"): _parse_npy(archive.read(info), path) for info in members}
     except FileNotFoundError as error:
         raise UserError(f"{path} does not exist") from error
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, MemoryError) as error:
-        if "allow_pickle" in str(error) or "pickled" in str(error):
-            raise UserError(f"{path} holds pickled Python objects; save it again with plain numeric arrays") from error
-        raise UserError(f"{path} is damaged or not a .npz file ({error})") from error
+    except (*_MALFORMED, *_BAD_ZIP, zlib.error) as error:
+        raise UserError(f"{path} is damaged or not a .npz file ({_short(error)})") from error
+
+
+def load_npy(path: Path) -> np.ndarray:
+    """The array of a .npy file; pickled objects are refused. Raises UserError naming the file."""
+    data, _ = _read(path, None)
+    return _parse_npy(data, path)
+
+
+def _parse_npy(data: bytes, path: Path) -> np.ndarray:
+    """numpy allocates what the header says before it looks how much there is, so the header is compared first."""
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, is_fortran, dtype = read_header(stream)
+        if dtype.hasobject:
+            raise UserError(f"{path} holds pickled Python objects; save it again with plain numeric arrays")
+        needed, given = math.prod(shape) * dtype.itemsize, len(data) - stream.tell()
+        if min(shape, default=0) < 0 or needed != given:
+            raise UserError(f"{path} is damaged: an array of shape {list(shape)} needs {needed} bytes, it has {given}")
+        flat = np.frombuffer(data, dtype, offset=stream.tell())
+        return flat.reshape(shape, order="F" if is_fortran else "C").copy()
+    except (*_MALFORMED, SyntaxError, tokenize.TokenError) as error:
+        raise UserError(f"{path} is damaged or holds no numpy arrays ({_short(error)})") from error
+
+
+def _short(error: Exception) -> str:
+    """What went wrong, without the pages of the file that some reasons quote."""
+    text = str(error)
+    return text if len(text) <= 400 else f"{text[:300]} ... {text[-80:]}"
 
 
 def _read(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
@@ -119,6 +155,6 @@ def _unpickle_all(data: bytes, name: str, count: int, persistent: PersistentLoad
     try:
         return [resolve(PickleMachine(stream, budget, persistent).run(), budget) for _ in range(count)]
     except Refused as error:
-        raise UnsafeFileError(f"{name} was not read: {error}") from error
+        raise UnsafeFileError(f"{name} was not read: {_short(error)}") from error
     except _MALFORMED as error:
-        raise UserError(f"{name} is damaged, cut short or not a pickle ({error})") from error
+        raise UserError(f"{name} is damaged, cut short or not a pickle ({_short(error)})") from error

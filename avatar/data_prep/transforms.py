@@ -69,7 +69,7 @@ class ListedFrame:
         if value is None:
             return None
         where = f"{self.listing}: {key} of frame {self.position}"
-        if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
+        if not is_path(value):
             raise UserError(f"{where} is not a path; export the folder again")
         forms = PurePosixPath(value), PureWindowsPath(value)
         if any(form.is_absolute() or form.drive or ".." in form.parts for form in forms):
@@ -77,6 +77,16 @@ class ListedFrame:
                 f"{where} is {value!r}, which leaves {self.listing.parent}; give a folder that holds its own frames"
             )
         return self.listing.parent / value
+
+
+def is_path(value: Any) -> bool:
+    """Whether the value is text that a file system takes as a path: encodable, and no part of it too long."""
+    if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
+        return False
+    try:
+        return max(len(part.encode()) for part in value.split("/")) <= 255
+    except UnicodeEncodeError:
+        return False
 
 
 def read_listings(folder: Path) -> list[ListedFrame]:

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.data_prep.safe_pickle import load_npz, load_pickle
+from avatar.data_prep.safe_pickle import load_npy, load_npz, load_pickle
 from avatar.errors import UserError
 from avatar.head.uv_obj import read_uv_obj
 
@@ -186,11 +186,7 @@ def _read_eyelids(folder: Path, V: int) -> np.ndarray:
         file = folder / name
         if not file.is_file():
             continue
-        try:
-            loaded = np.load(file, allow_pickle=False)
-        except (ValueError, OSError, EOFError) as error:
-            raise UserError(f"{file} is not a readable .npy file ({error})") from None
-        eyelids[side] = _array({name: loaded.squeeze()}, name, file, (V, 3))
+        eyelids[side] = _array({name: load_npy(file).squeeze()}, name, file, (V, 3))
     return eyelids
 
 

@@ -47,8 +47,12 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
             f"{file} has {positions} vertices and {len(corners)} triangles, but the head model has {num_vertices} and "
             f"{len(faces)}; the UV layout must be of the same topology"
         )
-    layout = np.asarray(corners, dtype=np.int64).reshape(-1, 3, 2)
-    uv_array = np.asarray(uvs, dtype=np.float32).reshape(-1, 2)
+    try:
+        layout = np.asarray(corners, dtype=np.int64).reshape(-1, 3, 2)
+    except OverflowError:
+        raise UserError(f"{file}: a face names a vertex or a UV by a number that no file can have") from None
+    with np.errstate(over="ignore"):  # what float32 cannot hold is found to be not finite below
+        uv_array = np.asarray(uvs, dtype=np.float64).reshape(-1, 2).astype(np.float32)
     if not np.isfinite(uv_array).all() or layout[..., 1].min() < 0 or layout[..., 1].max() >= len(uv_array):
         raise UserError(f"{file}: a face names a UV outside the {len(uv_array)} vt lines, or a vt line is not finite")
     return uv_array, _in_order_of(faces, layout, file)

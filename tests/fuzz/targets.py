@@ -1,0 +1,171 @@
+"""Every reader of files that come from elsewhere, with valid files to start from."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import shutil
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from exports import write_imavatar, write_insta, write_vhap
+from scipy import sparse
+from tracked_folder import write_tracked_folder
+
+from avatar.checkpoint import Checkpoint, load_checkpoint, read_run_info, save_checkpoint, write_run_info
+from avatar.config import load_config
+from avatar.data.images import decode_image, decode_mask
+from avatar.data.subject import Subject
+from avatar.data_prep.formats import open_tracked_folder
+from avatar.data_prep.metrical_tracker import read_tracking
+from avatar.data_prep.prepare import prepare
+from avatar.data_prep.safe_pickle import load_npz, load_pickle, load_torch_pickle
+from avatar.evaluation.protocol import read_protocol
+from avatar.head.assets import load_head_assets
+from avatar.head.uv_obj import read_uv_obj
+
+PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
+
+Reader = tuple[Path | None, Callable[[bytes], object]]  # the file to put the bytes into, if any; what reads them
+
+
+@dataclass(frozen=True)
+class Target:
+    """Valid files and what reads them; `weight` is the share of the cases."""
+
+    seeds: list[bytes]
+    reader: Reader
+    weight: float = 1.0
+    wrap: Callable[[bytes], bytes] = bytes  # makes a file of mutated contents, with checksums that fit
+
+
+def make_targets(place: Path) -> dict[str, Target]:
+    """`place` is an empty folder for the files that readers open."""
+    tracked = write_tracked_folder(place / "tracked", 6, 24)
+    head = load_head_assets(tracked / "head_model")
+    prepared = prepare(
+        tracked, head, tracked / "head_model", frame_offset=1, out=place / "prepared", say=lambda _: None
+    )
+    folders = {
+        "vhap": write_vhap(tracked, place / "vhap", divided=False) / "transforms.json",
+        "insta": write_insta(tracked, place / "insta") / "transforms_train.json",
+        "imavatar": write_imavatar(tracked, place / "imavatar") / "flame_params.json",
+    }
+    frame = (tracked / "checkpoint" / "00003.frame").read_bytes()
+    tensors = {"model.weight": torch.arange(6.0).reshape(2, 3), "optimizer.step": torch.ones(())}
+    checkpoint = save_checkpoint(place / "run" / "checkpoints", Checkpoint(7, tensors, {"data_hash": "ab"}), 1)
+    write_run_info(place / "run", {"folder": "x", "head": "y", "tracking": None, "frame_offset": None, "config": {}})
+    picture = cv2.imread(str(tracked / "imgs" / "00002.jpg"))
+    assert picture is not None
+
+    def on_disk(path: Path, read: Callable[[Path], object]) -> Reader:
+        return path, lambda _: read(path)
+
+    def of_copy(file: Path, folder: Path, read: Callable[[Path], object]) -> Reader:
+        """Reads a copy of `folder` in which `file` is another one."""
+        copy = place / f"copy of {folder.name} for {file.name}"
+        shutil.copytree(folder, copy)
+        return copy / file.relative_to(folder), lambda _: read(copy)
+
+    def listed(folder: Path) -> object:
+        source = open_tracked_folder(folder)
+        return source.read(head, (24, 24))
+
+    def first_frame(folder: Path) -> object:
+        return Subject.open(folder).frame(0)
+
+    def image(data: bytes) -> object:
+        return decode_image(data, Path("x.png")), decode_mask(data, Path("x.png"))
+
+    faces, V = head.faces.numpy(), head.num_vertices
+    parameters = folders["vhap"].parent / "flame_param" / "00002.npz"
+    with zipfile.ZipFile(parameters) as archive:
+        arrays = {name: archive.read(name) for name in archive.namelist()}
+    objects = {
+        "a": np.arange(6).reshape(2, 3),
+        "s": sparse.csc_matrix(np.eye(3)),
+        "l": [1, 2.5, "text", None, True, (1,), {"k": b"bytes"}],
+    }
+    model = tracked / "head_model"
+    parts = {
+        file.name: Target([file.read_bytes()], of_copy(file, model, load_head_assets), 0.25) for file in model.iterdir()
+    }
+    images = [
+        _encoded(picture, ".jpg"),
+        _encoded(picture, ".png"),
+        _encoded(np.dstack((picture, picture[..., 0])), ".png"),
+    ]
+    in_torch: Reader = None, lambda data: load_torch_pickle(data, "x")
+    content, npz = _member(frame, "data.pkl"), parameters.read_bytes()
+    run, manifest, tracks = place / "run" / "run.json", prepared / "manifest.json", prepared / "tracks.safetensors"
+
+    def listing(name: str, weight: float) -> Target:
+        return Target([folders[name].read_bytes()], of_copy(folders[name], folders[name].parent, listed), weight)
+
+    def in_frame(data: bytes) -> bytes:
+        return _with_member(frame, "data.pkl", data)
+
+    return {
+        "pickle": Target(
+            [pickle.dumps(objects, protocol=p) for p in range(6)], (None, lambda d: load_pickle(d, "x")), 3
+        ),
+        "torch": Target([frame, _legacy(frame)], in_torch),
+        "torch, checksums right": Target([content], in_torch, 2, in_frame),
+        ".frame": Target([content], on_disk(place / "0.frame", lambda p: read_tracking({0: p})), 2, in_frame),
+        "npz": Target([npz], on_disk(place / "x.npz", load_npz)),
+        "npz, checksums right": Target(
+            [arrays["expr.npy"]], on_disk(place / "y.npz", load_npz), 2, lambda d: _with_member(npz, "expr.npy", d)
+        ),
+        "VHAP listing": listing("vhap", 2),
+        "INSTA listing": listing("insta", 1),
+        "IMavatar listing": listing("imavatar", 2),
+        "manifest": Target([manifest.read_bytes()], of_copy(manifest, prepared, first_frame), 2),
+        "tracks": Target([tracks.read_bytes()], of_copy(tracks, prepared, first_frame)),
+        "checkpoint": Target([checkpoint.read_bytes()], on_disk(place / "x.safetensors", load_checkpoint)),
+        "run.json": Target([run.read_bytes()], on_disk(run, lambda p: read_run_info(p.parent))),
+        "UV obj": Target(
+            [(model / "head_template.obj").read_bytes()],
+            on_disk(place / "x.obj", lambda p: read_uv_obj(p, faces, V)),
+            0.5,
+        ),
+        "head model": parts["generic_model.pkl"],
+        "regions": parts["FLAME_masks.pkl"],
+        "eyelid": parts["l_eyelid.npy"],
+        "image": Target(images, (None, image), 2),
+        "protocol": Target(
+            [p.read_bytes() for p in PROTOCOLS.glob("*.yaml")], on_disk(place / "x.yaml", read_protocol)
+        ),
+        "override": Target(
+            [b"trainer.iterations=3", b"model=flashavatar", b"data.size=64", b"trainer.seed=1"],
+            (None, lambda d: load_config([d.decode("utf-8", "replace")])),
+            0.25,
+        ),
+    }
+
+
+def _encoded(image: np.ndarray, suffix: str) -> bytes:
+    return cv2.imencode(suffix, image)[1].tobytes()
+
+
+def _legacy(frame: bytes) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(torch.load(io.BytesIO(frame), weights_only=False), buffer, _use_new_zipfile_serialization=False)
+    return buffer.getvalue()
+
+
+def _member(archive: bytes, ending: str) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(archive)) as members:
+        return members.read(next(name for name in members.namelist() if name.endswith(ending)))
+
+
+def _with_member(archive: bytes, ending: str, content: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(archive)) as old, zipfile.ZipFile(buffer, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, content if name.endswith(ending) else old.read(name))
+    return buffer.getvalue()

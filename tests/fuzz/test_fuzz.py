@@ -1,0 +1,193 @@
+"""Damaged and hostile files: every reader answers with the data or with one sentence, soon, in bounded memory.
+
+AVATAR_FUZZ_CASES sets the number of mutated files of all readers together; the default is a short run for every day. A case
+is found again by the reader's name and its number, which a failure prints.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickletools
+import random
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mutate import mutate
+from targets import Target, make_targets
+from watch import Forbidden, memory_cap, watched
+
+from avatar.data.images import MAX_PIXELS, decode_image, decode_mask
+from avatar.data_prep.safe_pickle import load_npy, load_npz, load_pickle
+from avatar.errors import UserError
+
+CASES = int(os.environ.get("AVATAR_FUZZ_CASES", "600"))
+SECONDS = 5.0  # for one file of a few kilobytes, on a busy machine
+NAMES = (
+    "pickle", "torch", "torch, checksums right", ".frame", "npz", "npz, checksums right", "VHAP listing",
+    "INSTA listing", "IMavatar listing", "manifest", "tracks", "checkpoint", "run.json", "UV obj", "head model", "regions",
+    "eyelid", "image", "protocol", "override",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
+    return make_targets(tmp_path_factory.mktemp("fuzz"))
+
+
+def test_all_readers_are_fuzzed(targets: dict[str, Target]) -> None:
+    assert tuple(targets) == NAMES
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("name", NAMES)
+def test_reader(name: str, targets: dict[str, Target]) -> None:
+    target = targets[name]
+    for seed in target.seeds:
+        assert is_read(target, target.wrap(seed), name), "the starting points themselves are good"
+    cases = max(5, round(CASES * target.weight / sum(t.weight for t in targets.values())))
+    accepted, slowest = 0, 0.0
+    for case in range(cases):
+        rng = random.Random(f"{name} {case}")
+        data = target.wrap(mutate(rng, rng.choice(target.seeds), target.seeds))
+        begin = time.monotonic()
+        accepted += is_read(target, data, f"{name}, case {case}")
+        slowest = max(slowest, time.monotonic() - begin)
+        assert slowest < SECONDS, f"{name}, case {case} took {slowest:.1f} s"
+    print(f"{name}: {cases} files, {accepted} read, {cases - accepted} refused, slowest {1000 * slowest:.0f} ms")
+
+
+def is_read(target: Target, data: bytes, where: str) -> bool:
+    """Whether the file was read; anything but data or a UserError is a failure, as is anything done on the side."""
+    file, read = target.reader
+    if file is not None:
+        file.write_bytes(data)
+    try:
+        with memory_cap(), watched() as events:
+            read(data)
+    except UserError as error:
+        assert not events and 0 < len(str(error)) < 4000, where
+        return False
+    except Exception as error:
+        raise AssertionError(f"{where}: {type(error).__name__}: {error}") from error
+    assert not events, where
+    return True
+
+
+def test_the_watch_sees_what_it_forbids(tmp_path: Path) -> None:
+    deeds: list[Callable[[], object]] = [
+        lambda: os.system("true"),
+        lambda: subprocess.run(["true"]),
+        lambda: (tmp_path / "marker").write_text(""),
+        lambda: tmp_path.rmdir(),
+    ]
+    for deed in deeds:
+        with watched() as events, pytest.raises(Forbidden):
+            deed()
+        assert events
+    with memory_cap(), pytest.raises(MemoryError):
+        np.ones(2**28)
+    assert list(tmp_path.iterdir()) == []
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=5)
+    | st.sampled_from(["images/a.png", ".."]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=8,
+)
+KEYS = [
+    "file_path",
+    "flame_param_path",
+    "fg_mask_path",
+    "camera_id",
+    "transform_matrix",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+]
+KEYS += [
+    "h",
+    "camera_angle_x",
+    "seg_mask_path",
+    "expression",
+    "pose",
+    "world_mat",
+    "intrinsics",
+    "shape_params",
+    "frames",
+]
+
+
+@pytest.mark.parametrize("name", ["VHAP listing", "INSTA listing", "IMavatar listing"])
+def test_listings_with_any_value_for_any_key(name: str, targets: dict[str, Target]) -> None:
+    target = targets[name]
+    good = json.loads(target.seeds[0])
+
+    @settings(
+        max_examples=max(20, CASES // 60), deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    )
+    @given(st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=3), st.dictionaries(st.sampled_from(KEYS), VALUES))
+    def check(of_frame: dict, shared: dict) -> None:
+        frames = [entry | of_frame if i == 1 else entry for i, entry in enumerate(good["frames"])]
+        is_read(target, json.dumps({**good, "frames": frames, **shared}).encode(), name)
+
+    check()
+
+
+ARGUMENTS = st.sampled_from(
+    [b"", b"\0", b"\1", b"\xff", b"\0\0\0\0", b"\1\0\0\0", b"\xff\xff\xff\x7f", b"os\nsystem\n", b"12\n"]
+)
+CODES = st.sampled_from([opcode.code.encode("latin1") for opcode in pickletools.opcodes])
+
+
+@settings(max_examples=max(200, CASES // 3), deadline=None, derandomize=True)
+@given(st.lists(st.tuples(CODES, ARGUMENTS), max_size=30))
+def test_any_sequence_of_instructions(program: list[tuple[bytes, bytes]]) -> None:
+    data = b"".join(code + argument for code, argument in program) + b"."
+    try:
+        with memory_cap(), watched() as events:
+            load_pickle(data, "x")
+    except UserError:
+        pass
+    assert not events
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_header_cannot_make_us_allocate(suffix: str) -> None:
+    data = bytearray(cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    if suffix == ".png":
+        data[16:24] = (30_000).to_bytes(4, "big") * 2
+    else:
+        start = data.index(b"\xff\xc0")
+        data[start + 5 : start + 9] = (30_000).to_bytes(2, "big") * 2
+    for decode in (decode_image, decode_mask):
+        with pytest.raises(
+            UserError, match=f"claims to have 30000x30000 pixels; images of more than {MAX_PIXELS} are not"
+        ):
+            decode(bytes(data), Path("huge"))
+
+
+def test_an_array_header_cannot_make_us_allocate(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "<f8", "fortran_order": False, "shape": (2**40,)})
+    (tmp_path / "huge.npy").write_bytes(buffer.getvalue() + b"\0" * 64)
+    with pytest.raises(UserError, match=r"an array of shape \[1099511627776\] needs 8796093022208 bytes, it has 64"):
+        load_npy(tmp_path / "huge.npy")
+    np.savez(tmp_path / "small.npz", a=np.arange(3), b=np.asfortranarray(np.eye(3)))
+    read = load_npz(tmp_path / "small.npz")
+    assert read["a"].tolist() == [0, 1, 2] and np.array_equal(read["b"], np.eye(3))
