@@ -9,6 +9,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
+FUZZ_CASES ?= 20000
 
 .PHONY: help setup demo test stress fuzz sanitize arm64 check format smoke wheel clean
 help: ## show this list
