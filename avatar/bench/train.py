@@ -11,6 +11,7 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians, time_of
+from avatar.bench.floor import floor_ms
 from avatar.bench.stages import StagedStep
 from avatar.config import Config, load_config
 from avatar.data.loader import FrameLoader
@@ -39,6 +40,7 @@ class Row:
     early: Time
     late: Time
     stages: dict[str, Time]  # of a late step
+    floors: dict[str, float]  # of the stages whose work can be counted, forward and backward together
 
 
 @dataclass
@@ -84,6 +86,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
             times[preset, False],
             per_step(times[preset, True], steps_at_once(learner)),
             stages(learner, subject, repeats),
+            floors(learner.avatar),
         )
         for preset, learner in trainees.items()
     ]
@@ -137,6 +140,30 @@ def stages(learner: Trainee, subject: Subject, repeats: int) -> dict[str, Time]:
         index, decoded = pixels[turn % len(pixels)]
         staged(number, lambda index=index, decoded=decoded: subject.assemble(index, decoded, size))
     return {name: time_of(values[2:]) for name, values in staged.watch.spans.items()}
+
+
+def floors(avatar: Avatar) -> dict[str, float]:
+    """Milliseconds in which this machine does the products, or moves the bytes, that a stage cannot do without.
+
+    Network: a product for the outputs, one for the weights' gradients and, behind the first layer, one for the inputs'.
+    Heads: parameters and latents read twice, their gradients written once, offsets and their gradients moved once.
+    Optimizer: parameters, gradients and both moments read, all but the gradients written. Check: gradients read.
+    """
+    threads, places = torch.get_num_threads(), len(avatar.code)
+    first, *others = [layer.weight for layer in avatar.deformation.modules() if isinstance(layer, torch.nn.Linear)]
+    code = first[:, : avatar.deformation.code_size].numel()
+    products = 2 * code + 3 * sum(weight.numel() for weight in others)
+    everything = sum(parameter.nbytes for parameter in avatar.parameters())
+    found = {
+        "network": floor_ms(2.0 * places * products, 0.0, threads),
+        "optimizer": floor_ms(0.0, 7.0 * everything, threads),
+        "check": floor_ms(0.0, 1.0 * everything, threads),
+    }
+    if avatar.hyper is not None:
+        own = sum(parameter.nbytes for parameter in avatar.hyper.parameters())
+        moved = 3 * own + 4 * len(avatar) * (3 * avatar.config.latent_dim + 2 * 10)
+        found["heads"] = floor_ms(0.0, moved, threads)
+    return found
 
 
 def share_of_faithful(rows: Sequence[Row]) -> dict[str, float]:

@@ -32,7 +32,7 @@ def run(request: Request) -> None:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Milliseconds of a step as median (95th percentile), then of its stages, forward / backward."""
+    """Milliseconds of a step as median (95th percentile), then of the stages of a step with the perceptual term."""
     lines = [
         f"{'preset':>9} {'Gaussians':>9} {'network at':>10} {'parameters':>10} {'ms, first half':>17} "
         f"{'ms, second half':>17} {'faster':>7}"
@@ -45,10 +45,11 @@ def table(rows: Sequence[Row]) -> list[str]:
             f"{faster[row.preset]:6.1f}x"
         )
     names = stage_names(rows)
-    lines += ["", f"{'stage of a step with the perceptual term':>40} {''.join(f'{row.preset:>18}' for row in rows)}"]
+    heading = "stage: forward / backward (floor)"
+    lines += ["", f"{heading:>40} {''.join(f'{row.preset:>24}' for row in rows)}"]
     for name in names:
-        lines.append(f"{name:>40} {''.join(f'{stage_cell(row, name):>18}' for row in rows)}")
-    lines.append(f"{'sum without ' + ', '.join(ONCE_A_FRAME):>40} {''.join(f'{stage_sum(row):18.1f}' for row in rows)}")
+        lines.append(f"{name:>40} {''.join(f'{stage_cell(row, name):>24}' for row in rows)}")
+    lines.append(f"{'sum without ' + ', '.join(ONCE_A_FRAME):>40} {''.join(f'{stage_sum(row):24.1f}' for row in rows)}")
     return lines
 
 
@@ -62,7 +63,8 @@ def stage_cell(row: Row, name: str) -> str:
     if name not in row.stages:
         return "-"
     forward, backward = row.stages[name], row.stages.get(f"{name}, backward")
-    return f"{forward.median:.2f}" + (f" / {backward.median:.2f}" if backward else "")
+    times = f"{forward.median:.2f}" + (f" / {backward.median:.2f}" if backward else "")
+    return times + (f" ({row.floors[name]:.1f})" if name in row.floors else "")
 
 
 def stage_sum(row: Row) -> float:

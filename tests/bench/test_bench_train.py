@@ -45,6 +45,7 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     assert [row["preset"] for row in figures["rows"]] == ["paper", "balanced", "fast"]
     for row in figures["rows"]:
         assert f"{row['late']['median']:.1f} ({row['late']['p95']:.1f})" in output
+        assert set(row["floors"]) == {"network", "heads", "optimizer", "check"} and min(row["floors"].values()) > 0
         assert row["early"]["median"] > 0 and {"network", "network, backward", "splat", "loss"} <= row["stages"].keys()
     assert {"interpolation"} <= figures["rows"][2]["stages"].keys() - figures["rows"][0]["stages"].keys()
     assert iio.imread(tmp_path / "bench_train.png").shape[1] > 500
