@@ -32,6 +32,7 @@ PARTS = {
     "splat": Part("avatar.bench.splat_report"),
     "hyper": Part("avatar.bench.hyper_report"),
     "render": Part("avatar.bench.render", "RUN"),
+    "transfer": Part("avatar.bench.transfer"),
     "train": Part("avatar.bench.train_report", "FOLDER"),
     "quality": Part("avatar.bench.quality_report", "RUN..."),
     "stability": Part("avatar.bench.stability"),

@@ -8,13 +8,16 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from avatar.demo.head import NUM_EXPRESSION, NUM_IDENTITY, demo_head
 from avatar.demo.head_files import write_head_model
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import MOTIONS, Motion, Performance, frame_camera, frame_params, perform
@@ -34,14 +37,19 @@ def make_subject(
     motion: Motion = "speech",
     threads: int | None = None,
     progress: bool = True,
+    neutral_bias: float = 0.0,
 ) -> Path:
     """Render `frames` pictures of `size` x `size` pixels of the person of `seed`, and write them with their tracking.
 
     The folder appears under its name only when it is complete. Same arguments, same files. `threads` defaults to the
-    number of cores. Returns `out`. Raises UserError for values out of range and for an `out` that is not empty.
+    number of cores. `neutral_bias` is how much of the shape the tracking explains by the expression (`tracking_bias`); the
+    pictures do not depend on it. Returns `out`. Raises UserError for values out of range and for a folder that is not
+    empty.
     """
     out = Path(out)
     _check_arguments(out, frames, size, seed, motion, threads)
+    if not 0.0 <= neutral_bias <= 1.0:
+        raise UserError(f"neutral_bias must be from 0 to 1, not {neutral_bias}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
@@ -50,7 +58,7 @@ def make_subject(
             f"cannot write to {out.parent}: {error.strerror or error}; choose another output folder"
         ) from error
     try:
-        _write_subject(partial, frames, size, seed, motion, threads or os.cpu_count() or 1, progress)
+        _write_subject(partial, frames, size, seed, motion, threads or os.cpu_count() or 1, progress, neutral_bias)
         partial.chmod(0o755)
         partial.replace(out)
     except OSError as error:
@@ -58,6 +66,29 @@ def make_subject(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return out
+
+
+class TrackingBias(NamedTuple):
+    """What a tracker adds to a person's true coefficients, in every frame alike."""
+
+    expression: torch.Tensor  # float32 [100]
+    shape: np.ndarray  # float32 [300]
+
+
+def tracking_bias(seed: int, strength: float) -> TrackingBias:
+    """The person's own neutral as tracked: expression coefficients away from zero, and the shape that makes up for them.
+
+    The shape's change undoes the displacement of the expression's as well as the identity basis can (least squares): a
+    tracker sees the sum of both and cannot tell them apart. `strength` is the standard deviation of the coefficients.
+    """
+    head = demo_head()
+    E, S = head.expression_dirs.shape[2], head.identity_dirs.shape[2]
+    offset = strength * np.random.default_rng((seed, 3)).standard_normal(E)
+    displaced = head.expression_dirs.reshape(-1, E) @ offset
+    undo = -np.linalg.lstsq(head.identity_dirs.reshape(-1, S), displaced, rcond=None)[0]
+    expression, shape = np.zeros(NUM_EXPRESSION, np.float32), np.zeros(NUM_IDENTITY, np.float32)
+    expression[:E], shape[:S] = offset, undo
+    return TrackingBias(torch.from_numpy(expression), shape)
 
 
 def _check_arguments(out: Path, frames: int, size: int, seed: int, motion: str, threads: int | None) -> None:
@@ -80,7 +111,7 @@ def _check_arguments(out: Path, frames: int, size: int, seed: int, motion: str, 
 
 
 def _write_subject(
-    folder: Path, frames: int, size: int, seed: int, motion: Motion, threads: int, progress: bool
+    folder: Path, frames: int, size: int, seed: int, motion: Motion, threads: int, progress: bool, neutral_bias: float
 ) -> None:
     for name in ("imgs", "alpha", "parsing", "checkpoint"):
         (folder / name).mkdir()
@@ -88,6 +119,7 @@ def _write_subject(
     renderer = Renderer(identity)
     write_head_model(folder / "head_model", renderer.performer.head)
     performance = perform(seed, frames, motion)
+    bias = tracking_bias(seed, neutral_bias)
     threads_before = torch.get_num_threads(), cv2.getNumThreads()
     # One thread a frame is the better use of the cores than many in one frame's short operations.
     torch.set_num_threads(1)
@@ -97,7 +129,8 @@ def _write_subject(
         for index, (params, camera, picture) in enumerate(
             tqdm(done, total=frames, desc="rendering", unit="frame", disable=not progress)
         ):
-            _write_frame(folder, index, params, camera, picture, identity.shape)
+            tracked = replace(params, expression=params.expression + bias.expression)
+            _write_frame(folder, index, tracked, camera, picture, identity.shape + bias.shape)
     finally:
         torch.set_num_threads(threads_before[0])
         cv2.setNumThreads(threads_before[1])
