@@ -103,6 +103,7 @@ class Config:
         return dataclasses.asdict(self)
 
 
+MAX_OVERRIDE = 1000  # characters; a message quotes the override
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -160,6 +161,8 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
 
     Raises UserError for an unknown key or option, a wrong type or a value out of range.
     """
+    if long := next((override for override in overrides if len(override) > MAX_OVERRIDE), None):
+        raise UserError(f"the override {long[:60]}... has {len(long)} characters; no value of a key needs that many")
     _check_overrides(overrides)
     GlobalHydra.instance().clear()
     try:
