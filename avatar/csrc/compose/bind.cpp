@@ -1,28 +1,40 @@
 #include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
 
+#include "arguments.h"
 #include "compose/compose.h"
 #include "thread_pool.h"
 
 namespace nb = nanobind;
 using namespace avatar::compose;
+using avatar::check_shape;
 
 void bind_compose(nb::module_& m) {
-    using Floats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-    using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+    using Floats = avatar::Array<float>;
+    using ConstFloats = avatar::Array<const float>;
     static constexpr std::int64_t kGrain = 1024;  // Gaussians handed to a thread at a time
 
     m.def(
         "compose_forward",
         [](ConstFloats points, ConstFloats quats, ConstFloats log_scales, ConstFloats opacity_logits, ConstFloats raw,
            const std::string& simd, int threads, Floats means, Floats out_quats, Floats scales, Floats opacities) {
+            avatar::Size N("N");
+            check_shape("points", points, {N, 3});
+            check_shape("quats", quats, {N, 4});
+            check_shape("log_scales", log_scales, {N, 3});
+            check_shape("opacity_logits", opacity_logits, {N});
+            check_shape("raw", raw, {N, 10});
+            check_shape("means", means, {N, 3});
+            check_shape("out_quats", out_quats, {N, 4});
+            check_shape("scales", scales, {N, 3});
+            check_shape("opacities", opacities, {N});
+            avatar::check_threads(threads);
             const Parameters parameters{points.data(), quats.data(), log_scales.data(), opacity_logits.data(),
                                         raw.data()};
             const Composed composed{means.data(), out_quats.data(), scales.data(), opacities.data()};
             const Kernels& kernels = select_kernels(simd.c_str());
             const nb::gil_scoped_release unlocked;
-            avatar::parallel_for(threads, static_cast<std::int64_t>(raw.shape(0)), kGrain,
+            avatar::parallel_for(threads, N.value, kGrain,
                                  [&](std::int64_t begin, std::int64_t end) {
                                      kernels.forward(parameters, begin, end, composed);
                                  });
@@ -38,6 +50,21 @@ void bind_compose(nb::module_& m) {
            ConstFloats by_means, ConstFloats by_quats, ConstFloats by_scales, ConstFloats by_opacities,
            const std::string& simd, int threads, Floats grad_quats, Floats grad_log_scales,
            Floats grad_opacity_logits, Floats grad_raw) {
+            avatar::Size N("N");
+            check_shape("quats", quats, {N, 4});
+            check_shape("log_scales", log_scales, {N, 3});
+            check_shape("raw", raw, {N, 10});
+            check_shape("scales", scales, {N, 3});
+            check_shape("opacities", opacities, {N});
+            check_shape("by_means", by_means, {N, 3});
+            check_shape("by_quats", by_quats, {N, 4});
+            check_shape("by_scales", by_scales, {N, 3});
+            check_shape("by_opacities", by_opacities, {N});
+            check_shape("grad_quats", grad_quats, {N, 4});
+            check_shape("grad_log_scales", grad_log_scales, {N, 3});
+            check_shape("grad_opacity_logits", grad_opacity_logits, {N});
+            check_shape("grad_raw", grad_raw, {N, 10});
+            avatar::check_threads(threads);
             const Parameters parameters{nullptr, quats.data(), log_scales.data(), nullptr, raw.data()};
             const Upstream upstream{by_means.data(),     by_quats.data(), by_scales.data(),
                                     by_opacities.data(), scales.data(),   opacities.data()};
@@ -45,7 +72,7 @@ void bind_compose(nb::module_& m) {
                                       grad_raw.data()};
             const Kernels& kernels = select_kernels(simd.c_str());
             const nb::gil_scoped_release unlocked;
-            avatar::parallel_for(threads, static_cast<std::int64_t>(raw.shape(0)), kGrain,
+            avatar::parallel_for(threads, N.value, kGrain,
                                  [&](std::int64_t begin, std::int64_t end) {
                                      kernels.backward(parameters, upstream, begin, end, gradients);
                                  });

@@ -1,5 +1,4 @@
 #include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
@@ -7,17 +6,33 @@
 
 #include <cstring>
 
+#include "arguments.h"
 #include "splat/splat.h"
 
 namespace nb = nanobind;
 using namespace avatar::splat;
+using avatar::Array;
+using avatar::check_shape;
+using avatar::Size;
 
 namespace {
 
-using Floats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Floats = Array<float>;
+using ConstFloats = Array<const float>;
 constexpr std::size_t kCounts = sizeof(Counts) / sizeof(std::int64_t);
-using Integers = nb::ndarray<std::int64_t, nb::shape<kCounts>, nb::c_contig, nb::device::cpu>;
-using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+
+// Also of gradients, whose names begin with `prefix`. sh must hold the coefficients of `sh_degree`.
+template <typename T>
+void check_gaussians(const std::string& prefix, const Array<T>& means, const Array<T>& quats, const Array<T>& scales,
+                     const Array<T>& opacities, const Array<T>& sh, int sh_degree, Size& N, Size& K) {
+    check_shape(prefix + "means", means, {N, 3});
+    check_shape(prefix + "quats", quats, {N, 4});
+    check_shape(prefix + "scales", scales, {N, 3});
+    check_shape(prefix + "opacities", opacities, {N});
+    check_shape(prefix + "sh", sh, {N, K, 3});
+    avatar::check_within("sh_degree", sh_degree, 0, 3);
+    avatar::check_within(prefix + "sh's coefficients", K.value, (sh_degree + 1) * (sh_degree + 1), 16);
+}
 
 Gaussians gaussians_of(const ConstFloats& means, const ConstFloats& quats, const ConstFloats& scales,
                        const ConstFloats& opacities, const ConstFloats& sh) {
@@ -37,9 +52,20 @@ void bind_splat(nb::module_& m) {
            ConstFloats background, std::array<double, 9> rotation, std::array<double, 3> translation,
            std::array<double, 4> intrinsics, int sh_degree, std::array<float, 3> cutoffs, double blur, double near,
            bool antialiased, std::array<int, 4> region, const std::string& simd, int threads, Floats image,
-           Floats alpha, std::optional<Integers> counts, bool everywhere) {
+           Floats alpha, std::optional<Array<std::int64_t>> counts, bool everywhere) {
+            Size N("N"), K("K"), H("H"), W("W");
+            check_gaussians("", means, quats, scales, opacities, sh, sh_degree, N, K);
+            check_shape("background", background, {3});
+            check_shape("image", image, {H, W, 3});
+            check_shape("alpha", alpha, {H, W});
+            if (counts) check_shape("counts", *counts, {kCounts});
+            avatar::check_within("region's left column", region[0], 0, W.value - 1);
+            avatar::check_within("region's top row", region[1], 0, H.value - 1);
+            avatar::check_within("region's end column", region[2], region[0] + 1, W.value);
+            avatar::check_within("region's end row", region[3], region[1] + 1, H.value);
+            avatar::check_threads(threads);
             Camera camera{{}, {}, intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3],
-                          static_cast<int>(image.shape(1)), static_cast<int>(image.shape(0))};
+                          W.as_int(), H.as_int()};
             for (int k = 0; k < 9; ++k) camera.rotation[k] = rotation[k];
             for (int k = 0; k < 3; ++k) camera.translation[k] = translation[k];
             const Settings settings{sh_degree, cutoffs[0], cutoffs[1], cutoffs[2], blur, near, antialiased,
@@ -66,6 +92,16 @@ void bind_splat(nb::module_& m) {
            ConstFloats sh, std::optional<ConstFloats> grad_image, std::optional<ConstFloats> grad_alpha,
            Floats grad_means, Floats grad_quats, Floats grad_scales, Floats grad_opacities, Floats grad_sh,
            Floats grad_background) {
+            Size N("N"), K("K");
+            const int sh_degree = drawing.view.settings.sh_degree;
+            const Camera& camera = drawing.view.camera;
+            check_gaussians("", means, quats, scales, opacities, sh, sh_degree, N, K);
+            const auto drawn = static_cast<std::int64_t>(drawing.rank_of.size());
+            avatar::check_within("the number of Gaussians", N.value, drawn, drawn);
+            check_gaussians("grad_", grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, sh_degree, N, K);
+            check_shape("grad_background", grad_background, {3});
+            if (grad_image) check_shape("grad_image", *grad_image, {camera.height, camera.width, 3});
+            if (grad_alpha) check_shape("grad_alpha", *grad_alpha, {camera.height, camera.width});
             const GaussianGradients gradients{grad_means.data(), grad_quats.data(), grad_scales.data(),
                                               grad_opacities.data(), grad_sh.data()};
             const nb::gil_scoped_release unlocked;

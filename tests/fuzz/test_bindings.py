@@ -1,0 +1,58 @@
+"""Whatever the compiled functions are called with, they answer or raise TypeError or ValueError.
+
+A thousand calls, or a fiftieth of AVATAR_STRESS_EXAMPLES if that is more.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from avatar import _core
+
+EXAMPLES = max(1000, int(os.environ.get("AVATAR_STRESS_EXAMPLES", "0")) // 50)
+
+
+def test_no_arguments_crash_a_compiled_function(tmp_path: Path) -> None:
+    # In a process of its own, so that a crash is a failure of this test; `scripts/sanitize.sh` runs Python with -S.
+    last = tmp_path / "last call"
+    flags = ["-S"] if sys.flags.no_site else []
+    script = Path(__file__).with_name("call_bindings.py")
+    command = [sys.executable, *flags, "-X", "faulthandler", str(script), str(EXAMPLES), str(last)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    call = last.read_text() if last.exists() else "none"
+    assert done.returncode == 0, f"status {done.returncode} after the call {call}:\n{done.stderr[-4000:]}"
+    found = re.fullmatch(r"(\d+) answered, (\d+) refused\n", done.stdout)
+    assert found is not None and all(int(count) > EXAMPLES / 10 for count in found.groups()), done.stdout
+
+
+def test_the_message_names_argument_expectation_and_what_was_given() -> None:
+    def interpolate(**other: torch.Tensor) -> None:
+        arrays = {"grid": (9, 5), "weights": (7, 4), "out": (7, 5)}
+        call = {name: torch.zeros(shape) for name, shape in arrays.items()}
+        call |= {"cells": torch.zeros(7, 4, dtype=torch.int32)}
+        _core.interpolate_forward(**{**call, **other}, simd="", threads=1)
+
+    interpolate()
+    with pytest.raises(ValueError, match=r"^weights must have shape \[N, 4\], got \[7, 3\]$"):
+        interpolate(weights=torch.zeros(7, 3))
+    with pytest.raises(ValueError, match=r"^grid must have shape \[G, n\], got \[45\]$"):
+        interpolate(grid=torch.zeros(45))
+    with pytest.raises(ValueError, match=r"^out has N = 8, but cells has N = 7; they must be the same$"):
+        interpolate(out=torch.zeros(8, 5))
+    with pytest.raises(ValueError, match=r"^grid has G = 4294967296, but must have less than 2\^31$"):
+        interpolate(grid=torch.zeros(2**32, 0))
+
+
+def test_impossible_numbers_of_threads_are_refused() -> None:
+    # Rows of windows are divided among threads: none would be a division by zero.
+    image, mask = torch.zeros(11, 11, 3), torch.ones(11, 11)
+    for threads in (0, -2, 1025):
+        with pytest.raises(ValueError, match=f"^threads must be 1 to 1024, got {threads}$"):
+            _core.dssim(image, image, mask, "", threads, None)
