@@ -1,18 +1,22 @@
-"""The splatter's time and error: every variant is compared with the float64 reference first and timed after that."""
+"""The splatter's time and error: every variant is compared with the float64 reference first and timed after that.
+
+Errors are against the reference with the usual cut-offs, also of variants that have others of their own: what they gain in
+time is seen beside what they change in the image.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.machine import available_simd, describe_machine, limited_to
+from avatar.bench.machine import available_simd, limited_to
+from avatar.bench.plain import splat_plain
 from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
-from avatar.bench.splat_work import Work
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.types import Gaussians, Rendering
@@ -21,23 +25,49 @@ from avatar.types import Gaussians, Rendering
 IMAGE_TOLERANCE = 1e-5
 GRADIENT_TOLERANCE = 1e-4
 ALPHA_MIN, T_MIN = 1 / 255, 1e-4  # the defaults of avatar.splat.splat
+# Beside the defaults. A splat with an alpha of 1e-5 changes a channel by no more than the tolerance above; with 0 every
+# splat would be drawn in every pixel.
+OTHER_ALPHA_MINS, OTHER_T_MINS = (1e-5, 2 / 255, 4 / 255), (1e-6, 1e-2)
+OWN_SIZE = 128  # pixels, at most, where a variant with its own cut-offs is compared with a reference that has the same
 
 
 @dataclass(frozen=True)
 class Variant:
-    backend: Literal["cpu", "reference"]
+    backend: Literal["cpu", "plain", "reference"]
     count: int  # splats
     size: int  # pixels, width and height
     threads: int
-    simd: str  # of the cpu backend; "" for the reference
+    simd: str  # of the cpu backend; "" for the others
+    alpha_min: float = ALPHA_MIN
+    t_min: float = T_MIN
+
+    @property
+    def cutoffs(self) -> dict[str, float]:
+        return {"alpha_min": self.alpha_min, "t_min": self.t_min}
+
+    @property
+    def has_usual_cutoffs(self) -> bool:
+        return (self.alpha_min, self.t_min) == (ALPHA_MIN, T_MIN)
+
+    @property
+    def changed(self) -> str:
+        """What the variant has instead of the usual cut-offs."""
+        parts = []
+        if self.alpha_min != ALPHA_MIN:
+            steps = 255 * self.alpha_min
+            parts.append(f"alpha {steps:.0f}/255" if steps == round(steps) else f"alpha {self.alpha_min:.0e}")
+        if self.t_min != T_MIN:
+            parts.append(f"T {self.t_min:.0e}")
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Against the float64 reference, at `size` x `size` pixels."""
+    """Against the float64 reference with the usual cut-offs, at `size` x `size` pixels."""
 
     size: int
     image: float  # largest difference of a channel, at the pixels that are not ambiguous
+    rms: float  # root of the mean squared difference of a channel, at the same pixels
     gradient: float  # largest of the five tensors' ||difference|| / ||reference||
     ambiguous: int  # pixels where float64 itself sits on a cut-off to 1e-5; left out of both
 
@@ -70,16 +100,32 @@ Draw = Callable[..., Rendering]
 
 
 def all_variants(
-    sizes: Sequence[int], counts: Sequence[int], *, count: int = HEAD_SPLATS, size: int = 512
+    sizes: Sequence[int],
+    counts: Sequence[int],
+    *,
+    count: int = HEAD_SPLATS,
+    size: int = 512,
+    plain_sizes: Sequence[int] = (256, 512),
+    all_threads: bool = False,
 ) -> list[Variant]:
-    """Every size with `count` splats and every count at `size`, with one thread and with all, with the best instruction
-    set; the other sets and the plain-torch reference once each at (`count`, `size`)."""
+    """What is measured, by default with all threads and the best instruction set.
+
+    Every size with `count` splats and every count at `size`, with one thread and with all; at (`count`, `size`) also the
+    numbers of threads between (with `all_threads`), the other instruction sets, other cut-offs, and the float64 reference.
+    The plain splatter draws `count` splats with one thread: its many small operations have little for a second one.
+    """
     *others, best = available_simd()
-    threads = sorted({1, torch.get_num_threads()})
+    most = torch.get_num_threads()
+    threads = sorted({1, most})
     scenes = dict.fromkeys([(count, s) for s in sizes] + [(n, size) for n in counts])
     variants = [Variant("cpu", n, s, t, best) for n, s in scenes for t in threads]
+    if all_threads:
+        variants += [Variant("cpu", count, size, t, best) for t in range(2, most)]
     variants += [Variant("cpu", count, size, t, simd) for simd in others for t in threads]
-    return [*variants, Variant("reference", count, size, threads[-1], "")]
+    variants += [Variant("cpu", count, size, most, best, alpha_min=value) for value in OTHER_ALPHA_MINS]
+    variants += [Variant("cpu", count, size, most, best, t_min=value) for value in OTHER_T_MINS]
+    variants += [Variant("plain", count, s, 1, "") for s in plain_sizes]
+    return [*variants, Variant("reference", count, size, most, "")]
 
 
 def measure(
@@ -102,51 +148,71 @@ def measure(
         say(f"{count:,} splats at {size}x{size}: comparing with the reference at {checked_size}x{checked_size}")
         truth = reference_of(gaussians, checked_size)
         accuracies = [
-            validate(v, gaussians, checked_size, truth, function) if v.backend == "cpu" else None for v in group
+            None if v.backend == "reference" else validate(v, gaussians, checked_size, truth, function) for v in group
         ]
         timings = time_in_turns(group, gaussians, size, repeats, function)
         rows += [Row(*row) for row in zip(group, accuracies, timings, strict=True)]
     return rows
 
 
-def reference_of(gaussians: Gaussians, size: int) -> Truth:
+def reference_of(gaussians: Gaussians, size: int, *, alpha_min: float = ALPHA_MIN, t_min: float = T_MIN) -> Truth:
     camera, black = head_camera(size), torch.zeros(3, dtype=torch.float64)
     leaves = Gaussians(*(t.double().requires_grad_() for t in gaussians))
     with torch.no_grad():
         # The cut-offs make jumps in the image, and float32 may rightly fall on either side of one.
         low, high = (
-            splat(leaves, camera, black, backend="reference", alpha_min=f * ALPHA_MIN, t_min=f * T_MIN)
+            splat(leaves, camera, black, backend="reference", alpha_min=f * alpha_min, t_min=f * t_min)
             for f in (1 - 1e-5, 1 + 1e-5)
         )
     clear = (low.image - high.image).abs().amax(-1) <= 1e-6
     noise = torch.randn(size, size, 3, generator=torch.Generator().manual_seed(1))
     cotangent = noise.masked_fill(~clear[..., None], 0.0)
-    rendering = splat(leaves, camera, black, backend="reference")
+    rendering = splat(leaves, camera, black, backend="reference", alpha_min=alpha_min, t_min=t_min)
     gradients = torch.autograd.grad(rendering.image, leaves, cotangent.double())
     return Truth(Rendering(*(t.detach() for t in rendering)), clear, cotangent, gradients)
 
 
 def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, function: Draw = splat) -> Accuracy:
-    """The variant's errors at `size` pixels; UserError if they are above the tolerances."""
+    """The variant's errors at `size` pixels; UserError if they are above the tolerances.
+
+    Where the variant has its own cut-offs, its errors against a reference with the same ones decide, at OWN_SIZE or less.
+    """
+    accuracy = accuracy_of(variant, gaussians, size, truth, function)
+    found = accuracy
+    if not variant.has_usual_cutoffs:
+        size = min(size, OWN_SIZE)
+        own = reference_of(gaussians, size, **variant.cutoffs)
+        found = accuracy_of(variant, gaussians, size, own, function)
+    if not (found.image <= IMAGE_TOLERANCE and found.gradient <= GRADIENT_TOLERANCE):  # not: a NaN is wrong too
+        raise UserError(
+            f"{variant} is wrong, so it is not timed: its image is off by {found.image:.1e} (at most "
+            f"{IMAGE_TOLERANCE:.0e}) and its gradients by {found.gradient:.1e} of their length (at most "
+            f"{GRADIENT_TOLERANCE:.0e})"
+        )
+    return accuracy
+
+
+def accuracy_of(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, function: Draw = splat) -> Accuracy:
     leaves = Gaussians(*(t.clone().requires_grad_() for t in gaussians))
     found = draw(variant, leaves, size, function)
     gradients = torch.autograd.grad(found.image, leaves, truth.cotangent)
-    image = float((found.image.detach() - truth.rendering.image)[truth.clear].abs().max())
+    difference = (found.image.detach() - truth.rendering.image)[truth.clear]
     gradient = max(float((a - b).norm() / b.norm()) for a, b in zip(gradients, truth.gradients, strict=True))
-    if not (image <= IMAGE_TOLERANCE and gradient <= GRADIENT_TOLERANCE):  # not: a NaN is wrong too
-        raise UserError(
-            f"{variant} is wrong, so it is not timed: its image is off by {image:.1e} (at most {IMAGE_TOLERANCE:.0e}) "
-            f"and its gradients by {gradient:.1e} of their length (at most {GRADIENT_TOLERANCE:.0e})"
-        )
-    return Accuracy(size, image, gradient, int((~truth.clear).sum()))
+    return Accuracy(
+        size,
+        float(difference.abs().max()),
+        float(difference.square().mean().sqrt()),
+        gradient,
+        int((~truth.clear).sum()),
+    )
 
 
 def time_in_turns(
     variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int, function: Draw = splat
 ) -> list[Timing]:
-    """All variants in turns; the reference, seconds long, has three rounds of its own after them."""
+    """All variants in turns; the plain ones and the reference, seconds long, have three rounds of their own after them."""
     fast = [v for v in variants if v.backend == "cpu"]
-    slow = [v for v in variants if v.backend == "reference"]
+    slow = [v for v in variants if v.backend != "cpu"]
     times: dict[tuple[Variant, str], Time] = {}
     for group, rounds in ((fast, repeats), (slow, min(repeats, 3))):
         functions = {
@@ -176,14 +242,8 @@ def passes_of(
 
 
 def draw(variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat) -> Rendering:
+    camera, black = head_camera(size), torch.zeros(3)
     with limited_to(threads=variant.threads, simd=variant.simd):
-        return function(gaussians, head_camera(size), torch.zeros(3), backend=variant.backend)
-
-
-def as_json(rows: Sequence[Row], works: Sequence[Work]) -> dict[str, Any]:
-    """All figures, with the machine that they belong to; milliseconds and bytes."""
-    return {
-        "machine": describe_machine(),
-        "rows": [asdict(row) for row in rows],
-        "work": [asdict(work) for work in works],
-    }
+        if variant.backend == "plain":
+            return splat_plain(gaussians, camera, black, **variant.cutoffs)
+        return function(gaussians, camera, black, backend=variant.backend, **variant.cutoffs)

@@ -27,12 +27,24 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     simd = {row["variant"]["simd"] for row in written["rows"] if row["variant"]["backend"] == "cpu"}
     assert simd == set(available_simd())
     assert [row["accuracy"] for row in written["rows"] if row["variant"]["backend"] == "reference"] == [None]
+    assert sum(row["variant"]["backend"] == "plain" for row in written["rows"]) == 2
+    cutoffs = {(row["variant"]["alpha_min"], row["variant"]["t_min"]) for row in written["rows"]}
+    assert cutoffs == {
+        (1 / 255, 1e-4),
+        (1e-5, 1e-4),
+        (2 / 255, 1e-4),
+        (4 / 255, 1e-4),
+        (1 / 255, 1e-6),
+        (1 / 255, 1e-2),
+    }
     for row in written["rows"]:
         for time in row["timing"].values():
             assert 0 < time["median"] <= time["p95"]
         if row["accuracy"]:
-            assert row["accuracy"]["image"] <= 1e-5
-            assert row["accuracy"]["gradient"] <= 1e-4
+            assert row["accuracy"]["rms"] <= row["accuracy"]["image"]
+            usual = (row["variant"]["alpha_min"], row["variant"]["t_min"]) == (1 / 255, 1e-4)
+            assert (row["accuracy"]["image"] <= 1e-5) == usual  # another cut-off is another image
+            assert (row["accuracy"]["gradient"] <= 1e-4) == usual
     scenes = {(row["variant"]["count"], row["variant"]["size"]) for row in written["rows"]}
     assert {(work["count"], work["size"]) for work in written["work"]} == scenes
     for work in written["work"]:
@@ -40,8 +52,16 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
         assert 0 < numbers["pixels_composited"] <= numbers["pixels_evaluated"]
         assert numbers["pairs"] <= numbers["pairs_in_boxes"]
     assert (tmp_path / "out" / "bench_splat.png").read_bytes().startswith(b"\x89PNG")
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.lstrip().startswith(("cpu", "reference"))]
+    printed = capsys.readouterr().out.splitlines()
+    lines = [line for line in printed if line.lstrip().startswith(("cpu", "plain", "reference"))]
     assert len(lines) == len(written["rows"])
+    assert sum(line.startswith("Other splatters") for line in printed) == 1
+
+
+def test_cutoffs_are_named_by_what_they_change() -> None:
+    assert Variant("cpu", 200, 32, 1, "").changed == ""
+    assert Variant("cpu", 200, 32, 1, "", alpha_min=2 / 255).changed == "alpha 2/255"
+    assert Variant("cpu", 200, 32, 1, "", alpha_min=1e-5, t_min=1e-2).changed == "alpha 1e-05, T 1e-02"
 
 
 def brighter(gaussians: Gaussians, *arguments: Any, **options: Any) -> Rendering:
@@ -59,9 +79,10 @@ def not_a_number(gaussians: Gaussians, *arguments: Any, **options: Any) -> Rende
     return Rendering(image * torch.nan, alpha)
 
 
+@pytest.mark.parametrize("t_min", [1e-4, 1e-2], ids=["usual cut-offs", "own cut-offs"])
 @pytest.mark.parametrize("wrong", [brighter, with_steeper_gradients, not_a_number])
-def test_a_wrong_variant_is_refused(wrong: Any) -> None:
-    variant = Variant("cpu", 200, 32, 1, "baseline")
+def test_a_wrong_variant_is_refused(wrong: Any, t_min: float) -> None:
+    variant = Variant("cpu", 200, 32, 1, "baseline", t_min=t_min)
     measure([variant], repeats=1, validation_size=32, say=lambda _: None)
     with pytest.raises(UserError, match="is wrong, so it is not timed"):
         measure([variant], repeats=1, validation_size=32, say=lambda _: None, function=wrong)
