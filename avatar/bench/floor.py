@@ -1,4 +1,8 @@
-"""What this machine can do at best: the arithmetic and the memory traffic of a function give a time that it cannot beat."""
+"""An estimate of the least time that a function takes on this machine: counted work over the rates measured at this moment.
+
+It is no bound. The rates are those of one matrix product and one copy, which another mix of instructions, or data that stay
+in a cache, can exceed; and the counts are of one way of doing the work.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ ROUNDS = 25
 
 @cache
 def measured_flops(threads: int) -> float:
-    """Floating-point operations a second of PyTorch's float32 matrix product, the fastest arithmetic there is here."""
+    """Floating-point operations a second of PyTorch's float32 matrix product."""
     a, b = torch.randn(MATRIX, MATRIX), torch.randn(MATRIX, MATRIX)
     return 2 * MATRIX**3 / _seconds(lambda: torch.mm(a, b), threads)
 

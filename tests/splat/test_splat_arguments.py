@@ -120,7 +120,11 @@ def test_impossible_cameras(field: str, value: float) -> None:
         render(replace(SCENE, camera=replace(SCENE.camera, **{field: value})))
 
 
-def test_camera_with_a_non_finite_pose() -> None:
-    pose = torch.tensor([0.0, torch.nan, 1.0])
-    with pytest.raises(ValueError, match=r"t_cam_world has 1 non-finite of 3 values, the first at \[1\]"):
-        render(replace(SCENE, camera=replace(SCENE.camera, t_cam_world=pose)))
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize(("name", "at"), [("R_cam_world", (2, 1)), ("t_cam_world", (1,))])
+def test_camera_with_a_non_finite_pose(name: str, at: tuple[int, ...], value: float) -> None:
+    pose = getattr(SCENE.camera, name).clone()
+    pose[at] = value
+    message = rf"{name} has 1 non-finite of {pose.numel()} values, the first at \[{', '.join(map(str, at))}\]"
+    with pytest.raises(ValueError, match=message):
+        render(replace(SCENE, camera=replace(SCENE.camera, **{name: pose})))

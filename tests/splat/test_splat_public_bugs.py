@@ -99,6 +99,25 @@ def test_zero_splats_and_one_splat_do_not_crash(count: int, backend: str) -> Non
     assert grads["means"].shape == (count, 3)
 
 
+@pytest.mark.parametrize(
+    "hidden", ["behind the camera", "in the plane of the camera", "beside the image", "transparent"]
+)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_hidden_splats_leave_the_background_alone(hidden: str, backend: str) -> None:
+    g = random_gaussians(300, size=0.002)
+    x, y, z = g.means.unbind(-1)
+    if hidden == "transparent":
+        g = g._replace(opacities=g.opacities * np.float32(1 / 256))
+    else:
+        places = {"behind the camera": (x, y, -1.3 - z.abs()), "in the plane of the camera": (x, y, 0 * z - 1.2)}
+        g = g._replace(means=torch.stack(places.get(hidden, (x + 9, y, z)), -1))
+    scene = Scene(g, camera(40, 30, yaw=0.0))
+    found, grads = render(scene, backend), gradients(scene, backend, torch.ones(30, 40, 3), torch.ones(30, 40))
+    assert torch.equal(found.image, scene.background.expand(30, 40, 3)) and (found.alpha == 0).all()
+    assert torch.equal(grads.pop("background"), torch.full((3,), 1200.0))
+    assert all((grad == 0).all() for grad in grads.values())
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("depth", [0.0, -1e-30, 1e-30, 0.00999, -1.0])
 def test_a_splat_at_the_camera_gives_no_infinity(depth: float, backend: str) -> None:
@@ -114,7 +133,7 @@ def test_a_splat_just_beyond_the_near_plane_agrees() -> None:
     assert_agrees(Scene(g._replace(means=means), camera(32, 32, yaw=0.0)))
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e-6, 1e-9, 1e-12, 1e-30])
+@pytest.mark.parametrize("scale", [1e-4, 1e-6, 1e-9, 1e-12, 1e-30, 0.0])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_tiny_scales_do_not_underflow_to_nan(scale: float, antialiased: bool) -> None:
     g = random_gaussians(100)._replace(scales=scale * torch.tensor([[0.7, 1.0, 2.0]]).repeat(100, 1))
@@ -125,6 +144,27 @@ def test_tiny_scales_do_not_underflow_to_nan(scale: float, antialiased: bool) ->
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (15, 16), (17, 1), (1, 50), (31, 33), (64, 7), (65, 95)])
 def test_sizes_that_are_not_a_multiple_of_the_tile(width: int, height: int) -> None:
     assert_agrees(Scene(random_gaussians(60), camera(width, height)))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_sign_of_a_scale_has_no_effect(antialiased: bool) -> None:
+    g, sign = random_gaussians(60), torch.tensor([-1.0, 1.0, -1.0])
+    scene = Scene(g, camera(40, 30), options={"antialiased": antialiased})
+    flipped = replace(scene, gaussians=g._replace(scales=g.scales * sign))
+    assert torch.equal(render(flipped).image, render(scene).image)
+    cotangent = torch.randn(30, 40, 3)
+    expected, found = gradients(scene, "cpu", cotangent, None), gradients(flipped, "cpu", cotangent, None)
+    assert torch.equal(found.pop("scales"), expected.pop("scales") * sign)
+    assert all(torch.equal(found[name], expected[name]) for name in found)
+
+
+@pytest.mark.parametrize(("focal", "spread"), [(1000.0, 3e-4), (100.0, 3e-3), (0.05, 0.8), (0.005, 3.0)])
+def test_fields_of_view_from_a_twentieth_of_a_degree_to_179(focal: float, spread: float) -> None:
+    f = 48 * focal  # `focal` is in widths of the image
+    view = replace(camera(48, 40), t_cam_world=torch.tensor([0.0, 0.0, 1.2]), fx=f, fy=f)
+    scene = Scene(random_gaussians(80, spread=spread, size=spread / 10), view)
+    assert render(scene).alpha.max() > 0.1
+    assert_agrees(scene)
 
 
 @pytest.mark.parametrize("scale", [1e2, 1e6, 1e15, 1e30])
@@ -152,6 +192,18 @@ def test_too_many_pairs_are_refused_and_not_allocated() -> None:
     )
     with pytest.raises(ValueError, match=message):
         render(Scene(g, camera(1100, 1100)))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_non_finite_cotangent_shows_in_the_gradients_of_its_splat_alone(value: float) -> None:
+    one = single_splat(scale=0.01).gaussians
+    places = torch.tensor([[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0]])  # pixels 6.5 and 26.5 of a row
+    g = Gaussians(*(torch.cat((field, field)) for field in one))._replace(means=places)
+    cotangent = torch.ones(33, 33, 3)
+    cotangent[16, 7] = value
+    grads = gradients(replace(single_splat(), gaussians=g), "cpu", cotangent, None)
+    for name in Gaussians._fields:
+        assert not torch.isfinite(grads[name][0]).all() and torch.isfinite(grads[name][1]).all(), name
 
 
 def test_alpha_has_a_gradient() -> None:

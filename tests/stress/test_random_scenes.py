@@ -27,8 +27,7 @@ SIMD = available_simd()
 # IMAGE_TOLERANCE is of 1 + the brightest colour, GRADIENT_TOLERANCE of the gradient and of what rounding errors of relative
 # size 1 would make of it.
 NOTHING = 1e-30  # float32 ends at 1e-38, and products of what is near it
-# Longer splats, in pixels, lose digits of the gradients of mean, quaternion and scale in proportion: the sums over
-# pixels, in float32, tell a metre of a needle from the next only by what little of it lies in the image.
+# Of longer splats, in pixels, some gradients of mean, quaternion and scale are further off; these are not compared.
 LONG = 1e3
 
 
