@@ -103,6 +103,7 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument(
         "--driver", type=Path, required=True, metavar="DRIVER", help="tracked folder, or a drive file (.npz, .csv)"
     )
+    add_format(reenact)
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
     reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
     reenact.add_argument("--transfer", choices=("raw", "relative", "mean", "pca"), default="relative")
@@ -160,10 +161,14 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     """The options that name a tracked folder and what belongs to it."""
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
     add_head(parser)
+    add_format(parser)
+    add_tracking(parser)
+
+
+def add_format(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--format", metavar="NAME", help="metrical-tracker, VHAP, INSTA or IMavatar (default: told from the files)"
     )
-    add_tracking(parser)
 
 
 def add_tracking(parser: argparse.ArgumentParser) -> None:

@@ -157,7 +157,8 @@ def reenact(arguments: Namespace) -> int:
     if arguments.driver.suffix.lower() in (".npz", ".csv"):
         driver = open_drive_file(arguments.driver, run)
     else:
-        driver = open_driver(arguments.driver, run, arguments.head, arguments.driver_tracking, arguments.frame_offset)
+        tracking, offset, format = arguments.driver_tracking, arguments.frame_offset, arguments.format
+        driver = open_driver(arguments.driver, run, arguments.head, tracking, offset, format)
     choices = Choices(
         arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
     )
@@ -174,20 +175,26 @@ def drive_file(arguments: Namespace) -> int:
     if arguments.out.suffix.lower() != ".npz":
         raise UserError(f"a drive file is written as .npz, not as {arguments.out}")
     head = find_head(arguments.folder, arguments.head)
-    subject, assets = open_subject(
-        Source(arguments.folder, head, arguments.tracking, arguments.frame_offset), None, print
-    )
+    source = Source(arguments.folder, head, arguments.tracking, arguments.frame_offset, arguments.format)
+    subject, assets = open_subject(source, None, print)
     write_drive(arguments.out, subject_drive(subject, None), assets.fingerprint)
     print(f"{len(subject)} frames written to {arguments.out}")
     return OK
 
 
-def open_driver(folder: Path, run: Run, head: Path | None, tracking: Path | None, offset: int | None) -> Subject:
+def open_driver(
+    folder: Path,
+    run: Run,
+    head: Path | None = None,
+    tracking: Path | None = None,
+    offset: int | None = None,
+    format: str | None = None,
+) -> Subject:
     """The driver with its own head model where it has one, else with the avatar's."""
     own = folder / "head_model"
     path = own if own.is_dir() and head is None else run.source.head
     known: HeadAssets | None = run.avatar.head.assets if path == run.source.head else None
-    driver, _ = open_subject(Source(folder, path, tracking, offset), None, print, known)
+    driver, _ = open_subject(Source(folder, path, tracking, offset, format), None, print, known)
     return driver
 
 
@@ -251,7 +258,7 @@ def demo(arguments: Namespace) -> int:
         if status != OK:
             return status
     trained = load_run(run)
-    video = drive(trained, open_driver(driver, trained, None, None, None))
+    video = drive(trained, open_driver(driver, trained))
     results = evaluate(trained, None, write_frames=False)
     print("\nThe demo is done. Look at")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")

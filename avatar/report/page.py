@@ -19,6 +19,10 @@ from avatar.report.pictures import frame_panels, uncertainty_map
 from avatar.run import Run, versions
 
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
+BINNINGS = (  # key of results.json, what it is binned by, decimals and unit of the edges
+    ("by_yaw", "yaw", 0, "degrees"),
+    ("by_expression_distance", "distance from the training expressions", 2, "mm"),
+)
 MAX_POINTS = 1000  # of a curve
 SCRIPT = """
 const slider = document.getElementById("frame");
@@ -81,6 +85,29 @@ def means_table(protocols: Mapping[str, Any]) -> Markup:
     return data_table(["protocol", "frames", *(column.replace("_", " ") for column in columns)], rows)
 
 
+def bins_tables(protocols: Mapping[str, Any]) -> list[Markup]:
+    """Means over the frames in each bin of the conditions that a protocol was binned by, one table for each pair."""
+    tables = []
+    for name, entry in protocols.items():
+        columns = list(entry.get("means", {}))
+        for key, title, decimals, unit in BINNINGS:
+            bins = entry.get(key, ())
+            if not bins:
+                continue
+            rows = [
+                [_interval(one, decimals), one["frames"], *(_figure(c, one["means"].get(c)) for c in columns)]
+                for one in bins
+            ]
+            heading = [f"{title}, {unit}", "frames", *(column.replace("_", " ") for column in columns)]
+            tables.append(element("div", element("p", f"{name}, by {title}", class_="soft"), data_table(heading, rows)))
+    return tables
+
+
+def _interval(one: Mapping[str, Any], decimals: int) -> str:
+    low, high = (None if one[side] is None else f"{one[side]:.{decimals}f}" for side in ("from", "to"))
+    return f"below {high}" if low is None else f"{low} or more" if high is None else f"{low} to {high}"
+
+
 def _figure(column: str, value: float | None) -> str:
     return "-" if value is None else f"{value:.{SHOWN_DECIMALS.get(column.partition('_')[0], 4)}f}"
 
@@ -93,6 +120,7 @@ def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
         text = f"Measured at step {results.get('step')}, while the newest checkpoint is of step {run.step}."
         parts.append(element("p", text, class_="finding warning"))
     parts.append(means_table(results["protocols"]))
+    parts.append(fold("By head pose and by distance from the training expressions", *bins_tables(results["protocols"])))
     for name, caption in (("curves.png", "The figures along the video"), ("worst.png", "The worst frames")):
         file = run.path / "eval" / name
         if file.is_file():

@@ -14,7 +14,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from avatar.errors import UserError
-from avatar.report.page import means_table, read_curves, read_results
+from avatar.report.page import bins_tables, means_table, read_curves, read_results
 from avatar.report.pictures import uncertainty_map
 from avatar.run import load_run
 
@@ -78,6 +78,25 @@ def test_protocols_without_a_figure_have_a_dash() -> None:
     table = means_table(protocols)
     assert "<td>30.13</td><td>-</td><td>-</td>" in table and "<td>-</td><td>-</td><td>0.9100</td>" in table
     assert "<th>ssim head</th>" in table
+
+
+def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
+    bins = [
+        {"from": None, "to": -10.0, "frames": 3, "means": {"psnr": 28.004}},
+        {"from": -10.0, "to": 10.0, "frames": 5, "means": {"psnr": None}},
+        {"from": 10.0, "to": None, "frames": 1, "means": {"psnr": 27.5}},
+    ]
+    by_yaw, by_distance = bins_tables({"a": {"means": {"psnr": 28.0}, "by_yaw": bins, "by_expression_distance": bins[:1]}})
+    rows = re.findall(r"<tr>(.*?)</tr>", by_yaw)
+    assert [re.sub("<[^>]*>", "|", row).split("||") for row in rows] == [
+        ["|yaw, degrees", "frames", "psnr|"],
+        ["|below -10", "3", "28.00|"],
+        ["|-10 to 10", "5", "-|"],
+        ["|10 or more", "1", "27.50|"],
+    ]
+    assert "below -10.00" in by_distance
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "hypergaussians, by yaw" in page and "hypergaussians, by distance from the training expressions" in page
 
 
 def test_a_run_that_was_not_evaluated_says_so(run: Path, tmp_path: Path) -> None:
