@@ -19,8 +19,8 @@ from avatar.report.pictures import frame_panels, uncertainty_map
 from avatar.run import Run, versions
 
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
-BINNINGS = (  # key of results.json, what it is binned by, decimals and unit of the edges
-    ("by_yaw", "yaw", 0, "degrees"),
+BINNINGS = (  # key of results.json, what it is binned by, decimals of the edges and their column's name
+    ("by_yaw", "yaw", 0, "degrees of yaw"),
     ("by_expression_distance", "distance from the training expressions", 2, "mm"),
 )
 MAX_POINTS = 1000  # of a curve
@@ -89,8 +89,8 @@ def bins_tables(protocols: Mapping[str, Any]) -> list[Markup]:
     """Means over the frames in each bin of the conditions that a protocol was binned by, one table for each pair."""
     tables = []
     for name, entry in protocols.items():
-        columns = list(entry.get("means", {}))
-        for key, title, decimals, unit in BINNINGS:
+        columns = [column for column, value in entry.get("means", {}).items() if value is not None]
+        for key, title, decimals, column_name in BINNINGS:
             bins = entry.get(key, ())
             if not bins:
                 continue
@@ -98,7 +98,7 @@ def bins_tables(protocols: Mapping[str, Any]) -> list[Markup]:
                 [_interval(one, decimals), one["frames"], *(_figure(c, one["means"].get(c)) for c in columns)]
                 for one in bins
             ]
-            heading = [f"{title}, {unit}", "frames", *(column.replace("_", " ") for column in columns)]
+            heading = [column_name, "frames", *(column.replace("_", " ") for column in columns)]
             tables.append(element("div", element("p", f"{name}, by {title}", class_="soft"), data_table(heading, rows)))
     return tables
 

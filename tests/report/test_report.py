@@ -86,10 +86,12 @@ def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
         {"from": -10.0, "to": 10.0, "frames": 5, "means": {"psnr": None}},
         {"from": 10.0, "to": None, "frames": 1, "means": {"psnr": 27.5}},
     ]
-    by_yaw, by_distance = bins_tables({"a": {"means": {"psnr": 28.0}, "by_yaw": bins, "by_expression_distance": bins[:1]}})
+    by_yaw, by_distance = bins_tables(
+        {"a": {"means": {"psnr": 28.0, "lpips": None}, "by_yaw": bins, "by_expression_distance": bins[:1]}}
+    )
     rows = re.findall(r"<tr>(.*?)</tr>", by_yaw)
     assert [re.sub("<[^>]*>", "|", row).split("||") for row in rows] == [
-        ["|yaw, degrees", "frames", "psnr|"],
+        ["|degrees of yaw", "frames", "psnr|"],
         ["|below -10", "3", "28.00|"],
         ["|-10 to 10", "5", "-|"],
         ["|10 or more", "1", "27.50|"],
