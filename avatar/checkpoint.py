@@ -13,6 +13,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,8 @@ def write_atomically(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
         raise UserError(f"{path} cannot be written ({error.strerror}); what was there before is untouched") from None
 
 
@@ -72,7 +74,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
     path = folder / f"step_{checkpoint.step:08d}.safetensors"
     write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(meta)}))
     for old in list_checkpoints(folder)[:-keep]:
-        old.unlink()
+        with suppress(OSError):  # an old checkpoint too many is no reason to stop a run
+            old.unlink()
     return path
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
-import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -28,53 +31,74 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[UInt8[np.ndarray,
     """
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     shape: tuple[int, ...] | None = None
+    encoder: subprocess.Popen[bytes] | None = None
 
     def add(frame: UInt8[np.ndarray, "H W 3"]) -> None:
-        nonlocal shape
+        nonlocal shape, encoder
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise ValueError(f"a video frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
         if shape is not None and frame.shape != shape:
             was, now = (f"{s[1]}x{s[0]}" for s in (shape, frame.shape))
             raise UserError(f"{path} cannot hold a frame of {now} pixels after frames of {was}")
         shape = frame.shape
-        odd = ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0))
+        even = np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
         with _failing_as_user_error(path):
-            encoder.append_data(np.pad(frame, odd, mode="edge"))
+            if encoder is None:
+                encoder = _start_encoder(partial, even.shape[1], even.shape[0], fps)
+            assert encoder.stdin is not None
+            try:
+                encoder.stdin.write(even.tobytes())
+            except BrokenPipeError:
+                _finish(encoder)
 
     with _failing_as_user_error(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        encoder = imageio.get_writer(
-            partial,
-            format="FFMPEG",  # type: ignore[arg-type]
-            mode="I",
-            fps=fps,
-            codec="libx264",
-            pixelformat="yuv420p",
-            quality=None,
-            macro_block_size=1,
-            ffmpeg_log_level="error",
-            output_params=["-crf", "17", "-movflags", "+faststart"],
-        )
     try:
         yield add
-        if shape is None:
+        if encoder is None:
             raise UserError(f"there is no frame to write to {path}")
         with _failing_as_user_error(path):
-            encoder.close()
+            _finish(encoder)
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
             partial.replace(path)
     finally:
-        encoder.close()
-        partial.unlink(missing_ok=True)
+        if encoder is not None:
+            encoder.kill()
+            encoder.communicate()
+        with suppress(OSError):
+            partial.unlink()
+
+
+def _start_encoder(path: Path, width: int, height: int, fps: float) -> subprocess.Popen[bytes]:
+    """ffmpeg, which takes RGB bytes from its standard input. It is run here because imageio does not ask how it ended."""
+    taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    made = ["-an", "-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    # -xerror: it ends with its first error, so that what it says fits into the pipe
+    options = ["-y", "-loglevel", "error", "-xerror"]
+    return subprocess.Popen(
+        [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, str(path)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def _finish(encoder: subprocess.Popen[bytes]) -> None:
+    """Wait until the file is complete. Raises OSError with the encoder's words when it failed, however late."""
+    _, said = encoder.communicate()
+    if encoder.returncode != 0:
+        first = said.decode(errors="replace").strip().partition("\n")[0]
+        words = re.sub(r"^\[[^\]]*\] ", "", first)  # without the part of ffmpeg and its address
+        raise OSError(words or f"the encoder ended with status {encoder.returncode}")
 
 
 @contextmanager
 def _failing_as_user_error(path: Path) -> Iterator[None]:
-    """imageio raises OSError when the encoder ends early and RuntimeError when there is none."""
+    """OSError comes from the disk and the encoder, RuntimeError from imageio-ffmpeg when there is no encoder."""
     try:
         yield
     except (OSError, RuntimeError) as error:
-        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise UserError(f"the video {path} cannot be written ({reason})") from error
+        raise UserError(f"the video {path} cannot be written ({error})") from error
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: float) -> None:

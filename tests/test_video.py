@@ -66,7 +66,7 @@ def test_an_encoder_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytest
     broken = tmp_path / "ffmpeg"
     broken.write_text('#!/bin/sh\nif [ "$1" = -version ]; then echo ffmpeg version 7; exit 0; fi\nexit 1\n')
     broken.chmod(0o755)
-    monkeypatch.setattr("imageio_ffmpeg._io.get_ffmpeg_exe", lambda: str(broken))
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(broken))
     with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \("):
         write_video(path, gradients(200, 64, 64), fps=25)
     assert not path.exists()

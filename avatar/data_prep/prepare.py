@@ -277,8 +277,7 @@ def _write_masks(
 
 
 def _write_mask(path: Path, mask: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), mask):
-        raise OSError(None, f"could not write {path.name}")
+    path.write_bytes(cv2.imencode(".png", mask)[1].tobytes())  # cv2.imwrite does not notice a full disk
 
 
 def _data_hash(inspection: Inspection, pairing: Pairing, arrays: dict[str, np.ndarray], intrinsics: np.ndarray) -> str:

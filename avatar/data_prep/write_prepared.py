@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_manifest
 from avatar.errors import UserError
@@ -46,7 +46,7 @@ def write_prepared(
     except OSError as error:
         raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another place") from None
     try:
-        save_file(arrays, building / TRACKS_FILE)
+        (building / TRACKS_FILE).write_bytes(save(arrays))
         write_masks(building)
         (building / MANIFEST_FILE).write_text(manifest.to_json(), encoding="utf-8")
         building.chmod(0o755)
@@ -71,6 +71,14 @@ def _replace(target: Path, building: Path, input_hash: str) -> None:
         if is_current(target, input_hash, is_chosen=False):
             return
         stale = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-        with contextlib.suppress(FileNotFoundError):
-            target.rename(stale / "old")
-        shutil.rmtree(stale)
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                target.rename(stale / "old")
+            building.rename(target)
+            return
+        except OSError:
+            with contextlib.suppress(OSError):  # put back, unless another process was quicker
+                (stale / "old").rename(target)
+        finally:
+            if target.exists():
+                shutil.rmtree(stale, ignore_errors=True)
