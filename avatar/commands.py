@@ -225,6 +225,7 @@ def check(arguments: Namespace) -> int:
         lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
         tracking=arguments.tracking,
         frame_offset=arguments.frame_offset,
+        format=arguments.format,
         progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False),
     )
     print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from avatar.data_prep import imavatar, insta, vhap
@@ -9,25 +10,31 @@ from avatar.data_prep.frame_files import find_frame_files
 from avatar.data_prep.metrical_tracker import read_tracking
 from avatar.data_prep.tracked_folder import TrackedFolder
 from avatar.data_prep.transforms import ListedFrame, read_listings
-from avatar.errors import UserError
+from avatar.errors import UserError, refuse
 
 METRICAL_TRACKER = "metrical-tracker"
 _LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}
 FORMATS = (METRICAL_TRACKER, *_LISTED)
 
 
-def open_tracked_folder(folder: Path, tracking: Path | None = None, format: str | None = None) -> TrackedFolder:
+def open_tracked_folder(
+    folder: Path,
+    tracking: Path | None = None,
+    format: str | None = None,
+    complain: Callable[[str], object] = refuse,
+) -> TrackedFolder:
     """The folder in the form that `prepare` works on; `format` is one of FORMATS, or None to tell it from the files.
 
     Raises UserError when the folder is in none of the formats, or in several, or not in the one that was asked for.
+    What is wrong with the files of a metrical-tracker folder goes to `complain`, as in `find_frame_files`.
     """
     if format not in (None, *FORMATS):
         raise UserError(f"--format must be one of {', '.join(FORMATS)}, not {format!r}")
     frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
     name = format or detect_format(folder, frames)
     if name == METRICAL_TRACKER:
-        files = find_frame_files(folder, tracking)
-        return TrackedFolder(name, files, lambda head, size: read_tracking(files.tracking))
+        files = find_frame_files(folder, tracking, complain)
+        return TrackedFolder(name, files, lambda head, size, complain: read_tracking(files.tracking, complain))
     if not _LISTED[name].recognise(frames):
         raise UserError(f"{folder} is not a folder of {name}'s: docs/data.md says which files and values belong to it")
     if name == insta.NAME:

@@ -16,11 +16,13 @@ from avatar.errors import UserError, refuse
 
 
 class KindNames(NamedTuple):
-    """Where a layout has its masks, for messages."""
+    """Where a layout has its files, for messages."""
 
     alphas: str = "alpha/"
     head_masks: str = "parsing/*_neckhead.png"
     mouth_masks: str = "parsing/*_mouth.png"
+    images: str = "imgs/"
+    tracking: str = "checkpoint/"
 
 
 _NUMBERED_NAMES = KindNames()
@@ -49,7 +51,17 @@ class FrameFiles:
             "parsing *_neckhead": self.head_masks,
             "parsing *_mouth": self.mouth_masks,
             "checkpoint": self.tracking,
+        } | ({"face parsing": self.parsing} if self.parsing else {})
+
+    def title(self, kind: str) -> str:
+        """What the layout itself calls a kind of `of_kind`."""
+        own = {
+            "imgs": self.names.images,
+            "alpha": self.names.alphas,
+            "checkpoint": self.names.tracking,
+            "face parsing": self.names.head_masks,
         }
+        return own.get(kind, kind).rstrip("/")
 
     def frame_names(self) -> dict[int, str]:
         """The images' stems; with their folders where images lie in several, as the same stem may come twice."""
@@ -128,7 +140,7 @@ def _numbered(
     return dict(sorted(found.items()))
 
 
-def describe_numbers(numbers: list[int], limit: int = 12) -> str:
+def describe_numbers(numbers: list[int], limit: int = 12, name: Callable[[int], str] = "{:05d}".format) -> str:
     """`00003-00005, 00009` for messages; runs are joined, and a long list is cut."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
@@ -136,7 +148,7 @@ def describe_numbers(numbers: list[int], limit: int = 12) -> str:
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    shown = [f"{a:05d}" if a == b else f"{a:05d}-{b:05d}" for a, b in runs[:limit]]
+    shown = [name(a) if a == b else f"{name(a)}-{name(b)}" for a, b in runs[:limit]]
     return ", ".join(shown) + (f" and {len(runs) - limit} more" if len(runs) > limit else "")
 
 

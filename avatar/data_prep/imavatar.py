@@ -13,6 +13,7 @@ camera with OpenGL's axes. There are no eyelids: they are zero.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from avatar.data_prep.transforms import OPENCV_FROM_OPENGL, ListedFrame, read_fr
 from avatar.head.assets import HeadAssets
 
 NAME = "IMavatar"
-NAMES = KindNames("mask/", "semantic/", "semantic/")
+NAMES = KindNames("mask/", "semantic/", "semantic/", images="image/", tracking="flame_params.json")
 WORLD_SCALE = 4.0  # "the FLAME head is centered at the origin, scaled by 4 times"
 _OLD_SIZE = 512.0
 
@@ -52,9 +53,9 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
         names=NAMES,
     )
 
-    def read(head: HeadAssets, size: tuple[int, int]) -> Tracking:
+    def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
         root = RootJoint(head)
-        return read_frames(listed, files.tracking, lambda frame: _read_frame(frame, root, size))
+        return read_frames(listed, files.tracking, lambda frame: _read_frame(frame, root, size), complain)
 
     return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()})
 

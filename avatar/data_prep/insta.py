@@ -23,7 +23,7 @@ from avatar.data_prep.transforms import ListedFrame
 from avatar.errors import UserError
 
 NAME = "INSTA"
-NAMES = KindNames("matted/", "seg_mask/", "seg_mask/")
+NAMES = KindNames("matted/", "seg_mask/", "seg_mask/", images="images/")
 
 
 def recognise(frames: list[ListedFrame]) -> bool:
@@ -48,7 +48,12 @@ def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None =
         names=NAMES,
     )
     division = {number: frame.split for number, frame in listed.items()}
-    return TrackedFolder(NAME, files, lambda head, size: read_tracking(files.tracking, named_by_number=False), division)
+    return TrackedFolder(
+        NAME,
+        files,
+        lambda head, size, complain: read_tracking(files.tracking, complain, named_by_number=False),
+        division,
+    )
 
 
 def _tracking_folder(folder: Path, given: Path | None) -> Path:

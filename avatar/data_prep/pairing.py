@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,12 +32,12 @@ def refuse_if_many(bad: Mapping[int, str], total: int, what: str) -> None:
         )
 
 
-def describe_reasons(bad: Mapping[int, str]) -> str:
+def describe_reasons(bad: Mapping[int, str], name: Callable[[int], str] = "{:05d}".format) -> str:
     """`00002-00004 (all zero: ...), 00007 (...)`, grouped by reason."""
     by_reason: dict[str, list[int]] = {}
     for number, reason in bad.items():
         by_reason.setdefault(reason, []).append(number)
-    shown = [f"{describe_numbers(numbers)} ({reason})" for reason, numbers in by_reason.items()]
+    shown = [f"{describe_numbers(numbers, name=name)} ({reason})" for reason, numbers in by_reason.items()]
     rest = len(shown) - _REASONS_SHOWN
     return ", ".join(shown[:_REASONS_SHOWN]) + (f" and {rest} more reasons" if rest > 0 else "")
 

@@ -14,7 +14,7 @@ import torch
 
 from avatar.data.images import read_bytes
 from avatar.data.manifest import MANIFEST_VERSION, FrameRecord, Manifest
-from avatar.data.split import DEFAULT_SIZES, Split, SplitSizes, split_frames
+from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.data_prep.face_parsing import HEAD, MOUTH, mask_of
 from avatar.data_prep.formats import open_tracked_folder
 from avatar.data_prep.frame_files import FrameFiles
@@ -23,10 +23,10 @@ from avatar.data_prep.inspect_images import Inspection, composited_background, i
 from avatar.data_prep.overlap import confirm_pairing
 from avatar.data_prep.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from avatar.data_prep.projection import filled_lips, project_head, region_faces
-from avatar.data_prep.tracked_folder import TrackedFolder
+from avatar.data_prep.tracked_folder import TrackedFolder, divide
 from avatar.data_prep.tracking import Tracking, fit_coefficients
 from avatar.data_prep.write_prepared import is_current, write_prepared
-from avatar.errors import UserError
+from avatar.errors import UserError, refuse
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 
@@ -74,7 +74,7 @@ def prepare(
     say(f"format: {source.format}")
     inspection = inspect_images(files)
     refuse_if_many(inspection.bad, len(files.images), "images")
-    tracks = source.read(head, (inspection.width, inspection.height))
+    tracks = source.read(head, (inspection.width, inspection.height), refuse)
     refuse_if_many(tracks.bad, len(files.tracking), "tracking files")
     tracks = fit_coefficients(tracks, head)
     first = next(iter(tracks.frames.values()))
@@ -89,7 +89,7 @@ def prepare(
     say(evidence)
     pairing = pair_frames(files, inspection, tracks, offset, model.neutral_vertices().mean(0).numpy())
     has_lips = len(region_faces(model, "lips")) > 0
-    frames_split, split_notes = _split(source, pairing, split)
+    frames_split, split_notes = divide(source.division, [number for _, number in pairing.pairs], split)
     notes = [*source.notes, *tracks.notes, *pairing.notes, *_assumptions(files, inspection, has_lips), *split_notes]
     for note in notes:
         say(f"note: {note}")
@@ -147,7 +147,7 @@ def _input_hash(files: FrameFiles, options: dict[str, object]) -> str:
     for kind, found in files.of_kind().items():
         for number, path in found.items():
             digest.update(f"{kind} {number} {path} {_stamp(path)}\n".encode(errors="surrogateescape"))
-    for path in (*files.listings, *files.parsing.values()):
+    for path in files.listings:
         digest.update(f"{path} {_stamp(path)}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
@@ -171,11 +171,7 @@ def _pair(
     )
     first = next(iter(tracks.frames.values()))
     if source.is_paired:
-        if given:
-            raise UserError(
-                f"--frame-offset {given}: {source.files.listings[0].name} itself says which image belongs to which "
-                "tracking; leave it out, or give 0 to go on where head and masks do not overlap"
-            )
+        source.refuse_offset(given)
         witness = (
             "--frame-offset 0: not confirmed"
             if given is not None
@@ -186,22 +182,6 @@ def _pair(
         return given, f"image offset {given}, given with --frame-offset"
     estimate = detect_offset(model, tracks.frames, first.intrinsics, images, heads, mouths)
     return estimate.offset, estimate.sentence()
-
-
-def _split(source: TrackedFolder, pairing: Pairing, sizes: SplitSizes) -> tuple[Split, list[str]]:
-    """The folder's own division where it has one and no sizes are asked for, else the rule of `split_frames`."""
-    of_pair = [source.division.get(number) for _, number in pairing.pairs]
-    listed = Split(*(tuple(i for i, part in enumerate(of_pair) if part == name) for name in ("train", "test")))
-    if not any(of_pair) or sizes != DEFAULT_SIZES:
-        return split_frames(len(pairing.pairs), sizes), []
-    if not listed.train or not listed.test:
-        lacking = "test" if listed.train else "training"
-        return split_frames(len(pairing.pairs), sizes), [
-            f"the folder names no {lacking} frames: its last ones are tested"
-        ]
-    left = len(of_pair) - len(listed.train) - len(listed.test)
-    unused = f" ({left} of validation are not used)" if left else ""
-    return listed, [f"the folder's own division into training and test frames is kept{unused}"]
 
 
 def _assumptions(files: FrameFiles, inspection: Inspection, has_lips: bool) -> list[str]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from avatar.data.split import DEFAULT_SIZES, Split, SplitSizes, split_frames
 from avatar.data_prep.frame_files import FrameFiles
 from avatar.data_prep.tracking import Tracking
 from avatar.data_prep.transforms import ListedFrame
+from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 
 
@@ -18,7 +20,8 @@ class TrackedFolder:
 
     format: str
     files: FrameFiles
-    read: Callable[[HeadAssets, tuple[int, int]], Tracking]  # for a head model and the images' (width, height)
+    # For a head model and the images' (width, height); the last is called, or raises, for what spoils the whole clip.
+    read: Callable[[HeadAssets, tuple[int, int], Callable[[str], object]], Tracking]
     division: Mapping[int, str | None] = field(default_factory=dict)  # frame number -> "train", "val", "test"
     notes: tuple[str, ...] = ()
 
@@ -26,6 +29,29 @@ class TrackedFolder:
     def is_paired(self) -> bool:
         """Whether the folder itself says which image belongs to which tracking, under the same number."""
         return bool(self.files.listings)
+
+    def refuse_offset(self, given: int | None) -> None:
+        """Raises UserError for an offset that contradicts the folder's own pairing."""
+        if self.is_paired and given:
+            raise UserError(
+                f"--frame-offset {given}: {self.files.listings[0].name} itself says which image belongs to which "
+                "tracking; leave it out, or give 0 to go on where head and masks do not overlap"
+            )
+
+
+def divide(division: Mapping[int, str | None], numbers: Sequence[int], sizes: SplitSizes) -> tuple[Split, list[str]]:
+    """Positions in `numbers` by the folder's own division, where it has one and no sizes are asked for, else by the rule
+    of `split_frames`; and notes on it. Raises UserError where there are too few frames."""
+    parts = [division.get(number) for number in numbers]
+    listed = Split(*(tuple(i for i, part in enumerate(parts) if part == name) for name in ("train", "test")))
+    if not any(parts) or sizes != DEFAULT_SIZES:
+        return split_frames(len(numbers), sizes), []
+    if not listed.train or not listed.test:
+        lacking = "test" if listed.train else "training"
+        return split_frames(len(numbers), sizes), [f"the folder names no {lacking} frames: its last ones are tested"]
+    left = len(parts) - len(listed.train) - len(listed.test)
+    unused = f" ({left} of validation are not used)" if left else ""
+    return listed, [f"the folder's own division into training and test frames is kept{unused}"]
 
 
 def numbered(frames: list[ListedFrame]) -> dict[int, ListedFrame]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES
 from avatar.data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
-from avatar.errors import UserError
+from avatar.errors import UserError, refuse
 
 SPLITS = ("train", "val", "test")
 MAX_BYTES = 2**28
@@ -157,9 +157,12 @@ def _natural(path: Path) -> tuple[Any, ...]:
 
 
 def read_frames(
-    listed: dict[int, ListedFrame], paths: dict[int, Path], read: Callable[[ListedFrame], FrameTrack]
+    listed: dict[int, ListedFrame],
+    paths: dict[int, Path],
+    read: Callable[[ListedFrame], FrameTrack],
+    complain: Callable[[str], object] = refuse,
 ) -> Tracking:
-    """`read` every frame; the BadFrames among them end up in `bad`."""
+    """`read` every frame; the BadFrames among them end up in `bad`. `complain` as in `checked_tracking`."""
     frames: dict[int, FrameTrack] = {}
     bad: dict[int, str] = {}
     for number, frame in listed.items():
@@ -167,7 +170,7 @@ def read_frames(
             frames[number] = read(frame)
         except BadFrame as error:
             bad[number] = str(error)
-    return checked_tracking(frames, bad, paths)
+    return checked_tracking(frames, bad, paths, complain)
 
 
 def camera_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:

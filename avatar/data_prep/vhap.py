@@ -13,6 +13,7 @@ An entry has `transform_matrix` (the camera in the world, OpenGL axes) and intri
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 
 NAME = "VHAP"
-NAMES = KindNames("fg_masks/", "head masks", "mouth masks")
+NAMES = KindNames("fg_masks/", "head masks", "mouth masks", images="images/", tracking="flame_param/")
 
 
 def recognise(frames: list[ListedFrame]) -> bool:
@@ -56,9 +57,9 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
         names=NAMES,
     )
 
-    def read(head: HeadAssets, size: tuple[int, int]) -> Tracking:
+    def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
         root = RootJoint(head)
-        return read_frames(listed, parameters, lambda frame: _read_frame(frame, root, size))
+        return read_frames(listed, parameters, lambda frame: _read_frame(frame, root, size), complain)
 
     return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()}, notes)
 

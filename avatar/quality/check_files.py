@@ -11,7 +11,7 @@ from avatar.data_prep.frame_files import describe_numbers, gaps
 from avatar.data_prep.frame_offset import RADIUS
 from avatar.data_prep.pairing import MAX_BAD_FRACTION, describe_reasons
 from avatar.quality.clip import Clip
-from avatar.quality.findings import Finding, frame_names, frames_phrase, loss_severity
+from avatar.quality.findings import Finding, loss_severity
 from avatar.quality.view import HEAD, IMAGE
 
 _SHOWN = 6  # file names in a sentence
@@ -47,9 +47,10 @@ def _unreadable(clip: Clip) -> list[Finding]:
             Finding(
                 loss_severity(len(reasons), len(clip.views)),
                 "unreadable",
-                f"{len(reasons)} of {len(clip.views)} files of {kind} cannot be read: {', '.join(shown)}{rest}",
+                f"{len(reasons)} of {len(clip.views)} files of {clip.files.title(kind)} cannot be read: "
+                f"{', '.join(shown)}{rest}",
                 "write or copy them again; frames without them are left out of training",
-                frame_names(reasons),
+                clip.names(reasons),
             )
         )
     return findings
@@ -69,10 +70,10 @@ def _sizes(clip: Clip) -> list[Finding]:
                 Finding(
                     "error",
                     "sizes",
-                    f"{len(odd)} files of {kind} are not {usual[0]}x{usual[1]} pixels as most images are: "
-                    f"{describe_numbers(odd)} ({paths[odd[0]].name} is {width}x{height})",
+                    f"{len(odd)} files of {clip.files.title(kind)} are not {usual[0]}x{usual[1]} pixels as most images "
+                    f"are: {describe_numbers(odd, name=clip.name)} ({paths[odd[0]].name} is {width}x{height})",
                     "bring all images and masks of the clip to one size",
-                    frame_names(odd),
+                    clip.names(odd),
                 )
             )
     tracked = next(iter(clip.tracking.frames.values()), None)
@@ -81,8 +82,8 @@ def _sizes(clip: Clip) -> list[Finding]:
             Finding(
                 "error",
                 "sizes",
-                f"the tracking was made on {tracked.size[0]}x{tracked.size[1]} images, but those in imgs are "
-                f"{usual[0]}x{usual[1]}",
+                f"the tracking was made on {tracked.size[0]}x{tracked.size[1]} images, but those in "
+                f"{clip.files.title(IMAGE)} are {usual[0]}x{usual[1]}",
                 "resize the images to the size of the tracking, or track them again",
             )
         )
@@ -97,7 +98,10 @@ def _mask_values(clip: Clip) -> list[Finding]:
         if max(values.values()) == 1:
             findings.append(
                 Finding(
-                    "error", "mask-range", f"the files of {kind} hold 0 and 1, not 0 to 255", "multiply them by 255"
+                    "error",
+                    "mask-range",
+                    f"the files of {clip.files.title(kind)} hold 0 and 1, not 0 to 255",
+                    "multiply them by 255",
                 )
             )
         elif kind == HEAD and (empty := [n for n, value in values.items() if value == 0]):
@@ -105,9 +109,9 @@ def _mask_values(clip: Clip) -> list[Finding]:
                 Finding(
                     loss_severity(len(empty), len(clip.views)),
                     "empty-mask",
-                    f"the head mask is empty in {frames_phrase(empty)}: no head was found there",
+                    f"the head mask is empty in {clip.phrase(empty)}: no head was found there",
                     "segment them again, or accept that they are left out of training",
-                    frame_names(empty),
+                    clip.names(empty),
                 )
             )
     return findings
@@ -123,9 +127,10 @@ def _missing_masks(clip: Clip) -> list[Finding]:
             Finding(
                 loss_severity(len(missing), len(clip.files.images)),
                 "missing",
-                f"{kind} has no file for {len(missing)} of {len(clip.files.images)} images: {describe_numbers(missing)}",
+                f"{clip.files.title(kind)} has no file for {len(missing)} of {len(clip.files.images)} images: "
+                f"{describe_numbers(missing, name=clip.name)}",
                 "make the masks of these images; without them the frames are left out of training",
-                frame_names(missing),
+                clip.names(missing),
             )
         )
     return findings
@@ -159,7 +164,7 @@ def _partners(clip: Clip) -> list[Finding]:
                 "are both of the same video? Track it again, or extract its frames again"
                 if severity != "note"
                 else "nothing: a few at the ends are usual, and are left out",
-                frame_names(alone),
+                clip.names(alone),
             )
         )
     skipped = sorted(set(gaps(images)) & set(gaps(tracking)))
@@ -168,9 +173,9 @@ def _partners(clip: Clip) -> list[Finding]:
             Finding(
                 "note",
                 "gaps",
-                f"images and tracking both skip the numbers {describe_numbers(skipped)}",
+                f"images and tracking both skip the numbers {describe_numbers(skipped, name=clip.name)}",
                 "nothing, if frames were removed on purpose: training does not need them to be consecutive",
-                frame_names(skipped),
+                clip.names(skipped),
             )
         )
     return findings
@@ -185,15 +190,16 @@ def _extra(clip: Clip) -> list[Finding]:
                 Finding(
                     "note",
                     "extra",
-                    f"{kind} has files without an image: {describe_numbers(extra)}",
+                    f"{clip.files.title(kind)} has files without an image: {describe_numbers(extra, name=clip.name)}",
                     "nothing, if images were removed on purpose: these masks are not used",
-                    frame_names(extra),
+                    clip.names(extra),
                 )
             )
     strangers = [
         path.relative_to(clip.files.folder).as_posix()
         for name, suffixes in (("imgs", IMAGE_SUFFIXES), ("alpha", IMAGE_SUFFIXES), ("checkpoint", (".frame",)))
         for path in _entries(clip.files.folder / name)
+        if not clip.source.is_paired  # a listing names its files, whatever lies beside them
         if path.suffix.lower() not in suffixes
     ]
     if strangers:
@@ -227,8 +233,8 @@ def lost_frames(clip: Clip, reasons: dict[int, str]) -> list[Finding]:
             "error",
             "left-out",
             f"{len(reasons)} of {total} frames cannot be used, more than {MAX_BAD_FRACTION:.0%}: "
-            f"{describe_reasons(reasons)}",
+            f"{describe_reasons(reasons, clip.name)}",
             "mend what is named; training does not start before",
-            frame_names(reasons),
+            clip.names(reasons),
         )
     ]

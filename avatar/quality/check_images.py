@@ -10,7 +10,7 @@ import numpy as np
 from avatar.data_prep.inspect_images import composited_background
 from avatar.data_prep.overlap import MIN_OVERLAP
 from avatar.quality.clip import Clip
-from avatar.quality.findings import Finding, frame_names, frames_phrase
+from avatar.quality.findings import Finding
 
 # Neighbours differ by at least half of the clip's median difference in clips without repeats; an encoder that repeats a
 # frame leaves far less.
@@ -49,9 +49,9 @@ def _repeated(clip: Clip) -> list[Finding]:
         Finding(
             "warning",
             "repeated-images",
-            f"the image repeats the one before in {frames_phrase(repeated)}{every}",
+            f"the image repeats the one before in {clip.phrase(repeated)}{every}",
             "extract the frames at the video's own rate (ffmpeg -fps_mode passthrough) and track those",
-            frame_names(repeated),
+            clip.names(repeated),
         )
     ]
 
@@ -67,8 +67,8 @@ def _composited(clip: Clip) -> list[Finding]:
         Finding(
             "warning",
             "composited",
-            f"the images seem to be composited on {colour} already: compositing them again with alpha/ squares the matte "
-            "at the edges (hair gets a rim of that colour)",
+            f"the images seem to be composited on {colour} already: compositing them again with their matte squares "
+            "it at the edges (hair gets a rim of that colour)",
             f"use the frames as the camera recorded them; or train with this background colour ({colour})",
         )
     ]
@@ -88,7 +88,7 @@ _MATTE_LIMITS = (
         "haze",
         MAX_HAZE,
         "the background shines through far from the person (mean weight up to {worst:.0%})",
-        "make the matte again, or add head masks (parsing/*_neckhead.png), which cut the background off",
+        "make the matte again, or add head masks where the format has them: they cut the background off",
     ),
     _MatteLimit(
         "background-leak",
@@ -115,18 +115,16 @@ def _matte(clip: Clip) -> list[Finding]:
         over = [n for n, value in values.items() if value > limit]
         if over:
             sentence = problem.format(worst=max(values.values()))
-            findings.append(
-                Finding("warning", check, f"{sentence} in {frames_phrase(over)}", advice, frame_names(over))
-            )
+            findings.append(Finding("warning", check, f"{sentence} in {clip.phrase(over)}", advice, clip.names(over)))
     whole = [n for n, matte in mattes.items() if matte.covered > MAX_COVERED]
     if whole:
         findings.append(
             Finding(
                 "warning",
                 "background-leak",
-                f"matte and head mask cover the whole image in {frames_phrase(whole)}: the background is trained as head",
+                f"matte and head mask cover the whole image in {clip.phrase(whole)}: the background is trained as head",
                 "make masks of the head alone",
-                frame_names(whole),
+                clip.names(whole),
             )
         )
     return findings
@@ -158,10 +156,10 @@ def _mask_area(clip: Clip) -> list[Finding]:
                 Finding(
                     "warning",
                     "mask-area",
-                    f"the head mask is much {what} than usual against the tracked head in {frames_phrase(odd)} "
-                    f"({ratios[worst] / usual:.2f} times in {worst:05d})",
+                    f"the head mask is much {what} than usual against the tracked head in {clip.phrase(odd)} "
+                    f"({ratios[worst] / usual:.2f} times in {clip.name(worst)})",
                     f"make these masks again: {advice}",
-                    frame_names(odd),
+                    clip.names(odd),
                 )
             )
     return findings
@@ -206,9 +204,9 @@ def _exposure(clip: Clip) -> list[Finding]:
             "warning",
             "exposure",
             f"the brightness of {where} changes by {span:.2f} stops ({2**span - 1:.0%}) over the clip: darkest about "
-            f"{numbers[low]:05d}, brightest about {numbers[high]:05d}",
+            f"{clip.name(numbers[low])}, brightest about {clip.name(numbers[high])}",
             "record with exposure and white balance locked; the avatar has one colour and averages the two",
-            frame_names((int(numbers[low]), int(numbers[high]))),
+            clip.names((int(numbers[low]), int(numbers[high]))),
         )
     ]
 

@@ -12,8 +12,9 @@ from avatar.data_prep.overlap import MIN_OVERLAP
 from avatar.data_prep.safe_pickle import load_torch_pickle
 from avatar.errors import UserError
 from avatar.quality.clip import Clip
-from avatar.quality.findings import Finding, frame_names, frames_phrase, grouped, loss_severity
+from avatar.quality.findings import Finding, grouped, loss_severity
 from avatar.quality.motion import suddenness
+from avatar.quality.view import TRACKING
 
 # A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
 # neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.
@@ -53,10 +54,10 @@ def _unusable(clip: Clip) -> list[Finding]:
         findings.append(
             Finding(
                 loss_severity(len(numbers), len(clip.files.tracking)),
-                "non-finite" if keys else "no-face" if "no face" in reason else "tracking",
-                f"the tracking cannot be used in {frames_phrase(numbers)} of checkpoint: {detail}",
+                "non-finite" if keys or "is not finite" in reason else "no-face" if "no face" in reason else "tracking",
+                f"the tracking cannot be used in {clip.phrase(numbers)} of {clip.files.title(TRACKING)}: {detail}",
                 "track these frames again, or accept that they are left out of training",
-                frame_names(numbers),
+                clip.names(numbers),
             )
         )
     return findings
@@ -89,9 +90,9 @@ def _repeats(clip: Clip) -> list[Finding]:
         Finding(
             loss_severity(len(repeated), len(clip.pairs())),
             "tracking-repeats",
-            f"the tracking repeats that of the frame before while the image does not, in {frames_phrase(repeated)}",
+            f"the tracking repeats that of the frame before while the image does not, in {clip.phrase(repeated)}",
             "the tracker lost the face there: track again, or accept that they are left out of training",
-            frame_names(repeated),
+            clip.names(repeated),
         )
     ]
 
@@ -202,10 +203,10 @@ def _jumps(clip: Clip) -> list[Finding]:
             Finding(
                 "warning",
                 "jumps",
-                f"the tracked {what} jumps at {frames_phrase(jumping)}: {worst:05d} lies {size} from half-way between "
+                f"the tracked {what} jumps at {clip.phrase(jumping)}: {clip.name(worst)} lies {size} from half-way between "
                 f"its neighbours, where {np.nanmedian(values):.2g} is usual",
-                "look at these frames in the tracker's output; track them again or remove their .frame files",
-                frame_names(jumping),
+                "look at these frames in the tracker's output; track them again or remove them",
+                clip.names(jumping),
             )
         )
     return findings
@@ -258,10 +259,10 @@ def _residuals(clip: Clip) -> list[Finding]:
                 Finding(
                     "warning",
                     "residual",
-                    f"{what} in {frames_phrase(off)}: {pixels[worst]:.1f} pixels in {numbers[worst]:05d}, where "
+                    f"{what} in {clip.phrase(off)}: {pixels[worst]:.1f} pixels in {clip.name(numbers[worst])}, where "
                     f"{np.nanmedian(pixels):.1f} is usual",
                     "look at these frames: is the mask wrong or the tracking? Redo it, or remove the frames",
-                    frame_names(off),
+                    clip.names(off),
                 )
             )
     if np.median(inside) < MIN_INSIDE and not findings:
@@ -292,8 +293,8 @@ def check_behind_camera(clip: Clip) -> list[Finding]:
         Finding(
             loss_severity(len(behind), len(clip.pairs())),
             "behind-camera",
-            f"the tracked head is behind the camera in frames {describe_numbers(behind)}",
+            f"the tracked head is behind the camera in frames {describe_numbers(behind, name=clip.name)}",
             "track these frames again, or accept that they are left out of training",
-            frame_names(behind),
+            clip.names(behind),
         )
     ]

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from avatar.data_prep.frame_files import FrameFiles, find_frame_files
+from avatar.data_prep.formats import METRICAL_TRACKER, open_tracked_folder
+from avatar.data_prep.frame_files import FrameFiles
 from avatar.data_prep.frame_offset import OffsetEstimate, detect_offset
 from avatar.data_prep.metrical_tracker import read_tracking
+from avatar.data_prep.tracked_folder import TrackedFolder
 from avatar.data_prep.tracking import FrameTrack, Tracking, fit_coefficients
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from avatar.quality.fit import Fit, MeshProjector, fit_of_files
-from avatar.quality.view import IMAGE, View, look_at
+from avatar.quality.findings import frames_phrase
+from avatar.quality.fit import Fit, MeshProjector, fit_of_masks
+from avatar.quality.masks import read_masks
+from avatar.quality.view import IMAGE, TRACKING, View, look_at
 
 MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
 GIVEN = "given with --frame-offset"
@@ -38,7 +43,7 @@ def silent(items: Iterable[T], total: int, what: str) -> Iterable[T]:
 
 @dataclass(frozen=True)
 class Clip:
-    files: FrameFiles
+    source: TrackedFolder
     tracking: Tracking
     complaints: tuple[tuple[str, str], ...]  # (which check, sentence): what stops `prepare` while reading
     head: HeadModel | None
@@ -48,6 +53,24 @@ class Clip:
     views: dict[int, View] = field(default_factory=dict)  # by image number
     fits: dict[int, Fit] = field(default_factory=dict)  # by image number
     steps: dict[int, float] = field(default_factory=dict)  # image number -> mean grey-level change since the one before
+
+    @property
+    def files(self) -> FrameFiles:
+        return self.source.files
+
+    @cached_property
+    def _listed_names(self) -> dict[int, str]:
+        return self.files.frame_names() if self.source.is_paired else {}
+
+    def name(self, number: int) -> str:
+        """How the user knows a frame: by its number, or by its image's name where a listing has the frames."""
+        return self._listed_names.get(number, f"{number:05d}")
+
+    def names(self, numbers: Iterable[int]) -> tuple[str, ...]:
+        return tuple(self.name(number) for number in numbers)
+
+    def phrase(self, numbers: Sequence[int]) -> str:
+        return frames_phrase(numbers, self.name)
 
     def pairs(self) -> list[tuple[int, int]]:
         """(image number, tracking number) of everything that has a partner, usable or not."""
@@ -77,12 +100,19 @@ def read_clip(
     assets: HeadAssets | None,
     tracking: Path | None,
     frame_offset: int | None,
+    format: str | None = None,
     progress: Progress = silent,
 ) -> Clip:
-    """Read everything. Raises UserError only when there is no folder."""
+    """Read everything. Raises UserError only when the folder's files cannot be listed."""
     complaints: list[tuple[str, str]] = []
-    files = find_frame_files(folder, tracking, lambda message: complaints.append(("layout", message)))
-    tracks = read_tracking(files.tracking, lambda message: complaints.append(("tracking", message)))
+    source = open_tracked_folder(folder, tracking, format, lambda message: complaints.append(("layout", message)))
+    try:
+        source.refuse_offset(frame_offset)
+    except UserError as error:
+        complaints.append(("frame-offset", str(error)))
+    views, steps = _read_views(source.files, progress)
+    size = next((view.sizes[IMAGE] for view in views.values() if IMAGE in view.sizes), None)
+    tracks = _read_tracking(source, assets, size, lambda message: complaints.append(("tracking", message)))
     head = None
     if assets is not None and tracks.frames:
         try:
@@ -90,13 +120,28 @@ def read_clip(
             head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
         except UserError as error:
             complaints.append(("head-model", str(error)))
-    clip = Clip(files, tracks, tuple(complaints), head, frame_offset, GIVEN, None)
-    views, steps = _read_views(files, progress)
-    clip = replace(clip, views=views, steps=steps)
-    if head is None or not files.images:
+    offset, evidence = frame_offset, GIVEN
+    if source.is_paired:
+        offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
+    clip = Clip(source, tracks, tuple(complaints), head, offset, evidence, None, views, steps=steps)
+    if head is None or not clip.files.images:
         return clip
-    clip = _with_offset(clip, head, frame_offset)
+    if not source.is_paired:
+        clip = _with_offset(clip, head, frame_offset)
     return replace(clip, fits=_measure_fits(clip, head, progress))
+
+
+def _read_tracking(
+    source: TrackedFolder,
+    assets: HeadAssets | None,
+    size: tuple[int, int] | None,
+    complain: Callable[[str], object],
+) -> Tracking:
+    if source.format == METRICAL_TRACKER:  # its files say it all
+        return read_tracking(source.files.tracking, complain)
+    if assets is None or size is None:
+        return Tracking({}, {}, [], source.files.tracking)
+    return source.read(assets, size, complain)
 
 
 def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View], dict[int, float]]:
@@ -105,7 +150,7 @@ def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View],
     previous: tuple[int, np.ndarray] | None = None
     numbers = list(files.images)
     with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
-        looks = pool.map(lambda n: look_at(_files_of(files, n)), numbers)
+        looks = pool.map(lambda n: look_at(_files_of(files, n), files.decode_parsing), numbers)
         for number, view in zip(numbers, progress(looks, len(numbers), "images"), strict=True):
             views[number] = replace(view, grey=None)
             if view.grey is None:
@@ -119,12 +164,15 @@ def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View],
 
 def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, Fit]:
     tracks = {image: track for image, track in clip.tracked() if clip.is_whole(image)}
-    masks = clip.files.head_masks or clip.files.alphas
-    numbers = [number for number in tracks if number in masks]
     project = MeshProjector(head, next(iter(clip.tracking.frames.values())).intrinsics)
+
+    def measure(number: int) -> Fit | None:
+        mask, mouth = read_masks(clip.files, number)
+        return None if mask is None else fit_of_masks(project, tracks[number], mask, mouth)
+
     with ThreadPoolExecutor(max_workers=2) as pool:  # as do matrix products
-        fits = pool.map(lambda n: fit_of_files(project, tracks[n], masks[n], clip.files.mouth_masks.get(n)), numbers)
-        found = dict(zip(numbers, progress(fits, len(numbers), "mesh against masks"), strict=True))
+        fits = pool.map(measure, tracks)
+        found = dict(zip(tracks, progress(fits, len(tracks), "mesh against masks"), strict=True))
     return {number: fit for number, fit in found.items() if fit is not None}
 
 
@@ -161,5 +209,5 @@ def _estimate(clip: Clip, head: HeadModel, numbers: list[int]) -> OffsetEstimate
 
 
 def _files_of(files: FrameFiles, number: int) -> Mapping[str, Path]:
-    kinds = {kind: found for kind, found in files.of_kind().items() if kind != "checkpoint"}
+    kinds = {kind: found for kind, found in files.of_kind().items() if kind != TRACKING}
     return {kind: found[number] for kind, found in kinds.items() if number in found}

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.data.split import Split, SplitSizes, split_frames
+from avatar.data.split import Split, SplitSizes
+from avatar.data_prep.tracked_folder import divide
 from avatar.errors import UserError
 from avatar.quality.clip import Clip
-from avatar.quality.findings import Finding, frame_names, frames_phrase
+from avatar.quality.findings import Finding
 from avatar.quality.motion import HeadAngles, head_angles
 
 MIN_TEST_FRAMES = 2
@@ -37,7 +38,7 @@ class Coverage:
 def measure_coverage(clip: Clip, usable: list[int], sizes: SplitSizes) -> Coverage | Finding:
     """`usable` are image numbers. A Finding where they cannot be split."""
     try:
-        split = split_frames(len(usable), sizes)
+        split, _ = divide(clip.source.division, usable, sizes)
     except UserError as error:
         problem, _, advice = str(error).rpartition("; ")
         return Finding("error", "too-few-frames", problem, advice)
@@ -108,9 +109,9 @@ def check_coverage(clip: Clip, coverage: Coverage) -> list[Finding]:
                 Finding(
                     "note",
                     "test-coverage",
-                    f"{frames_phrase(far)} of the {tests} held-out frames show {what} that no training frame shows",
+                    f"{clip.phrase(far)} of the {tests} held-out frames show {what} that no training frame shows",
                     "expect lower figures there; they measure extrapolation",
-                    frame_names(far),
+                    clip.names(far),
                 )
             )
     return findings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -48,14 +48,10 @@ def loss_severity(lost: int, total: int) -> Severity:
     return "error" if lost > MAX_BAD_FRACTION * total else "warning"
 
 
-def frames_phrase(numbers: Sequence[int]) -> str:
-    """`frame 00003` or `5 frames (00003-00006, 00009)`."""
-    listed = describe_numbers(list(numbers))
+def frames_phrase(numbers: Sequence[int], name: Callable[[int], str]) -> str:
+    """`frame 00003` or `5 frames (00003-00006, 00009)`, each called by `name`."""
+    listed = describe_numbers(list(numbers), name=name)
     return f"frame {listed}" if len(numbers) == 1 else f"{len(numbers)} frames ({listed})"
-
-
-def frame_names(numbers: Iterable[int]) -> tuple[str, ...]:
-    return tuple(f"{number:05d}" for number in numbers)
 
 
 def grouped(reasons: Mapping[int, str]) -> dict[str, list[int]]:

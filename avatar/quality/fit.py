@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from avatar.data.images import read_mask
 from avatar.data_prep.projection import filled_lips, project_head, region_faces, silhouette
 from avatar.data_prep.tracking import FrameTrack
 from avatar.head.model import HeadModel
@@ -57,15 +55,14 @@ class MeshProjector:
         return Mesh(screen, self._faces, self._skin, self._lips)
 
 
-def fit_of_files(project: MeshProjector, track: FrameTrack, head: Path, mouth: Path | None) -> Fit | None:
-    """The fit of one frame whose mask files can be read; None where mask or mesh is empty."""
-    mask = read_mask(head)
-    full_width = mask.shape[1]
-    width, height = measured_size(full_width, mask.shape[0])
-    on = _resized(mask, (width, height)) > _ON
+def fit_of_masks(project: MeshProjector, track: FrameTrack, head: np.ndarray, mouth: np.ndarray | None) -> Fit | None:
+    """The fit of one frame, whose masks are uint8 [H, W]; None where mask or mesh is empty."""
+    full_width = head.shape[1]
+    width, height = measured_size(full_width, head.shape[0])
+    on = _resized(head, (width, height)) > _ON
     if not on.any():
         return None
-    lips = None if mouth is None else _resized(read_mask(mouth), (width, height)) > _ON
+    lips = None if mouth is None else _resized(mouth, (width, height)) > _ON
     return measure_fit(project(track, width, height), on, lips, full_width / width)
 
 

@@ -19,7 +19,7 @@ from avatar.quality.check_tracking import behind_camera, check_behind_camera, ch
 from avatar.quality.clip import Clip, Progress, read_clip, silent
 from avatar.quality.coverage import Coverage, check_coverage, measure_coverage
 from avatar.quality.findings import Finding, by_severity, count_phrase, exit_status
-from avatar.quality.view import HEAD
+from avatar.quality.view import HEAD, TRACKING
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
 
@@ -56,6 +56,7 @@ def check_folder(
     *,
     tracking: Path | None = None,
     frame_offset: int | None = None,
+    format: str | None = None,
     split: SplitSizes = DEFAULT_SIZES,
     progress: Progress = silent,
 ) -> Check:
@@ -67,10 +68,11 @@ def check_folder(
     except UserError as error:
         findings.append(from_sentence("head-model", str(error)))
     try:
-        clip = read_clip(folder, assets, tracking, frame_offset, progress)
+        clip = read_clip(folder.resolve(), assets, tracking, frame_offset, format, progress)
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     findings += check_files(clip) + check_tracking(clip) + check_behind_camera(clip) + check_images(clip)
+    findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     lost = left_out(clip)
     if not any(finding.severity == "error" for finding in findings):
         findings += lost_frames(clip, lost)
@@ -92,7 +94,9 @@ def left_out(clip: Clip) -> dict[int, str]:
     repeated, behind = set(repeated_tracking(clip)), set(behind_camera(clip))
     for image, number in clip.pairs():
         view = clip.views[image]
-        absent = [k for k, f in clip.files.of_kind().items() if k != "checkpoint" and f and image not in f]
+        absent = [
+            clip.files.title(k) for k, f in clip.files.of_kind().items() if k != TRACKING and f and image not in f
+        ]
         if number in clip.tracking.bad:
             reasons[image] = clip.tracking.bad[number]
         elif view.problems:
@@ -110,7 +114,10 @@ def left_out(clip: Clip) -> dict[int, str]:
 
 def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
     """Figures about the clip, none of which is a judgement."""
-    found: dict[str, Any] = {f"files in {kind}": len(paths) for kind, paths in clip.files.of_kind().items()}
+    found: dict[str, Any] = {"format": clip.source.format}
+    for kind, paths in clip.files.of_kind().items():
+        if paths or not clip.source.is_paired:  # the other formats have no place for some kinds
+            found[f"files in {clip.files.title(kind)}"] = len(paths)
     if (size := clip.size()) is not None:
         found["image size"] = f"{size[0]}x{size[1]}"
     found |= {"frame offset": clip.offset, "offset found": clip.offset_evidence}
@@ -129,7 +136,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
             if np.isfinite(values).any():
                 found[title] = round(float(np.nanmedian(values)), 3)
     lost = left_out(clip)
-    found["frames left out"] = describe_reasons(lost) if lost else 0
+    found["frames left out"] = describe_reasons(lost, clip.name) if lost else 0
     if coverage is not None:
         found["usable frames"] = len(coverage.images)
         found["training frames"], found["held-out frames"] = len(coverage.split.train), len(coverage.split.test)

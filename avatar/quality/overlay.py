@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from avatar.data.images import read_image, read_mask
+from avatar.data.images import read_image
 from avatar.data_prep.projection import filled_lips
 from avatar.errors import UserError
 from avatar.quality.clip import Clip
 from avatar.quality.fit import Mesh, MeshProjector
+from avatar.quality.masks import read_masks
 
 SHOWN = 8
 DRAWN_WIDTH = 560  # pixels; the mesh needs room for its lines
@@ -54,11 +55,7 @@ def draw_overlays(clip: Clip) -> list[Overlay]:
     for number in choose_frames(clip):
         try:
             image = read_image(clip.files.images[number])
-            masks = {
-                colour: read_mask(found[number])
-                for colour, found in ((MASK, clip.files.head_masks), (MOUTH, clip.files.mouth_masks))
-                if number in found
-            }
+            head, mouth = read_masks(clip.files, number)
         except UserError:
             continue  # named in its own finding; it may have changed since
         width = DRAWN_WIDTH
@@ -66,7 +63,9 @@ def draw_overlays(clip: Clip) -> list[Overlay]:
         canvas = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC)
         mesh = project(tracks[number], width, height)
         canvas = draw_mesh(canvas, mesh)
-        for colour, mask in masks.items():
+        for colour, mask in ((MASK, head), (MOUTH, mouth)):
+            if mask is None:
+                continue
             outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
         if len(mesh.lip_faces):
             outline(canvas, filled_lips(mesh.screen, mesh.lip_faces, width, height) > 0, LIPS)

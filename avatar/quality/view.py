@@ -12,12 +12,17 @@ import numpy as np
 
 from avatar.data.images import decode_image, decode_mask, read_bytes
 from avatar.data.subject import FAINTEST_MATTE
+from avatar.data_prep import face_parsing
+from avatar.data_prep.face_parsing import mask_of
 from avatar.errors import UserError
 
-IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"  # as FrameFiles.of_kind names them
+# As FrameFiles.of_kind names them.
+IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
+PARSING, TRACKING = "face parsing", "checkpoint"
 MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distances are given in the frame's own pixels
 FAR = 0.05  # of the image width: further from the person than soft hair reaches
 _ON = 127
+Decode = Callable[[bytes, Path], np.ndarray]
 _MIN_PIXELS = 64  # below, a mean colour says nothing
 
 
@@ -48,13 +53,16 @@ def measured_size(width: int, height: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def look_at(paths: Mapping[str, Path]) -> View:
-    """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing."""
+def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> View:
+    """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing.
+
+    `decode_parsing` gives the classes of a PARSING file, out of which the head mask is made.
+    """
     problems: dict[str, str] = {}
     pixels: dict[str, np.ndarray] = {}
     digest = b""
     for kind, path in paths.items():
-        decode: Callable[[bytes, Path], np.ndarray] = decode_image if kind == IMAGE else decode_mask
+        decode: Decode = decode_image if kind == IMAGE else decode_parsing if kind == PARSING else decode_mask
         try:
             data = read_bytes(path)
             pixels[kind] = decode(data, path)
@@ -64,6 +72,8 @@ def look_at(paths: Mapping[str, Path]) -> View:
         if kind == IMAGE:
             digest = hashlib.blake2b(data, digest_size=16).digest()
     sizes = {kind: (array.shape[1], array.shape[0]) for kind, array in pixels.items()}
+    if PARSING in pixels:
+        pixels[HEAD] = mask_of(pixels.pop(PARSING), face_parsing.HEAD)
     brightest = {kind: int(array.max()) for kind, array in pixels.items() if kind != IMAGE}
     if IMAGE not in pixels:
         return View(problems, sizes, brightest, digest)
@@ -72,10 +82,10 @@ def look_at(paths: Mapping[str, Path]) -> View:
     small = {
         kind: array if size == (width, height) else cv2.resize(array, size, interpolation=cv2.INTER_AREA)
         for kind, array in pixels.items()
-        if sizes[kind] == (width, height)
+        if array.shape[:2] == (height, width)
     }
     image, alpha, head = small[IMAGE], small.get(ALPHA), small.get(HEAD)
-    if head is None and alpha is not None and HEAD not in paths:
+    if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
         head = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))  # as data/subject.py does
     matte = None
     if alpha is not None and head is not None:

@@ -25,6 +25,7 @@ from avatar.data_prep.formats import open_tracked_folder
 from avatar.data_prep.metrical_tracker import read_tracking
 from avatar.data_prep.prepare import prepare
 from avatar.data_prep.safe_pickle import load_npz, load_pickle, load_torch_pickle
+from avatar.errors import refuse
 from avatar.evaluation.protocol import read_protocol
 from avatar.head.assets import load_head_assets
 from avatar.head.uv_obj import read_uv_obj
@@ -74,7 +75,7 @@ def make_targets(place: Path) -> dict[str, Target]:
 
     def listed(folder: Path) -> object:
         source = open_tracked_folder(folder)
-        return source.read(head, (24, 24))
+        return source.read(head, (24, 24), refuse)
 
     def first_frame(folder: Path) -> object:
         return Subject.open(folder).frame(0)

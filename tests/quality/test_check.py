@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from data_prep.test_bad_folders import CASES, all_zero, copy_of_previous, cut, edit_frame, every, nan_in, remove, set_K
 from tracked_folder import write_tracked_folder
 
@@ -251,6 +253,19 @@ def test_small_losses_add_up_to_an_error(folder: Path) -> None:
     check = checked(folder)
     assert new_findings(check)["left-out"].severity == "error"
     assert new_findings(check)["left-out"].frames == ("00006", "00007")
+
+
+def test_frames_dropped_on_one_side_are_seen_by_the_offset_of_both_ends(tmp_path: Path) -> None:
+    """Each third needs 60 frames of its own, more than the other tests have."""
+    folder = write_tracked_folder(tmp_path / "subject", 190, size=48)
+    tracked = sorted((folder / "checkpoint").iterdir())
+    for dropped, path in pairwise(tracked[95:]):
+        content = torch.load(path, weights_only=False)
+        torch.save(content | {"frame_id": dropped.stem}, dropped)
+    tracked[-1].unlink()
+    dropped_frames = new_findings(checked(folder))["dropped-frames"]
+    assert dropped_frames.severity == "error"
+    assert "offset is 1 in the first third of the clip and 2 in the last" in dropped_frames.problem
 
 
 def test_json_is_all_of_stdout_and_the_status_is_that_of_the_findings(
