@@ -25,12 +25,27 @@ from avatar.data_prep.formats import open_tracked_folder
 from avatar.data_prep.metrical_tracker import read_tracking
 from avatar.data_prep.prepare import prepare
 from avatar.data_prep.safe_pickle import load_npz, load_pickle, load_torch_pickle
+from avatar.drive import subject_drive
+from avatar.drive_file import read_drive, write_drive
 from avatar.errors import refuse
 from avatar.evaluation.protocol import read_protocol
 from avatar.head.assets import load_head_assets
+from avatar.head.expression_names import ExpressionNames
 from avatar.head.uv_obj import read_uv_obj
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
+
+DRIVE_CSV = b"""time,expression_0,smile_right,jaw_x,jaw_y,jaw_z,eyelid_left,eyelid_right,mood
+0.00,0.1,-2e-1,0.1,0,0,0,1,good
+0.04,0.2,+0.5,0.2,0,0,"0.5",1,bad
+0.08,0.3,1,0.1,0,-0.01,0,1,good
+"""
+LIVE_LINK_FACE = b"""\xef\xbb\xbfTimecode,BlendShapeCount,EyeBlinkLeft,EyeLookDownLeft,JawOpen,MouthSmileLeft,HeadYaw
+10:31:09:58.123,61,0.1,0.2,0.3,0.4,0.5
+10:31:09:59.140,61,0.1,0.2,0.3,0.4,0.5
+10:31:10:00.156,61,0.1,0.2,0.3,0.4,0.5
+10:31:11:00.156,61,0.1,0.2,0.3,0.4,0.5
+"""
 
 Reader = tuple[Path | None, Callable[[bytes], object]]  # the file to put the bytes into, if any; what reads them
 
@@ -111,6 +126,16 @@ def make_targets(place: Path) -> dict[str, Target]:
     def in_frame(data: bytes) -> bytes:
         return _with_member(frame, "data.pkl", data)
 
+    expressions = ExpressionNames(("smile_left", "smile_right"))
+    write_drive(place / "drive.npz", subject_drive(Subject.open(prepared), None), head.fingerprint)
+    drive = (place / "drive.npz").read_bytes()
+
+    def driven(name: str) -> Reader:
+        return on_disk(place / name, lambda path: read_drive(path, head, expressions, 24, say=lambda _: None))
+
+    def in_drive(data: bytes) -> bytes:
+        return _with_member(drive, "R.npy", data)
+
     return {
         "pickle": Target(
             [pickle.dumps(objects, protocol=p) for p in range(6)], (None, lambda d: load_pickle(d, "x")), 3
@@ -141,6 +166,10 @@ def make_targets(place: Path) -> dict[str, Target]:
         "protocol": Target(
             [p.read_bytes() for p in PROTOCOLS.glob("*.yaml")], on_disk(place / "x.yaml", read_protocol)
         ),
+        "drive .npz": Target([drive], driven("a.npz")),
+        "drive .npz, checksums right": Target([_member(drive, "R.npy")], driven("b.npz"), 1, in_drive),
+        "drive .csv": Target([DRIVE_CSV], driven("a.csv")),
+        "Live Link Face": Target([LIVE_LINK_FACE], driven("b.csv")),
         "override": Target(
             [b"trainer.iterations=3", b"model=flashavatar", b"data.size=64", b"trainer.seed=1"],
             (None, lambda d: load_config([d.decode("utf-8", "replace")])),

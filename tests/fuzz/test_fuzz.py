@@ -34,7 +34,8 @@ SECONDS = 5.0  # for one file of a few kilobytes, on a busy machine
 NAMES = (
     "pickle", "torch", "torch, checksums right", ".frame", "npz", "npz, checksums right", "VHAP listing",
     "INSTA listing", "IMavatar listing", "manifest", "tracks", "checkpoint", "run.json", "UV obj", "head model", "regions",
-    "eyelid", "image", "protocol", "override",
+    "eyelid", "image", "protocol", "drive .npz", "drive .npz, checksums right",
+    "drive .csv", "Live Link Face", "override",
 )  # fmt: skip
 
 
@@ -80,6 +81,12 @@ def is_read(target: Target, data: bytes, where: str) -> bool:
         raise AssertionError(f"{where}: {type(error).__name__}: {error}") from error
     assert not events, where
     return True
+
+
+def test_a_signalling_nan_is_refused_without_a_warning(targets: dict[str, Target]) -> None:
+    target = targets["drive .npz, checksums right"]
+    damaged = target.seeds[0][:-4] + b"\0\0\xa0\x7f"
+    assert not is_read(target, target.wrap(damaged), "a rotation that ends in a signalling NaN")
 
 
 def test_the_watch_sees_what_it_forbids(tmp_path: Path) -> None:
