@@ -27,18 +27,25 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
             [a.gradient for _, a in points], [total(row) for row, _ in points], s=30, marker=mark, label=kind
         )
         for row, accuracy in points:
+            # The names of neighbours lean away from each other.
+            offset, rotation, horizontal, vertical = {
+                "alpha_min": ((2, 5), 60, "left", "bottom"),
+                "t_min": ((2, -5), -60, "left", "top"),
+            }.get(kind, ((-6, 0), 0, "right", "center") if row.variant.threads == 1 else ((6, 0), 0, "left", "center"))
             by_error.annotate(
                 note(row),
                 (accuracy.gradient, total(row)),
-                xytext=(6, 0),
+                xytext=offset,
+                rotation=rotation,
+                ha=horizontal,
+                va=vertical,
                 textcoords="offset points",
                 fontsize=8,
-                va="center",
             )
     by_error.axhline(total(truth), color="k", ls=":", label="reference (plain torch, float64)")
     by_error.set(xscale="log", ylabel="forward + backward, ms")
     by_error.set_xlabel(f"largest relative error of a gradient, {count:,} splats, {size} x {size} pixels")
-    by_error.margins(x=0.25)
+    by_error.margins(x=0.25, y=0.15)
 
     best = here[0].variant.simd
     cpu = [row for row in rows if row.variant.simd == best and kind_of(row) == "instructions, threads"]
@@ -61,7 +68,7 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
     by_count.set(xlabel=f"splats, {size} x {size} pixels")
     for axes in (by_error, by_size, by_count):
         axes.set(yscale="log")
-        axes.grid(alpha=0.3, which="both")
+        axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=90)
 

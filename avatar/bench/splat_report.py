@@ -19,7 +19,7 @@ from avatar.bench.splat_work import Work, floors, work_of
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
 USUAL_SIZES, USUAL_COUNTS = (256, 512), (HEAD_SPLATS, 50_000)
 FULL_SIZES, FULL_COUNTS = (128, 256, 512, 1024), (1_000, 5_000, HEAD_SPLATS, 50_000, 200_000)
-# Packages that draw Gaussians; all of them need a GPU, so that there is none to time here.
+# Packages that draw Gaussians; none of them draws on a CPU, so there is none to time here.
 OTHER_SPLATTERS = ("gsplat", "diff_gaussian_rasterization", "diff_surfel_rasterization", "msplat")
 
 
@@ -71,7 +71,7 @@ def others_line() -> str:
     found = installed_splatters()
     if not found:
         return f"Other splatters ({', '.join(OTHER_SPLATTERS)}): none installed"
-    return f"Other splatters: {', '.join(found)} installed, not timed: none of them draws without a GPU"
+    return f"Other splatters: {', '.join(found)} installed, not timed: none of them draws on a CPU"
 
 
 def table(rows: Iterable[Row]) -> list[str]:
