@@ -171,10 +171,17 @@ def test_files_that_are_missing_or_ambiguous(head_dir: Path, tmp_path_factory: p
         load_head_assets(head_dir / "flame2020.pkl")
 
 
-@pytest.mark.parametrize("content", [b"", b"garbage", b"\x93NUMPY\x01\x00"])
-def test_a_damaged_eyelid_file_is_named(head_dir: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "l_eyelid.npy is empty"),
+        (b"garbage", "l_eyelid.npy is damaged or holds no numpy arrays"),
+        (b"\x93NUMPY\x01\x00", "l_eyelid.npy is damaged or holds no numpy arrays"),
+    ],
+)
+def test_a_damaged_eyelid_file_is_named(head_dir: Path, content: bytes, message: str) -> None:
     (head_dir / "l_eyelid.npy").write_bytes(content)
-    with pytest.raises(UserError, match="l_eyelid.npy is not a readable"):
+    with pytest.raises(UserError, match=message):
         load_head_assets(head_dir)
 
 
