@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
+def environment(name: str) -> str | None: ...
 def rasterize_mesh(
     screen: np.ndarray, faces: np.ndarray, face_id: np.ndarray, barycentric: np.ndarray, depth: np.ndarray
 ) -> None: ...
@@ -53,7 +54,7 @@ def splat_backward(
 ) -> None: ...
 def dssim(image: Tensor, target: Tensor, mask: Tensor, simd: str, threads: int, gradient: Tensor | None) -> float: ...
 def hyper_forward(
-    parameters: Sequence[Tensor],  # mean, lower and cross of position, rotation and scale
+    packed: Tensor,
     latents: Tensor,
     simd: str,
     threads: int,
@@ -61,15 +62,16 @@ def hyper_forward(
     solved: Tensor | None,
 ) -> None: ...
 def hyper_backward(
-    parameters: Sequence[Tensor],
+    packed: Tensor,
     latents: Tensor,
     solved: Tensor,
     grad_offsets: Tensor,
     simd: str,
     threads: int,
-    gradients: Sequence[Tensor] | None,
+    with_parameters: bool,
     grad_latents: Tensor | None,
-) -> None: ...
+) -> Tensor | None: ...  # the gradient of the parameters, a large_tensor
+def large_tensor(shape: Sequence[int]) -> Tensor: ...  # uninitialised
 def hyper_apply(matrix: Tensor, bias: Tensor, latents: Tensor, simd: str, threads: int, offsets: Tensor) -> None: ...
 def interpolate_forward(grid: Tensor, cells: Tensor, weights: Tensor, simd: str, threads: int, out: Tensor) -> None: ...
 def interpolate_backward(

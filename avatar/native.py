@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
+
+from avatar import _core
 
 
 def thread_count() -> int:
     """Threads that a kernel uses: the variable AVATAR_THREADS, or as many as torch does."""
-    text = os.environ.get("AVATAR_THREADS")
+    text = _core.environment("AVATAR_THREADS")
     if text is None:
         return torch.get_num_threads()
     if not text.isdigit() or not 1 <= int(text) <= 1024:
@@ -19,4 +19,4 @@ def thread_count() -> int:
 
 def instruction_set() -> str:
     """The variable AVATAR_SIMD (baseline, avx2 or avx512; the kernels refuse another); "" is the best there is."""
-    return os.environ.get("AVATAR_SIMD", "")
+    return _core.environment("AVATAR_SIMD") or ""

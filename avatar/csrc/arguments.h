@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <array>
 #include <cstdint>
 #include <initializer_list>
 #include <limits>
@@ -14,8 +15,34 @@
 // Indices that arrays hold are not looked at again: who makes them in Python keeps them in range.
 namespace avatar {
 
+// An array in C order on the CPU that a caller lends for the time of a call.
 template <typename T>
-using Array = nanobind::ndarray<T, nanobind::c_contig, nanobind::device::cpu>;
+class Array {
+public:
+    using Any = nanobind::ndarray<T, nanobind::c_contig, nanobind::device::cpu>;
+
+    Array() = default;
+    Array(T* data, std::size_t ndim, const std::int64_t* shape) : data_(data), ndim_(ndim), shape_(shape) {}
+    explicit Array(Any array)
+        : data_(array.data()), ndim_(array.ndim()), shape_(array.shape_ptr()), owner_(std::move(array)) {}
+
+    T* data() const { return data_; }
+    std::size_t ndim() const { return ndim_; }
+    std::size_t shape(std::size_t axis) const { return static_cast<std::size_t>(shape_[axis]); }
+
+private:
+    T* data_ = nullptr;
+    std::size_t ndim_ = 0;
+    const std::int64_t* shape_ = nullptr;
+    Any owner_;
+};
+
+// The function with which a type lends its arrays without a detour through Python, or null. Torch's tensors have one from
+// 2.10 on; it makes a call of a compiled function cheaper by 2 microseconds for every array.
+using Lend = int (*)(void* object, nanobind::dlpack::dltensor* out);  // 0, or -1 with a Python exception
+
+Lend lender_of(PyTypeObject* type) noexcept;
+bool is_in_c_order(const nanobind::dlpack::dltensor& tensor) noexcept;
 
 // A size that several arrays share. The first array that is checked sets it.
 struct Size {
@@ -81,3 +108,28 @@ inline void check_within(const std::string& name, std::int64_t value, std::int64
 inline void check_threads(int threads) { check_within("threads", threads, 1, 1024); }  // as avatar/native.py
 
 }  // namespace avatar
+
+template <typename T>
+struct nanobind::detail::type_caster<avatar::Array<T>> {
+    using Any = make_caster<typename avatar::Array<T>::Any>;
+    NB_TYPE_CASTER(avatar::Array<T>, Any::Name)
+
+    bool from_python(handle source, std::uint32_t flags, cleanup_list* cleanup) noexcept {
+        if (const avatar::Lend lend = avatar::lender_of(Py_TYPE(source.ptr()))) {
+            dlpack::dltensor lent;
+            if (lend(source.ptr(), &lent) == 0) {
+                if (lent.device.device_type != device::cpu::value || !avatar::is_in_c_order(lent) ||
+                    lent.dtype != nanobind::dtype<std::remove_const_t<T>>())
+                    return false;
+                T* const data = reinterpret_cast<T*>(static_cast<char*>(lent.data) + lent.byte_offset);
+                value = avatar::Array<T>(data, static_cast<std::size_t>(lent.ndim), lent.shape);
+                return true;
+            }
+            PyErr_Clear();  // what cannot be lent is not taken the other way either, but told so there
+        }
+        Any any;
+        if (!any.from_python(source, static_cast<std::uint8_t>(flags), cleanup)) return false;
+        value = avatar::Array<T>(std::move(any.value));
+        return true;
+    }
+};

@@ -6,7 +6,6 @@ same for any number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -19,40 +18,60 @@ from avatar.check import check_shapes
 from avatar.native import instruction_set, thread_count
 
 HEADS = {"position": 3, "rotation": 4, "scale": 3}  # and the number of values of each
+OFFSETS = sum(HEADS.values())
+BLOCK = 16  # Gaussians side by side in the parameters
+CONSTANTS = sum(
+    m + m * (m + 1) // 2 for m in HEADS.values()
+)  # rows of a block that there are once: means and triangles
+DIMENSION = sum(1 + m for m in HEADS.values())  # and rows for every latent dimension
 
 
-def condition(latents: Float[Tensor, "N n"], parameters: Sequence[Float[Tensor, "..."]]) -> Float[Tensor, "N 10"]:
+def packed_shape(num_gaussians: int, latent_size: int) -> tuple[int, int, int]:
+    """The shape of all heads' parameters in one tensor; `avatar.gaussians.hyper.pack` says what is where."""
+    return -(-num_gaussians // BLOCK), CONSTANTS + latent_size * DIMENSION, BLOCK
+
+
+def condition(latents: Float[Tensor, "N n"], packed: Float[Tensor, "blocks rows 16"]) -> Float[Tensor, "N 10"]:
     """The raw offsets of all three heads, differentiable in everything; `avatar.gaussians.hyper` is the definition.
-
-    parameters   `mean` [N, m + n], `lower` [N, m, m] and `cross` [N, n, m] of position, rotation and scale
 
     Raises TypeError or ValueError, naming the tensor, for a wrong shape, dtype or device. A value that is not finite
     shows in its own Gaussian's offsets and gradients and in no other's.
     """
-    _check(latents, parameters)
-    if torch.is_grad_enabled() and any(t.requires_grad for t in (latents, *parameters)):
-        return _Condition.apply(latents, *parameters)  # pyright: ignore
-    return _forward(latents, parameters, None)
-
-
-def _check(latents: Tensor, parameters: Sequence[Tensor]) -> None:
-    check_shapes(latents=(latents, "N n"))
-    N, n = latents.shape
-    expected = {"latents": (N, n)}
-    for head, m in HEADS.items():
-        expected |= {f"{head}.mean": (N, m + n), f"{head}.lower": (N, m, m), f"{head}.cross": (N, n, m)}
-    for (name, shape), tensor in zip(expected.items(), (latents, *parameters), strict=True):
-        if tensor.shape != shape:
-            raise ValueError(f"{name} must have shape {list(shape)} for these latents, got {list(tensor.shape)}")
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+    for name, tensor in (("latents", latents), ("packed", packed)):
+        if tensor.dtype is not torch.float32 or not tensor.is_cpu:
             raise TypeError(f"{name} must be float32 on the cpu, got {tensor.dtype} on {tensor.device}")
+    if latents.ndim != 2:
+        raise ValueError(f"latents must have shape [N, n], got {list(latents.shape)}")
+    latents, packed = latents.contiguous(), packed.contiguous()
+    if torch.is_grad_enabled() and (latents.requires_grad or packed.requires_grad):
+        return _Condition.apply(latents, packed)  # pyright: ignore
+    return _forward(latents, packed, None)
 
 
-def _forward(latents: Tensor, parameters: Sequence[Tensor], solved: Tensor | None) -> Tensor:
-    offsets = torch.empty((len(latents), sum(HEADS.values())), dtype=torch.float32)
-    latents, *inputs = (t.detach().contiguous() for t in (latents, *parameters))
-    _core.hyper_forward(inputs, latents, instruction_set(), thread_count(), offsets, solved)
+def _forward(latents: Tensor, packed: Tensor, solved: Tensor | None) -> Tensor:
+    offsets = torch.empty((latents.shape[0], OFFSETS), dtype=torch.float32)
+    _core.hyper_forward(packed.detach(), latents.detach(), instruction_set(), thread_count(), offsets, solved)
     return offsets
+
+
+class _Condition(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, latents: Tensor, packed: Tensor) -> Tensor:
+        solved = torch.empty((packed.shape[0], OFFSETS, BLOCK), dtype=torch.float32)
+        ctx.save_for_backward(solved, latents, packed)
+        return _forward(latents, packed, solved)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # pyright: ignore
+        solved, latents, packed = ctx.saved_tensors
+        latents, packed, simd, threads = latents.detach(), packed.detach(), instruction_set(), thread_count()
+        by_latents, by_packed = ctx.needs_input_grad
+        grad_latents = torch.empty_like(latents) if by_latents else None
+        gradient = _core.hyper_backward(
+            packed, latents, solved, grad.contiguous(), simd, threads, by_packed, grad_latents
+        )
+        return grad_latents, gradient
 
 
 @torch.no_grad()
@@ -67,40 +86,6 @@ def apply_folded(
     offsets = torch.empty_like(bias)
     _core.hyper_apply(matrix, bias, latents, instruction_set(), thread_count(), offsets)
     return offsets
-
-
-class _Condition(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, latents: Tensor, *parameters: Tensor) -> Tensor:
-        solved = torch.empty((len(latents), sum(HEADS.values())), dtype=torch.float32)
-        ctx.save_for_backward(solved, latents, *parameters)
-        return _forward(latents, parameters, solved)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
-        solved, latents, *parameters = (t.detach().contiguous() for t in ctx.saved_tensors)
-        needed = ctx.needs_input_grad
-        grad_latents = torch.empty_like(latents) if needed[0] else None
-        gradients = _one_block(parameters) if any(needed[1:]) else None
-        _core.hyper_backward(
-            parameters,
-            latents,
-            solved,
-            grad.contiguous(),
-            instruction_set(),
-            thread_count(),
-            gradients,
-            grad_latents,
-        )
-        everything = (grad_latents, *(gradients or [None] * len(parameters)))
-        return tuple(gradient if wanted else None for gradient, wanted in zip(everything, needed, strict=True))
-
-
-def _one_block(tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Uninitialised tensors of the same shapes, side by side: one allocation."""
-    parts = torch.empty(sum(t.numel() for t in tensors), dtype=torch.float32).split([t.numel() for t in tensors])
-    return [part.view(t.shape) for part, t in zip(parts, tensors, strict=True)]
 
 
 def interpolate(

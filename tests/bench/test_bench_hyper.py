@@ -6,7 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from avatar.bench.hyper import WAYS, Leaves, by_covariance, covariance_leaves, fused, leaves_of, measure, random_heads
+from avatar.bench.hyper import (
+    WAYS,
+    Leaves,
+    Way,
+    by_covariance,
+    covariance_leaves,
+    fused,
+    measure,
+    packed_leaves,
+    random_heads,
+)
 from avatar.bench.hyper_report import straight_line
 from avatar.cli import main
 from avatar.errors import UserError
@@ -49,12 +59,14 @@ def not_a_number(leaves: Leaves) -> torch.Tensor:
 @pytest.mark.parametrize("wrong", [off_by_a_little, with_steeper_gradients, not_a_number])
 def test_a_wrong_way_is_not_timed(wrong) -> None:
     with pytest.raises(UserError, match="wrong with 3 latent dimensions is wrong, so it is not timed"):
-        measure((3,), count=50, repeats=1, ways={"wrong": wrong}, say=lambda _: None)
+        measure((3,), count=50, repeats=1, ways={"wrong": Way(wrong, packed_leaves)}, say=lambda _: None)
 
 
 def test_the_covariances_are_those_of_the_same_heads() -> None:
     heads = random_heads(20, 6)
-    torch.testing.assert_close(by_covariance(covariance_leaves(heads)), fused(leaves_of(heads)), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        by_covariance(covariance_leaves(heads)), fused(packed_leaves(heads)), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_a_straight_line_is_found() -> None:

@@ -24,7 +24,7 @@ from valid_calls import BINDINGS, Arguments, Shapes
 from avatar import _core
 from avatar.check import check_shapes
 
-OPTIONAL = {"counts", "solved", "gradients", "grad_latents", "grad_image", "grad_alpha", "gradient"}
+OPTIONAL = {"counts", "solved", "grad_latents", "grad_image", "grad_alpha", "gradient"}
 EVIL = [None, "text", b"", object(), [], {}, 1.5, math.nan, -1, 0, 2**31, 2**70]
 NUMBERS = [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e308, 1e-320]
 # Values that are refused for what the argument means; any number is taken for the others.
@@ -129,18 +129,6 @@ def in_range(name: str, call: Arguments) -> bool:
     return True
 
 
-def packed(call: Arguments) -> Arguments:
-    """With lists in place of "name.0", "name.1", ..."""
-    result: Arguments = {}
-    for name, value in call.items():
-        first, _, part = name.partition(".")
-        if part:
-            result.setdefault(first, []).append(value)
-        else:
-            result[name] = value
-    return result
-
-
 def describe(value: Any) -> str:
     if not isinstance(value, Tensor | np.ndarray):
         return repr(value)[:100]
@@ -197,7 +185,7 @@ def main(examples: int, last: Path) -> None:
         words = ", ".join(f"{argument}={describe(value)}" for argument, value in call.items())
         last.write_text(f"{name}({words})")
         try:
-            getattr(_core, name)(**packed(call))
+            getattr(_core, name)(**call)
             answered = True
         except (TypeError, ValueError):
             answered = False

@@ -10,7 +10,7 @@ import torch
 
 from avatar import _core
 
-Arguments = dict[str, Any]  # the arrays of a list as "name.0", "name.1", ...
+Arguments = dict[str, Any]
 Shapes = dict[str, str]  # of every array, as check_shapes takes them
 
 OUTPUTS = {
@@ -83,16 +83,18 @@ def rasterize_mesh(r: random.Random) -> tuple[Arguments, Shapes]:
     return call, shapes
 
 
-def hyper(r: random.Random, names: list[str], more: Shapes) -> tuple[Arguments, Shapes]:
-    """A call with `latents`, the nine arrays of every list in `names`, and more."""
+def hyper(r: random.Random, more: Shapes) -> tuple[Arguments, Shapes]:
+    """A call with `latents` and more, in whose shapes B and R are the blocks and rows of the parameters."""
     sizes = {"N": r.choice(COUNTS), "n": r.choice([0, 1, 7, 8, 19])}
-    shapes = {"latents": "N n"}
-    for name in names:
-        for head, m in enumerate((3, 4, 3)):
-            parts = (f"N {m + sizes['n']}", f"N {m} {m}", f"N n {m}")
-            shapes |= {f"{name}.{3 * head + part}": shape for part, shape in enumerate(parts)}
-    shapes |= more
+    blocks, rows = -(-sizes["N"] // 16), 32 + 13 * sizes["n"]
+    shapes = {"latents": "N n"} | {k: v.replace("B", str(blocks)).replace("R", str(rows)) for k, v in more.items()}
     return {**arrays(shapes, sizes), **KERNEL}, shapes
+
+
+def hyper_backward(r: random.Random) -> tuple[Arguments, Shapes]:
+    more = {"packed": "B R 16", "solved": "B 10 16", "grad_offsets": "N 10", "grad_latents": "N n"}
+    call, shapes = hyper(r, more)
+    return {**call, "with_parameters": r.random() < 0.5}, shapes
 
 
 def interpolate_forward(r: random.Random) -> tuple[Arguments, Shapes]:
@@ -130,11 +132,9 @@ BINDINGS: dict[str, Callable[[random.Random], tuple[Arguments, Shapes]]] = {
     "splat_forward": splat_forward,
     "splat_backward": splat_backward,
     "rasterize_mesh": rasterize_mesh,
-    "hyper_forward": lambda r: hyper(r, ["parameters"], {"offsets": "N 10", "solved": "N 10"}),
-    "hyper_backward": lambda r: hyper(
-        r, ["parameters", "gradients"], {"solved": "N 10", "grad_offsets": "N 10", "grad_latents": "N n"}
-    ),
-    "hyper_apply": lambda r: hyper(r, [], {"matrix": "N n 10", "bias": "N 10", "offsets": "N 10"}),
+    "hyper_forward": lambda r: hyper(r, {"packed": "B R 16", "offsets": "N 10", "solved": "B 10 16"}),
+    "hyper_backward": hyper_backward,
+    "hyper_apply": lambda r: hyper(r, {"matrix": "N n 10", "bias": "N 10", "offsets": "N 10"}),
     "interpolate_forward": interpolate_forward,
     "interpolate_backward": interpolate_backward,
     "compose_forward": compose({"points": "N 3", **BASES, "opacity_logits": "N", **COMPOSED}),

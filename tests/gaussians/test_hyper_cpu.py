@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from avatar import _core
 from avatar.bench.machine import available_simd
-from avatar.gaussians.hyper import HyperHeads
+from avatar.gaussians.hyper import HyperHeads, unpack
 from avatar.gaussians.hyper_cpu import condition
 
 TOLERANCE = {"rtol": 2e-5, "atol": 2e-5}  # sums of up to 128 products in float32
@@ -16,14 +17,13 @@ TOLERANCE = {"rtol": 2e-5, "atol": 2e-5}  # sums of up to 128 products in float3
 def random_heads(num: int, n: int, seed: int = 0) -> HyperHeads:
     generator = torch.Generator().manual_seed(seed)
     heads = HyperHeads(num, n)
-    with torch.no_grad():
-        for parameter in heads.parameters():
-            parameter.copy_(0.4 * torch.randn(parameter.shape, generator=generator))
+    values = {name: 0.4 * torch.randn(value.shape, generator=generator) for name, value in heads.state_dict().items()}
+    heads.load_state_dict(values)
     return heads
 
 
 def in_float64(heads: HyperHeads) -> HyperHeads:
-    exact = HyperHeads(len(heads.position.mean), heads.position.latent_size).double()
+    exact = HyperHeads(heads.num_gaussians, heads.latent_size).double()
     exact.load_state_dict(heads.state_dict())
     return exact
 
@@ -32,9 +32,13 @@ def gradients(heads: HyperHeads, latents: Tensor, cotangent: Tensor) -> dict[str
     """The offsets and all gradients, by name."""
     leaf = latents.detach().requires_grad_()
     offsets = heads(leaf)
-    names = [name for name, _ in heads.named_parameters()]
-    found = torch.autograd.grad(offsets, (leaf, *heads.parameters()), cotangent)
-    return {"offsets": offsets.detach(), **dict(zip(("latents", *names), found, strict=True))}
+    of_latents, packed = torch.autograd.grad(offsets, (leaf, heads.packed), cotangent)
+    return {"offsets": offsets.detach(), "latents": of_latents, **by_part(packed, heads.num_gaussians)}
+
+
+def by_part(packed: Tensor, num: int) -> dict[str, Tensor]:
+    heads = unpack(packed.detach(), num)
+    return {f"{name}.{part}": value for name, head in heads.items() for part, value in head._asdict().items()}
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 8, 9, 16, 33, 128])
@@ -66,11 +70,10 @@ def test_only_the_gradients_that_are_asked_for() -> None:
     leaf = latents.clone().requires_grad_()
     heads.requires_grad_(False)
     assert torch.equal(torch.autograd.grad(heads(leaf), leaf, cotangent)[0], everything["latents"])
-    heads.rotation.lower.requires_grad_()
+    heads.requires_grad_(True)
     heads(latents).backward(cotangent)
-    assert {name for name, p in heads.named_parameters() if p.grad is not None} == {"rotation.lower"}
-    assert heads.rotation.lower.grad is not None
-    assert torch.equal(heads.rotation.lower.grad, everything["rotation.lower"])
+    assert heads.packed.grad is not None and latents.grad is None
+    assert all(torch.equal(value, everything[name]) for name, value in by_part(heads.packed.grad, 40).items())
     heads.requires_grad_(False)
     assert not heads(latents).requires_grad
     with torch.no_grad():
@@ -82,13 +85,43 @@ def test_strided_tensors() -> None:
     found = gradients(heads, latents.T, cotangent.T)
     expected = gradients(heads, latents.T.contiguous(), cotangent.T.contiguous())
     assert all(torch.equal(found[name], value) for name, value in expected.items())
-    strided = [p.detach().transpose(0, 1).contiguous().transpose(0, 1) for p in parameters_of(heads)]
-    assert not any(p.is_contiguous() for p in strided)
+    strided = heads.packed.detach().transpose(0, 1).contiguous().transpose(0, 1)
+    assert not strided.is_contiguous()
     assert torch.equal(condition(latents.T, strided), found["offsets"])
 
 
-def parameters_of(heads: HyperHeads) -> list[Tensor]:
-    return [t for head in (heads.position, heads.rotation, heads.scale) for t in (head.mean, head.lower, head.cross)]
+def test_parameters_at_any_address() -> None:
+    heads, latents, cotangent = random_heads(50, 3), torch.randn(50, 3), torch.randn(50, 10)
+    expected = gradients(heads, latents, cotangent)
+    memory = torch.zeros(heads.packed.numel() + 1)
+    heads.packed = torch.nn.Parameter(memory[1:].view_as(heads.packed).copy_(heads.packed.detach()))
+    assert heads.packed.data_ptr() % 64 == 4
+    found = gradients(heads, latents, cotangent)
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_the_last_block_is_filled_with_zeros_that_stay() -> None:
+    heads = random_heads(21, 4)
+    optimizer = torch.optim.Adam(heads.parameters(), lr=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        heads(torch.randn(21, 4)).square().sum().backward()
+        optimizer.step()
+    assert bool((heads.packed[-1, :, :5] != 0).all()) and not bool(heads.packed[-1, :, 5:].any())
+
+
+def test_a_gradient_in_use_is_not_written_over() -> None:
+    heads, latents, cotangent = random_heads(300, 4), torch.randn(300, 4), torch.randn(300, 10)
+    before = _core.large_tensor([3, 5]).data_ptr()
+    assert _core.large_tensor([3, 5]).data_ptr() == before  # what is dropped is used again
+    heads(latents).backward(cotangent)
+    kept = heads.packed.grad
+    assert kept is not None
+    copy, view, heads.packed.grad = kept.clone(), kept[3:], None
+    del kept
+    others = [gradients(heads, latents, torch.randn(300, 10)) for _ in range(3)]
+    assert torch.equal(view, copy[3:])
+    assert not torch.equal(others[0]["scale.cross"], others[1]["scale.cross"])
 
 
 @pytest.mark.parametrize("poison", [torch.nan, torch.inf])
@@ -97,7 +130,9 @@ def test_what_is_not_finite_shows_and_stays_with_its_gaussian(index: int, poison
     heads, latents, cotangent = random_heads(40, 9), torch.randn(40, 9), torch.randn(40, 10)
     clean = gradients(heads, latents, cotangent)
     with torch.no_grad():
-        (latents, *parameters_of(heads))[index][17].fill_(poison)
+        parts = heads.state_dict()
+        (latents, *parts.values())[index][17].fill_(poison)
+        heads.load_state_dict(parts)
     poisoned = gradients(heads, latents, cotangent)
     others = [g for g in range(40) if g != 17]
     assert all(torch.equal(poisoned[name][others], value[others]) for name, value in clean.items())
@@ -110,12 +145,13 @@ def test_what_is_not_finite_shows_and_stays_with_its_gaussian(index: int, poison
 def test_extreme_diagonals() -> None:
     """exp as the processor's own, over all that a float can hold."""
     heads = HyperHeads(4001, 1)
-    with torch.no_grad():
-        heads.position.lower[:, 0, 0] = torch.linspace(-95, 95, 4001)
-        heads.position.cross.fill_(1.0)
+    parts = heads.state_dict()
+    parts["position.lower"][:, 0, 0] = diagonals = torch.linspace(-95, 95, 4001)
+    parts["position.cross"].fill_(1.0)
+    heads.load_state_dict(parts)
     latents = torch.ones(4001, 1)
     found = -heads(latents)[:, 0].detach()
-    expected = torch.exp(-heads.position.lower[:, 0, 0].detach().double())
+    expected = torch.exp(-diagonals.double())
     normal = (expected > 1.2e-38) & (expected < 3.4e38)
     assert int(normal.sum()) > 3700
     torch.testing.assert_close(found[normal].double(), expected[normal], rtol=3e-7, atol=0)
@@ -147,7 +183,7 @@ def test_folded_heads_do_not_follow_the_heads() -> None:
     folded = heads.fold()
     before = folded(latents)
     with torch.no_grad():
-        heads.position.mean.add_(1.0)
+        heads.packed.add_(1.0)
     assert torch.equal(folded(latents), before)
     with pytest.raises(ValueError, match="matrix has N = 5, but latents has N = 4; they must be the same"):
         folded(latents[:4])
@@ -157,23 +193,14 @@ def test_wrong_tensors_are_named() -> None:
     heads = random_heads(5, 4)
     with pytest.raises(ValueError, match=r"latents must have shape \[N, n\], got \[4\]"):
         heads(torch.zeros(4))
-    with pytest.raises(ValueError, match=r"position.mean must have shape \[6, 7\] for these latents, got \[5, 7\]"):
-        heads(torch.zeros(6, 4))
-    with pytest.raises(ValueError, match=r"position.mean must have shape \[5, 6\] for these latents, got \[5, 7\]"):
+    with pytest.raises(ValueError, match=r"packed must have shape \[1, 84, 16\], got \[2, 84, 16\]"):
+        condition(torch.zeros(5, 4), torch.zeros(2, 84, 16))
+    with pytest.raises(ValueError, match=r"packed must have shape \[1, 71, 16\], got \[1, 84, 16\]"):
         heads(torch.zeros(5, 3))
-    parameters = parameters_of(heads)
-    with pytest.raises(TypeError, match="rotation.cross must be float32 on the cpu, got torch.float64 on cpu"):
-        condition(torch.zeros(5, 4), [*parameters[:5], parameters[5].double(), *parameters[6:]])
+    with pytest.raises(TypeError, match="packed must be float32 on the cpu, got torch.float64 on cpu"):
+        condition(torch.zeros(5, 4), heads.packed.double())
     with pytest.raises(TypeError, match="latents must be float32 on the cpu, got torch.float64 on cpu"):
-        condition(torch.zeros(5, 4, dtype=torch.float64), parameters)
-
-
-def test_checkpoints_keep_their_names_and_shapes() -> None:
-    assert {name: tuple(value.shape) for name, value in HyperHeads(6, 5).state_dict().items()} == {
-        f"{head}.{name}": shape
-        for head, m in (("position", 3), ("rotation", 4), ("scale", 3))
-        for name, shape in (("mean", (6, m + 5)), ("lower", (6, m, m)), ("cross", (6, 5, m)))
-    }
+        condition(torch.zeros(5, 4, dtype=torch.float64), heads.packed)
 
 
 def test_a_second_backward_accumulates() -> None:
@@ -181,6 +208,6 @@ def test_a_second_backward_accumulates() -> None:
     for _ in range(2):
         heads(latents).sum().backward()
     once = gradients(heads, latents, torch.ones(20, 10))
-    for name, parameter in heads.named_parameters():
-        assert parameter.grad is not None
-        torch.testing.assert_close(parameter.grad, 2 * once[name], rtol=1e-6, atol=1e-6)
+    assert heads.packed.grad is not None
+    for name, value in by_part(heads.packed.grad, 20).items():
+        torch.testing.assert_close(value, 2 * once[name], rtol=1e-6, atol=1e-6)

@@ -1,7 +1,7 @@
 #pragma once
 // Activations of vectors of floats, within 2 units in the last place over the whole range; NaN stays NaN. Included only by
-// the kernels, as splat/simd.h, whose min and max return their second argument where one is NaN.
-#include "splat/simd.h"
+// the kernels, as simd.h, whose min and max return their second argument where one is NaN.
+#include "simd.h"
 
 namespace {
 

@@ -1,10 +1,10 @@
 #include <nanobind/nanobind.h>
-#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
 #include "arguments.h"
 #include "hyper/kernels.h"
+#include "large_tensor.h"
 #include "thread_pool.h"
 
 namespace nb = nanobind;
@@ -17,81 +17,59 @@ namespace {
 
 constexpr std::int64_t kGrain = 256;  // rows that a thread takes at a time
 
-// The arrays of mean, lower and cross of each head.
-using Parameters = std::array<Array<const float>, 3 * kHeads>;
-using Gradients = std::array<Array<float>, 3 * kHeads>;
-
-template <typename Arrays>
-void check_heads(const std::string& name, const Arrays& arrays, Size& N, Size& n) {
-    for (int h = 0; h < kHeads; ++h) {
-        const auto check = [&](int part, std::initializer_list<avatar::Extent> extents) {
-            check_shape(name + "[" + std::to_string(3 * h + part) + "]", arrays[3 * h + part], extents);
-        };
-        const int m = kAttributeSizes[h];
-        check(0, {N, m + n.value});
-        check(1, {N, m, m});
-        check(2, {N, n, m});
-    }
-}
-
-std::array<Head, kHeads> heads_of(const Parameters& p) {
-    std::array<Head, kHeads> heads;
-    for (int h = 0; h < kHeads; ++h) heads[h] = {p[3 * h].data(), p[3 * h + 1].data(), p[3 * h + 2].data()};
-    return heads;
-}
+std::int64_t blocks_of(const Size& gaussians) { return (gaussians.value + kBlock - 1) / kBlock; }
 
 }  // namespace
 
 void bind_hyper(nb::module_& m) {
     m.def(
         "hyper_forward",
-        [](const Parameters& parameters, Array<const float> latents, const std::string& simd, int threads,
+        [](Array<const float> parameters, Array<const float> latents, const std::string& simd, int threads,
            Array<float> offsets, std::optional<Array<float>> solved) {
             Size N("N"), n("n");
             check_shape("latents", latents, {N, n});
-            check_heads("parameters", parameters, N, n);
+            check_shape("packed", parameters, {blocks_of(N), rows_of(n.value), kBlock});
             check_shape("offsets", offsets, {N, kOffsets});
-            if (solved) check_shape("solved", *solved, {N, kOffsets});
+            if (solved) check_shape("solved", *solved, {blocks_of(N), kOffsets, kBlock});
             avatar::check_threads(threads);
             const Kernels& kernels = select_kernels(simd.c_str());
-            const auto heads = heads_of(parameters);
             const nb::gil_scoped_release unlocked;
-            avatar::parallel_for(threads, N.value, kGrain, [&](std::int64_t begin, std::int64_t end) {
-                kernels.forward(heads.data(), latents.data(), n.value, begin, end, offsets.data(),
+            avatar::parallel_for(threads, blocks_of(N), kGrain / kBlock, [&](std::int64_t begin, std::int64_t end) {
+                kernels.forward(parameters.data(), latents.data(), N.value, n.value, begin, end, offsets.data(),
                                 solved ? solved->data() : nullptr);
             });
         },
-        nb::arg("parameters").noconvert(), nb::arg("latents").noconvert(), nb::arg("simd"), nb::arg("threads"),
+        nb::arg("packed").noconvert(), nb::arg("latents").noconvert(), nb::arg("simd"), nb::arg("threads"),
         nb::arg("offsets").noconvert(), nb::arg("solved").noconvert().none());
 
     m.def(
         "hyper_backward",
-        [](const Parameters& parameters, Array<const float> latents, Array<const float> solved,
-           Array<const float> grad_offsets, const std::string& simd, int threads, std::optional<Gradients> gradients,
-           std::optional<Array<float>> grad_latents) {
-            if (!gradients && !grad_latents)
-                throw std::invalid_argument("gradients or grad_latents must be given, got None for both");
+        [](Array<const float> parameters, Array<const float> latents, Array<const float> solved,
+           Array<const float> grad_offsets, const std::string& simd, int threads, bool with_parameters,
+           std::optional<Array<float>> grad_latents) -> std::optional<avatar::Tensor> {
+            if (!with_parameters && !grad_latents)
+                throw std::invalid_argument("a gradient must be wanted: with_parameters is False and grad_latents None");
             Size N("N"), n("n");
             check_shape("latents", latents, {N, n});
-            check_heads("parameters", parameters, N, n);
-            check_shape("solved", solved, {N, kOffsets});
+            check_shape("packed", parameters, {blocks_of(N), rows_of(n.value), kBlock});
+            check_shape("solved", solved, {blocks_of(N), kOffsets, kBlock});
             check_shape("grad_offsets", grad_offsets, {N, kOffsets});
-            if (gradients) check_heads("gradients", *gradients, N, n);
             if (grad_latents) check_shape("grad_latents", *grad_latents, {N, n});
             avatar::check_threads(threads);
             const Kernels& kernels = select_kernels(simd.c_str());
-            const auto heads = heads_of(parameters);
-            std::array<HeadGradient, kHeads> own{};
-            for (int h = 0; gradients && h < kHeads; ++h)
-                own[h] = {(*gradients)[3 * h].data(), (*gradients)[3 * h + 1].data(), (*gradients)[3 * h + 2].data()};
+            std::optional<avatar::Tensor> gradient;
+            if (with_parameters)
+                gradient = avatar::large_tensor({parameters.shape(0), parameters.shape(1), parameters.shape(2)});
             const nb::gil_scoped_release unlocked;
-            avatar::parallel_for(threads, N.value, kGrain, [&](std::int64_t begin, std::int64_t end) {
-                kernels.backward(heads.data(), latents.data(), solved.data(), grad_offsets.data(), n.value, begin, end,
-                                 gradients ? own.data() : nullptr, grad_latents ? grad_latents->data() : nullptr);
+            avatar::parallel_for(threads, blocks_of(N), kGrain / kBlock, [&](std::int64_t begin, std::int64_t end) {
+                kernels.backward(parameters.data(), latents.data(), solved.data(), grad_offsets.data(), N.value, n.value,
+                                 begin, end, gradient ? gradient->data() : nullptr,
+                                 grad_latents ? grad_latents->data() : nullptr);
             });
+            return gradient;
         },
-        nb::arg("parameters").noconvert(), nb::arg("latents").noconvert(), nb::arg("solved").noconvert(),
-        nb::arg("grad_offsets").noconvert(), nb::arg("simd"), nb::arg("threads"), nb::arg("gradients").noconvert().none(),
+        nb::arg("packed").noconvert(), nb::arg("latents").noconvert(), nb::arg("solved").noconvert(),
+        nb::arg("grad_offsets").noconvert(), nb::arg("simd"), nb::arg("threads"), nb::arg("with_parameters"),
         nb::arg("grad_latents").noconvert().none());
 
     m.def(

@@ -7,184 +7,195 @@
 //
 //     grad mu_a = g,   grad C = d w^T,   grad L = -x w^T (lower part),   grad z = -grad mu_b = C w.
 //
-// The products with C stream through memory Gaussian by Gaussian, with the m values of an attribute in the lanes of a
-// vector; the triangular systems are solved for kBlock Gaussians at once, one to a lane. Included only by kernels.cpp.
+// A lane is a Gaussian. kBlock of them lie side by side in the parameters, so that all heads of a block are one stream of
+// rows through memory, read and written without a shuffle; latents and offsets, which others use too, are transposed on
+// the way. Included only by kernels.cpp.
 #include "hyper/exponential.h"
-#include "hyper/four.h"
 #include "hyper/kernels.h"
 
 namespace avatar::hyper {
 namespace {
 
-constexpr int kBlock = 16;                // Gaussians whose triangular systems are solved together
-enum class Latents { none, set, add };    // what becomes of their gradient: the first head sets it
+constexpr int kStrip = 16;  // latent dimensions that are transposed together
+static_assert(kBlock % kLanes == 0);
 
-// The triangular factors of up to kBlock Gaussians, transposed; lanes without a Gaussian hold the identity.
-template <int M>
-struct Factors {
-    float below[M][M][kBlock];  // [i][j], i > j
-    float inverse[M][kBlock];   // of the diagonal
-
-    Factors(const float* lower, int count) {
-        for (int i = 0; i < M; ++i) {
-            for (int j = 0; j <= i; ++j) {
-                float* to = i == j ? inverse[i] : below[i][j];
-                for (int lane = 0; lane < count; ++lane) to[lane] = lower[lane * M * M + i * M + j];
-                for (int lane = count; lane < kBlock; ++lane) to[lane] = 0;
-            }
-            for (int lane = 0; lane < kBlock; ++lane) inverse[i][lane] = exponential(-inverse[i][lane]);
-        }
-    }
-};
-
-// C^T (z - mu_b) of one Gaussian, in four partial sums.
-template <int M>
-inline Four pull(const float* cross, const float* mean_b, const float* z, std::int64_t n) {
-    Four sums[4] = {};
-    std::int64_t k = 0;
-    for (; k + kStrip <= n; k += kStrip) {
-        float d[kStrip];
-        for (int j = 0; j < kStrip; ++j) d[j] = z[k + j] - mean_b[k + j];
-        for (int j = 0; j < kStrip; ++j)
-            sums[j % 4] += broadcast(d[j]) * load<M>(cross + (k + j) * M, j + 1 < kStrip || k + kStrip < n);
-    }
-    for (; k < n; ++k) sums[k % 4] += broadcast(z[k] - mean_b[k]) * load<M>(cross + k * M, k + 1 < n);
-    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+// to[i][lane] = from[lane * stride + i] for i < size; 0 in lanes without a Gaussian.
+inline void transpose_in(const float* from, std::int64_t stride, int count, int size, float (*to)[kBlock]) {
+    for (int lane = 0; lane < count; ++lane)
+        for (int i = 0; i < size; ++i) to[i][lane] = from[lane * stride + i];
+    for (int lane = count; lane < kBlock; ++lane)
+        for (int i = 0; i < size; ++i) to[i][lane] = 0;
 }
 
-template <int M>
-inline void forward_block(const Head& head, const float* latents, std::int64_t n, std::int64_t first, int count,
-                          float* offsets, float* solved) {
-    const std::int64_t size = M + n;
-    float x[M][kBlock] = {};
-    for (int lane = 0; lane < count; ++lane) {
-        const std::int64_t g = first + lane;
-        const Four sum = pull<M>(head.cross + g * n * M, head.mean + g * size + M, latents + g * n, n);
-        for (int i = 0; i < M; ++i) x[i][lane] = sum[i];
+inline void transpose_out(const float (*from)[kBlock], int count, int size, float* to, std::int64_t stride) {
+    for (int lane = 0; lane < count; ++lane)
+        for (int i = 0; i < size; ++i) to[lane * stride + i] = from[i][lane];
+}
+
+inline Floats row(const float* rows, int i) { return load_anywhere(rows + i * kBlock); }
+
+// A gradient is not read again before others have pushed it out of the caches, so a whole line of it goes past them.
+inline void set_row(float* rows, int i, Floats v) {
+    if constexpr (kLanes == kBlock)
+        store_past_caches(rows + i * kBlock, v);
+    else
+        store_anywhere(rows + i * kBlock, v);
+}
+
+// Reads rows in their order and drops them: the processor then takes them for a stream and fetches ahead at the rate of
+// memory, which it does not for the order of the arithmetic.
+inline void fetch(const float* rows, std::int64_t count) {
+    constexpr int kAhead = 4096;  // floats; about two blocks at n = 8
+    for (std::int64_t i = 0; i < count; ++i) {
+        (void)*static_cast<const volatile float*>(rows + i * kBlock);
+        __builtin_prefetch(rows + i * kBlock + kAhead, 0, 2);
     }
-    const Factors<M> L(head.lower + first * M * M, count);
+}
+
+constexpr int lower_row(int i, int j) { return i * (i + 1) / 2 + j; }
+
+// s += C^T d for one dimension of one head, whose rows are mu_b and C.
+template <int M>
+inline void pull(const float* rows, Floats z, Floats* s) {
+    const Floats d = z - row(rows, 0);
+    for (int i = 0; i < M; ++i) s[i] += row(rows, 1 + i) * d;
+}
+
+// x with L^T x = s, in place.
+template <int M>
+inline void solve_upper(const float* lower, Floats* s) {
     for (int i = M - 1; i >= 0; --i) {
-        for (int j = i + 1; j < M; ++j)
-            for (int lane = 0; lane < kBlock; ++lane) x[i][lane] -= L.below[j][i][lane] * x[j][lane];
-        for (int lane = 0; lane < kBlock; ++lane) x[i][lane] *= L.inverse[i][lane];
-    }
-    for (int lane = 0; lane < count; ++lane) {
-        const std::int64_t g = first + lane;
-        for (int i = 0; i < M; ++i) offsets[g * kOffsets + i] = head.mean[g * size + i] - x[i][lane];
-        if (solved != nullptr)
-            for (int i = 0; i < M; ++i) solved[g * kOffsets + i] = x[i][lane];
+        for (int j = i + 1; j < M; ++j) s[i] -= row(lower, lower_row(j, i)) * s[j];
+        s[i] *= exponential(-row(lower, lower_row(i, i)));
     }
 }
 
-void forward(const Head heads[kHeads], const float* latents, std::int64_t n, std::int64_t begin, std::int64_t end,
-             float* offsets, float* solved) {
-    const auto shifted = [](float* p, int by) { return p == nullptr ? nullptr : p + by; };
-    for (std::int64_t first = begin; first < end; first += kBlock) {
-        const int count = end - first < kBlock ? static_cast<int>(end - first) : kBlock;
-        forward_block<3>(heads[0], latents, n, first, count, offsets, solved);
-        forward_block<4>(heads[1], latents, n, first, count, offsets + 3, shifted(solved, 3));
-        forward_block<3>(heads[2], latents, n, first, count, offsets + 7, shifted(solved, 7));
-    }
-}
-
-// One Gaussian's C and what it meets, from the first latent dimension of a strip on.
-struct Row {
-    const float *cross, *mean_b, *z;
-    float *grad_cross, *grad_mean_b, *grad_z;
-};
-
-// The gradients of kSize dimensions of C, mu_b and z; `last` if none follows.
-template <int M, int kSize, bool kParameters, Latents kLatents>
-inline void push(const Row& row, Four w, bool last) {
-    float d[kSize], grad_d[kSize];
-    for (int j = 0; j < kSize; ++j) d[j] = row.z[j] - row.mean_b[j];
-    for (int j = 0; j < kSize; ++j) {
-        const float* c = row.cross + j * M;
-        grad_d[j] = c[0] * w[0] + c[1] * w[1] + c[2] * w[2];
-        if constexpr (M == 4) grad_d[j] += c[3] * w[3];
-    }
-    if constexpr (kParameters) {
-        for (int j = 0; j < kSize; ++j)
-            store<M>(row.grad_cross + j * M, broadcast(d[j]) * w, j + 1 < kSize || !last);
-        for (int j = 0; j < kSize; ++j) row.grad_mean_b[j] = -grad_d[j];
-    }
-    if constexpr (kLatents == Latents::set)
-        for (int j = 0; j < kSize; ++j) row.grad_z[j] = grad_d[j];
-    if constexpr (kLatents == Latents::add)
-        for (int j = 0; j < kSize; ++j) row.grad_z[j] += grad_d[j];
-}
-
-template <int M, bool kParameters, Latents kLatents>
-inline void backward_block(const Head& head, const float* latents, const float* solved, const float* grad_offsets,
-                           std::int64_t n, std::int64_t first, int count, const HeadGradient& gradient,
-                           float* grad_latents) {
-    const std::int64_t size = M + n;
-    const Factors<M> L(head.lower + first * M * M, count);
-    float w[M][kBlock], residual[M][kBlock];  // residual = w times the diagonal
-    for (int i = 0; i < M; ++i) {
-        for (int lane = 0; lane < kBlock; ++lane)
-            residual[i][lane] = lane < count ? -grad_offsets[(first + lane) * kOffsets + i] : 0;
-        for (int j = 0; j < i; ++j)
-            for (int lane = 0; lane < kBlock; ++lane) residual[i][lane] -= L.below[i][j][lane] * w[j][lane];
-        for (int lane = 0; lane < kBlock; ++lane) w[i][lane] = residual[i][lane] * L.inverse[i][lane];
-    }
-    for (int lane = 0; lane < count; ++lane) {
-        const std::int64_t g = first + lane;
-        if constexpr (kParameters) {
-            const float* x = solved + g * kOffsets;
-            float* grad_lower = gradient.lower + g * M * M;
-            for (int i = 0; i < M; ++i) {
-                gradient.mean[g * size + i] = grad_offsets[g * kOffsets + i];
-                for (int j = 0; j < i; ++j) grad_lower[i * M + j] = -x[i] * w[j][lane];
-                grad_lower[i * M + i] = -x[i] * residual[i][lane];  // through exp
-                for (int j = i + 1; j < M; ++j) grad_lower[i * M + j] = 0;
+void forward(const float* parameters, const float* latents, std::int64_t gaussians, std::int64_t n, std::int64_t begin,
+             std::int64_t end, float* offsets, float* solved) {
+    for (std::int64_t block = begin; block < end; ++block) {
+        const float* constants = parameters + block * rows_of(n) * kBlock;
+        const float* dimensions = constants + kConstantRows * kBlock;
+        const std::int64_t first = block * kBlock, left = gaussians - first;
+        const int count = left < kBlock ? static_cast<int>(left) : kBlock;
+        alignas(64) float z[kStrip][kBlock], x[kOffsets][kBlock] = {};
+        fetch(constants, kConstantRows);
+        for (std::int64_t k = 0; k < n; k += kStrip) {
+            const int size = n - k < kStrip ? static_cast<int>(n - k) : kStrip;
+            fetch(dimensions + k * kDimensionRows * kBlock, size * kDimensionRows);
+            transpose_in(latents + first * n + k, n, count, size, z);
+            for (int lane = 0; lane < kBlock; lane += kLanes) {
+                Floats s[kOffsets];
+                for (int i = 0; i < kOffsets; ++i) s[i] = load(x[i] + lane);
+                for (int i = 0; i < size; ++i) {
+                    const float* rows = dimensions + (k + i) * kDimensionRows * kBlock + lane;
+                    const Floats value = load(z[i] + lane);
+                    pull<3>(rows, value, s);
+                    pull<4>(rows + 4 * kBlock, value, s + 3);
+                    pull<3>(rows + 9 * kBlock, value, s + 7);
+                }
+                for (int i = 0; i < kOffsets; ++i) store(x[i] + lane, s[i]);
             }
         }
-        Four own{};
-        for (int i = 0; i < M; ++i) own[i] = w[i][lane];
-        Row row{head.cross + g * n * M, head.mean + g * size + M, latents + g * n, nullptr, nullptr, nullptr};
-        if constexpr (kParameters) {
-            row.grad_cross = gradient.cross + g * n * M;
-            row.grad_mean_b = gradient.mean + g * size + M;
+        alignas(64) float out[kOffsets][kBlock];
+        for (int lane = 0; lane < kBlock; lane += kLanes) {
+            Floats s[kOffsets];
+            for (int i = 0; i < kOffsets; ++i) s[i] = load(x[i] + lane);
+            const float* rows = constants + lane;
+            solve_upper<3>(rows + kOffsets * kBlock, s);
+            solve_upper<4>(rows + (kOffsets + 6) * kBlock, s + 3);
+            solve_upper<3>(rows + (kOffsets + 16) * kBlock, s + 7);
+            for (int i = 0; i < kOffsets; ++i) {
+                store(out[i] + lane, row(rows, i) - s[i]);
+                if (solved != nullptr) store_anywhere(solved + (block * kOffsets + i) * kBlock + lane, s[i]);
+            }
         }
-        if constexpr (kLatents != Latents::none) row.grad_z = grad_latents + g * n;
-        const auto advance = [&](int by) {
-            row.cross += by * M, row.mean_b += by, row.z += by;
-            if constexpr (kParameters) row.grad_cross += by * M, row.grad_mean_b += by;
-            if constexpr (kLatents != Latents::none) row.grad_z += by;
-        };
-        std::int64_t k = 0;
-        for (; k + kStrip <= n; k += kStrip, advance(kStrip))
-            push<M, kStrip, kParameters, kLatents>(row, own, k + kStrip == n);
-        for (; k < n; ++k, advance(1)) push<M, 1, kParameters, kLatents>(row, own, k + 1 == n);
+        transpose_out(out, count, kOffsets, offsets + first * kOffsets, kOffsets);
     }
+}
+
+// w with L w = -g, in place, and the gradient of L if it is wanted.
+template <int M, bool kParameters>
+inline void solve_lower(const float* lower, const float* x, Floats* g, float* grad_lower) {
+    for (int i = 0; i < M; ++i) {
+        Floats residual = -g[i];  // w times the diagonal
+        for (int j = 0; j < i; ++j) residual -= row(lower, lower_row(i, j)) * g[j];
+        g[i] = residual * exponential(-row(lower, lower_row(i, i)));
+        if constexpr (kParameters) {
+            const Floats of_x = -row(x, i);
+            for (int j = 0; j < i; ++j) set_row(grad_lower, lower_row(i, j), of_x * g[j]);
+            set_row(grad_lower, lower_row(i, i), of_x * residual);  // through exp
+        }
+    }
+}
+
+// C w of one dimension of one head, and the gradients of its rows if they are wanted.
+template <int M, bool kParameters>
+inline Floats push(const float* rows, Floats z, const Floats* w, float* gradient) {
+    Floats grad_d = row(rows, 1) * w[0];
+    for (int i = 1; i < M; ++i) grad_d += row(rows, 1 + i) * w[i];
+    if constexpr (kParameters) {
+        const Floats d = z - row(rows, 0);
+        set_row(gradient, 0, -grad_d);
+        for (int i = 0; i < M; ++i) set_row(gradient, 1 + i, d * w[i]);
+    }
+    return grad_d;
 }
 
 template <bool kParameters, bool kLatents>
-void backward_range(const Head heads[kHeads], const float* latents, const float* solved, const float* grad_offsets,
-                    std::int64_t n, std::int64_t begin, std::int64_t end, const HeadGradient* gradients,
+void backward_range(const float* parameters, const float* latents, const float* solved, const float* grad_offsets,
+                    std::int64_t gaussians, std::int64_t n, std::int64_t begin, std::int64_t end, float* gradient,
                     float* grad_latents) {
-    constexpr Latents kFirst = kLatents ? Latents::set : Latents::none, kNext = kLatents ? Latents::add : Latents::none;
-    const HeadGradient none{};
-    const auto of = [&](int head) -> const HeadGradient& { return kParameters ? gradients[head] : none; };
-    for (std::int64_t first = begin; first < end; first += kBlock) {
-        const int count = end - first < kBlock ? static_cast<int>(end - first) : kBlock;
-        backward_block<3, kParameters, kFirst>(heads[0], latents, solved, grad_offsets, n, first, count, of(0),
-                                               grad_latents);
-        backward_block<4, kParameters, kNext>(heads[1], latents, solved + 3, grad_offsets + 3, n, first, count, of(1),
-                                              grad_latents);
-        backward_block<3, kParameters, kNext>(heads[2], latents, solved + 7, grad_offsets + 7, n, first, count, of(2),
-                                              grad_latents);
+    for (std::int64_t block = begin; block < end; ++block) {
+        const std::int64_t start = block * rows_of(n) * kBlock, first = block * kBlock, left = gaussians - first;
+        const int count = left < kBlock ? static_cast<int>(left) : kBlock;
+        alignas(64) float w[kOffsets][kBlock], z[kStrip][kBlock], grad_z[kStrip][kBlock];
+        fetch(parameters + start, kConstantRows);
+        transpose_in(grad_offsets + first * kOffsets, kOffsets, count, kOffsets, w);
+        for (int lane = 0; lane < kBlock; lane += kLanes) {
+            const float *rows = parameters + start + lane, *x = solved + block * kOffsets * kBlock + lane;
+            float* to = kParameters ? gradient + start + lane : nullptr;
+            Floats g[kOffsets];
+            for (int i = 0; i < kOffsets; ++i) {
+                g[i] = load(w[i] + lane);
+                if constexpr (kParameters) set_row(to, i, g[i]);
+            }
+            const auto below = [&](int i) { return kParameters ? to + i * kBlock : nullptr; };
+            solve_lower<3, kParameters>(rows + kOffsets * kBlock, x, g, below(kOffsets));
+            solve_lower<4, kParameters>(rows + (kOffsets + 6) * kBlock, x + 3 * kBlock, g + 3, below(kOffsets + 6));
+            solve_lower<3, kParameters>(rows + (kOffsets + 16) * kBlock, x + 7 * kBlock, g + 7, below(kOffsets + 16));
+            for (int i = 0; i < kOffsets; ++i) store(w[i] + lane, g[i]);
+        }
+        for (std::int64_t k = 0; k < n; k += kStrip) {
+            const int size = n - k < kStrip ? static_cast<int>(n - k) : kStrip;
+            fetch(parameters + start + (kConstantRows + k * kDimensionRows) * kBlock, size * kDimensionRows);
+            if constexpr (kParameters) transpose_in(latents + first * n + k, n, count, size, z);
+            for (int lane = 0; lane < kBlock; lane += kLanes) {
+                Floats v[kOffsets];
+                for (int i = 0; i < kOffsets; ++i) v[i] = load(w[i] + lane);
+                for (int i = 0; i < size; ++i) {
+                    const std::int64_t at = start + (kConstantRows + (k + i) * kDimensionRows) * kBlock + lane;
+                    const float* rows = parameters + at;
+                    const auto to = [&](int r) { return kParameters ? gradient + at + r * kBlock : nullptr; };
+                    const Floats value = kParameters ? load(z[i] + lane) : Floats{};
+                    Floats sum = push<3, kParameters>(rows, value, v, to(0));
+                    sum += push<4, kParameters>(rows + 4 * kBlock, value, v + 3, to(4));
+                    sum += push<3, kParameters>(rows + 9 * kBlock, value, v + 7, to(9));
+                    if constexpr (kLatents) store(grad_z[i] + lane, sum);
+                }
+            }
+            if constexpr (kLatents) transpose_out(grad_z, count, size, grad_latents + first * n + k, n);
+        }
     }
 }
 
-void backward(const Head heads[kHeads], const float* latents, const float* solved, const float* grad_offsets,
-              std::int64_t n, std::int64_t begin, std::int64_t end, const HeadGradient* gradients,
+void backward(const float* parameters, const float* latents, const float* solved, const float* grad_offsets,
+              std::int64_t gaussians, std::int64_t n, std::int64_t begin, std::int64_t end, float* gradient,
               float* grad_latents) {
-    const auto range = gradients == nullptr      ? backward_range<false, true>
+    const auto range = gradient == nullptr       ? backward_range<false, true>
                        : grad_latents == nullptr ? backward_range<true, false>
                                                  : backward_range<true, true>;
-    range(heads, latents, solved, grad_offsets, n, begin, end, gradients, grad_latents);
+    range(parameters, latents, solved, grad_offsets, gaussians, n, begin, end, gradient, grad_latents);
+    finish_stores_past_caches();
 }
 
 }  // namespace

@@ -1,10 +1,11 @@
 #pragma once
 // Included only by kernels.cpp, as is all that has internal linkage here.
-#include "hyper/four.h"
 #include "hyper/kernels.h"
 
 namespace avatar::hyper {
 namespace {
+
+constexpr int kSummed = 8;  // latent dimensions that are summed together
 
 void interpolate(const Corners& corners, const float* grid, std::int64_t n, std::int64_t begin, std::int64_t end,
                  float* out) {
@@ -24,14 +25,14 @@ void interpolate_backward(const Touching& touching, const float* grad, std::int6
         const std::int64_t first = touching.begin[cell], last = touching.begin[cell + 1];
         float* __restrict__ row = grad_grid + cell * n;
         std::int64_t k = 0;
-        for (; k + kStrip <= n; k += kStrip) {
-            float sums[kStrip] = {};  // in registers
+        for (; k + kSummed <= n; k += kSummed) {
+            float sums[kSummed] = {};  // in registers
             for (std::int64_t i = first; i < last; ++i) {
                 const float weight = touching.weights[i];
                 const float* from = grad + touching.gaussians[i] * n + k;
-                for (int j = 0; j < kStrip; ++j) sums[j] += weight * from[j];
+                for (int j = 0; j < kSummed; ++j) sums[j] += weight * from[j];
             }
-            for (int j = 0; j < kStrip; ++j) row[k + j] = sums[j];
+            for (int j = 0; j < kSummed; ++j) row[k + j] = sums[j];
         }
         for (; k < n; ++k) {
             float sum = 0;

@@ -18,27 +18,24 @@ struct Touching {
     const float* weights;           // [gaussians * 4]
 };
 
-// The heads of position, rotation and scale; avatar/gaussians/hyper.py says what the arrays hold.
-constexpr int kHeads = 3, kAttributeSizes[kHeads] = {3, 4, 3}, kOffsets = 10;
+// The heads of position, rotation and scale, with 3, 4 and 3 values. Their parameters are [blocks, rows_of(n), kBlock]: a
+// block holds kBlock Gaussians side by side, the last one zeros beyond the last Gaussian. avatar/gaussians/hyper.py says
+// what the rows are.
+constexpr int kBlock = 16, kOffsets = 3 + 4 + 3;
+constexpr int kConstantRows = kOffsets + 6 + 10 + 6;  // the mean of the attributes, the triangular factors
+constexpr int kDimensionRows = 3 + kOffsets;          // for each head the mean of the latent and a row of the cross term
 
-struct Head {  // of m attribute values, on n latent dimensions
-    const float* mean;   // [gaussians, m + n]
-    const float* lower;  // [gaussians, m, m]
-    const float* cross;  // [gaussians, n, m]
-};
-
-struct HeadGradient {
-    float *mean, *lower, *cross;
-};
+constexpr std::int64_t rows_of(std::int64_t n) { return kConstantRows + n * kDimensionRows; }
 
 struct Kernels {
-    // offsets [gaussians, 10] from latents [gaussians, n]; solved [gaussians, 10], which may be null, is what the
-    // backward pass needs of them: the means of the attributes minus the offsets.
-    void (*forward)(const Head heads[kHeads], const float* latents, std::int64_t n, std::int64_t begin,
-                    std::int64_t end, float* offsets, float* solved);
-    // Every value of the gradients is written; `gradients` or `grad_latents` [gaussians, n] may be null.
-    void (*backward)(const Head heads[kHeads], const float* latents, const float* solved, const float* grad_offsets,
-                     std::int64_t n, std::int64_t begin, std::int64_t end, const HeadGradient* gradients,
+    // For the blocks begin .. end: offsets [gaussians, 10] from latents [gaussians, n]; solved [blocks, 10, kBlock], which
+    // may be null, is what the backward pass needs of them: the means of the attributes minus the offsets.
+    void (*forward)(const float* parameters, const float* latents, std::int64_t gaussians, std::int64_t n,
+                    std::int64_t begin, std::int64_t end, float* offsets, float* solved);
+    // Every value of `gradient`, as large as the parameters and aligned to 64 bytes, and of grad_latents [gaussians, n] is
+    // written; one of them may be null.
+    void (*backward)(const float* parameters, const float* latents, const float* solved, const float* grad_offsets,
+                     std::int64_t gaussians, std::int64_t n, std::int64_t begin, std::int64_t end, float* gradient,
                      float* grad_latents);
     // out [gaussians, 10] = bias [gaussians, 10] + latents [gaussians, n] times matrix [gaussians, n, 10]
     void (*apply)(const float* matrix, const float* bias, const float* latents, std::int64_t n, std::int64_t begin,

@@ -2,7 +2,7 @@
 // What the forward and the backward kernel share: the pixels of a tile, and the alpha of a splat at them. Both
 // directions must make the same decisions (skipped, drawn) to the last bit, so both get them here.
 #include "splat/raster.h"
-#include "splat/simd.h"
+#include "simd.h"
 
 namespace avatar::splat {
 namespace {
