@@ -15,4 +15,4 @@ while read -r source; do
     -fno-trapping-math -ffp-contract=off -DAVATAR_KERNELS=kernels_baseline -Iavatar/csrc \
     -c "$source" -o "$objects/$(echo "${source#avatar/csrc/}" | tr / _).o"
   echo "compiled $source"
-done < <(find avatar/csrc -name '*.cpp' ! -name 'bind*.cpp' ! -name module.cpp | sort)
+done < <(find avatar/csrc -name '*.cpp' ! -name 'bind*.cpp' ! -path '*/python/*' | sort)

@@ -26,12 +26,12 @@ inline Ints load(const int* p) { return *reinterpret_cast<const Ints*>(p); }    
 inline void store(int* p, Ints v) { *reinterpret_cast<Ints*>(p) = v; }            // p aligned
 inline void store(float* p, Floats v) { *reinterpret_cast<Floats*>(p) = v; }        // p aligned
 inline Floats broadcast(float x) { return x - Floats{}; }
+inline Ints sign_bits() { return Ints{} - 0x7fffffff - 1; }
 
 typedef Floats FloatsAnywhere __attribute__((aligned(alignof(float)), may_alias));
 
 inline Floats load_anywhere(const float* p) { return *reinterpret_cast<const FloatsAnywhere*>(p); }
 inline void store_anywhere(float* p, Floats v) { *reinterpret_cast<FloatsAnywhere*>(p) = v; }
-inline Ints sign_bits() { return Ints{} - 0x7fffffff - 1; }
 
 // p aligned to the vector, where it is as wide as a line of the caches. Who writes so calls finish_stores_past_caches()
 // before another thread may look.

@@ -1,8 +1,8 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 
-#include "arguments.h"
 #include "compose/compose.h"
+#include "python/arguments.h"
 #include "thread_pool.h"
 
 namespace nb = nanobind;

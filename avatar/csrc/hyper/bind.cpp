@@ -2,9 +2,9 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
-#include "arguments.h"
 #include "hyper/kernels.h"
-#include "large_tensor.h"
+#include "python/arguments.h"
+#include "python/large_tensor.h"
 #include "thread_pool.h"
 
 namespace nb = nanobind;

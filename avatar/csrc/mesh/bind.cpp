@@ -1,7 +1,7 @@
 #include <nanobind/nanobind.h>
 
-#include "arguments.h"
 #include "mesh/rasterize.h"
+#include "python/arguments.h"
 
 namespace nb = nanobind;
 using avatar::Array;

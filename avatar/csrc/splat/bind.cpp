@@ -6,7 +6,7 @@
 
 #include <cstring>
 
-#include "arguments.h"
+#include "python/arguments.h"
 #include "splat/splat.h"
 
 namespace nb = nanobind;

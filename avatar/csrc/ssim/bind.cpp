@@ -4,7 +4,7 @@
 
 #include <limits>
 
-#include "arguments.h"
+#include "python/arguments.h"
 #include "ssim/ssim.h"
 
 namespace nb = nanobind;

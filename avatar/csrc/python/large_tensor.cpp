@@ -1,4 +1,4 @@
-#include "large_tensor.h"
+#include "python/large_tensor.h"
 
 #include <nanobind/stl/vector.h>
 

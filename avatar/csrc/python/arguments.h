@@ -128,7 +128,7 @@ struct nanobind::detail::type_caster<avatar::Array<T>> {
             PyErr_Clear();  // what cannot be lent is not taken the other way either, but told so there
         }
         Any any;
-        if (!any.from_python(source, static_cast<std::uint8_t>(flags), cleanup)) return false;
+        if (!any.from_python(source, flags, cleanup)) return false;
         value = avatar::Array<T>(std::move(any.value));
         return true;
     }
