@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from avatar.bench import Request
 from avatar.bench.hyper import LATENT_SIZES, QUICK_LATENT_SIZES, Row, measure
-from avatar.bench.machine import describe_machine
+from avatar.bench.results import leave, new_figure
 
 
 def run(request: Request) -> None:
@@ -17,11 +16,8 @@ def run(request: Request) -> None:
     rows = measure(QUICK_LATENT_SIZES, count=300, repeats=3) if request.quick else measure(LATENT_SIZES)
     for line in (*table(rows), "", *comparisons(rows)):
         print(line)
-    figures, plot = request.out / "bench_hyper.json", request.out / "bench_hyper.png"
-    content = {"machine": describe_machine(), "rows": [asdict(row) for row in rows]}
-    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    write_plot(rows, plot)
-    print(f"\nFigures  {figures}\nPlot     {plot}")
+    content = {"rows": [asdict(row) for row in rows]}
+    leave(request.out, "bench_hyper", content, lambda path: write_plot(rows, path))
 
 
 def table(rows: Sequence[Row]) -> list[str]:
@@ -70,11 +66,7 @@ def straight_line(values: dict[int, float]) -> tuple[float, float, float]:
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:
     """Time of one Gaussian over the number of latent dimensions."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(7, 4.5)
     axes = figure.subplots()
     for way in dict.fromkeys(row.way for row in rows):
         points = [(row.latent_size, each(row)) for row in rows if row.way == way]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from avatar.bench.clock import Time, paired_medians
@@ -16,7 +17,9 @@ from avatar.bench.train import Trainee, per_step, run_steps, steps_at_once, trai
 from avatar.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
-from avatar.evaluation.measure import to_8_bit
+from avatar.evaluation.measure import lpips_in_mask, to_8_bit
+from avatar.evaluation.networks import find_lpips
+from avatar.lpips_network import Lpips
 from avatar.metrics import psnr, ssim
 from avatar.render import Renderer
 from avatar.run import Run, load_run
@@ -44,6 +47,7 @@ class Curve:
     late: Time  # and after
     frames: int  # held out, evenly spread over the test split
     points: list[Point]
+    lpips: float | None = None  # of the last point; None where there are no weights
 
     @property
     def last(self) -> Point:
@@ -68,6 +72,8 @@ def measure(
             raise UserError(f"{run.path} was trained on other data than {runs[0].path}; compare runs of one subject")
     learners = [trainee(run.avatar, run.subject, run.config, lambda _: None) for run in runs]
     times = time_steps(learners, repeats)
+    network, note = find_lpips("vgg")
+    say(f"LPIPS: {note}")
     curves = []
     for run, learner, (early, late) in zip(runs, learners, times, strict=True):
         points = []
@@ -79,7 +85,8 @@ def measure(
             minutes = minutes_of(learner, checkpoint.step, early, late)
             points.append(Point(checkpoint.step, minutes, *figures(run, held_out)))
         iterations = run.config.trainer.iterations
-        curves.append(Curve(str(run.path), len(run.avatar), iterations, early, late, len(held_out), points))
+        lpips = None if network is None else mean_lpips(run, held_out, network)
+        curves.append(Curve(str(run.path), len(run.avatar), iterations, early, late, len(held_out), points, lpips))
     return curves
 
 
@@ -110,18 +117,27 @@ def held_out_frames(run: Run, count: int) -> list[Frame]:
 
 
 @torch.no_grad()
-def figures(run: Run, frames: Sequence[Frame]) -> tuple[float, float]:
-    """PSNR and SSIM over the head mask, means over the frames."""
+def pictures(run: Run, frames: Sequence[Frame]) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Render and truth [H, W, 3] of 8 bits each, as values, and the head mask [H, W], for every frame."""
     background = torch.tensor(run.config.data.background)
     renderings = Renderer(run.avatar, background).stream((frame.params, frame.camera) for frame in frames)
-    values = []
     for frame, rendering in zip(frames, renderings, strict=True):
-        pictures = (rendering.image, frame.composite(background))
-        render, truth = (to_8_bit(picture).double() / 255 for picture in pictures)
-        mask = frame.head_mask.double()
-        values.append((float(psnr(render, truth, mask)), float(ssim(render, truth, mask))))
+        render, truth = (to_8_bit(p).double() / 255 for p in (rendering.image, frame.composite(background)))
+        yield render, truth, frame.head_mask.double()
+
+
+def figures(run: Run, frames: Sequence[Frame]) -> tuple[float, float]:
+    """PSNR and SSIM over the head mask, means over the frames."""
+    values = [(float(psnr(*shown)), float(ssim(*shown))) for shown in pictures(run, frames)]
     mean_psnr, mean_ssim = np.mean(values, axis=0).tolist()
     return mean_psnr, mean_ssim
+
+
+@torch.no_grad()
+def mean_lpips(run: Run, frames: Sequence[Frame], network: Lpips) -> float:
+    """LPIPS of the head, mean over the frames."""
+    shown = pictures(run, frames)
+    return float(np.mean([lpips_in_mask(network, (render, truth), mask) for render, truth, mask in shown]))
 
 
 def pareto(curves: Sequence[Curve]) -> list[Curve]:

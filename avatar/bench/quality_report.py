@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from avatar.bench import Request
-from avatar.bench.machine import describe_machine
 from avatar.bench.quality import Curve, measure, pareto
+from avatar.bench.results import leave, new_figure
 
 FRAMES, FULL_FRAMES, QUICK_FRAMES = 50, 10_000, 2
 REPEATS, QUICK_REPEATS = 11, 1
@@ -23,11 +22,8 @@ def run(request: Request) -> None:
     curves = measure(request.inputs, request.head, frames=frames, repeats=repeats)
     for line in table(curves):
         print(line)
-    figures, plot = request.out / "bench_quality.json", request.out / "bench_quality.png"
-    content = {"machine": describe_machine(), "curves": [asdict(curve) for curve in curves]}
-    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    write_plot(curves, plot)
-    print(f"\nFigures  {figures}\nPlot     {plot}")
+    content = {"curves": [asdict(curve) for curve in curves]}
+    leave(request.out, "bench_quality", content, lambda path: write_plot(curves, path))
 
 
 def table(curves: Sequence[Curve]) -> list[str]:
@@ -35,14 +31,16 @@ def table(curves: Sequence[Curve]) -> list[str]:
     yardstick, front = curves[0], pareto(curves)
     goals = [f"to {point.psnr:.2f} dB" for point in (yardstick.last, yardstick.best)]
     lines = [
-        f"{'run':>16} {'steps':>6} {'ms/step':>15} {'minutes':>8} {'PSNR':>6} {'SSIM':>7} {'best PSNR':>16} "
+        f"{'run':>16} {'steps':>6} {'ms/step':>15} {'minutes':>8} {'PSNR':>6} {'SSIM':>7} {'LPIPS':>6} {'best PSNR':>16} "
         f"{goals[0]:>11} {goals[1]:>11} {f'within {NEAR} dB':>13}"
     ]
     for curve in curves:
         last, best = curve.last, curve.best
+        lpips = "-" if curve.lpips is None else f"{curve.lpips:.4f}"
+        finest = f"{best.psnr:.2f} ({best.minutes:.2f})"
         lines.append(
             f"{Path(curve.run).name:>16} {last.step:6} {f'{curve.early.median:.1f}, {curve.late.median:.1f}':>15} "
-            f"{last.minutes:8.2f} {last.psnr:6.2f} {last.ssim:7.4f} {f'{best.psnr:.2f} ({best.minutes:.2f})':>16} "
+            f"{last.minutes:8.2f} {last.psnr:6.2f} {last.ssim:7.4f} {lpips:>6} {finest:>16} "
             f"{minutes(curve.minutes_to(yardstick.last.psnr)):>11} {minutes(curve.minutes_to(yardstick.best.psnr)):>11} "
             f"{minutes(curve.minutes_to(last.psnr - NEAR)):>13}"
         )
@@ -62,11 +60,7 @@ def minutes(value: float | None) -> str:
 
 def write_plot(curves: Sequence[Curve], path: Path) -> None:
     """PSNR and SSIM against training time; the last checkpoints that are best for their time are joined."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11, 4.2)
     front = pareto(curves)
     for axes, name, unit in zip(figure.subplots(1, 2), ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True):
         for curve in curves:

@@ -7,7 +7,6 @@ threads) and the stream (several frames at a time) are timed as they are used. T
 from __future__ import annotations
 
 import itertools
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,8 +18,9 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.machine import describe_machine, limited_to
+from avatar.bench.machine import limited_to
 from avatar.bench.render_plot import write_plot
+from avatar.bench.results import leave
 from avatar.errors import UserError
 from avatar.render import Renderer
 from avatar.run import Run, load_run
@@ -60,11 +60,8 @@ def run(request: Request) -> None:
     rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
     for line in table(rows, describe(trained)):
         print(line)
-    figures, plot = request.out / "bench_render.json", request.out / "bench_render.png"
-    content = {"machine": describe_machine(), "avatar": describe(trained), "rows": [asdict(row) for row in rows]}
-    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    write_plot(rows, plot)
-    print(f"\nFigures  {figures}\nPlot     {plot}")
+    content = {"avatar": describe(trained), "rows": [asdict(row) for row in rows]}
+    leave(request.out, "bench_render", content, lambda path: write_plot(rows, path))
 
 
 def describe(trained: Run) -> dict[str, Any]:

@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from avatar.bench.render import Row
+    from avatar.bench.results import new_figure
+from avatar.bench.render import Row
 
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 1.6 + 0.8 * len(rows)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10, 1.6 + 0.8 * len(rows))
     steps, rates = figure.subplots(1, 2, width_ratios=(3, 1))
     names = [f"{row.size} px" for row in rows]
     done = [0.0] * len(rows)

@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from avatar.bench.splat import Row
+    from avatar.bench.results import new_figure
+from avatar.bench.splat import Row
 
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(15, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(15, 5)
     by_error, by_size, by_count = figure.subplots(1, 3)
     truth = next(row for row in rows if row.variant.backend == "reference")  # where all sweeps cross
     count, size = truth.variant.count, truth.variant.size

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -10,7 +9,8 @@ from typing import Any
 
 from avatar.bench import Request
 from avatar.bench.floor import measured_copy_bandwidth, measured_flops
-from avatar.bench.machine import available_simd, describe_machine
+from avatar.bench.machine import available_simd
+from avatar.bench.results import leave
 from avatar.bench.scenes import HEAD_SPLATS
 from avatar.bench.splat import Row, all_variants, measure
 from avatar.bench.splat_plot import total, write_plot
@@ -25,7 +25,6 @@ OTHER_SPLATTERS = ("gsplat", "diff_gaussian_rasterization", "diff_surfel_rasteri
 
 def run(request: Request) -> None:
     """Measure, print and write; `quick` takes scenes too small to say anything."""
-    out = request.out
     if request.quick:
         variants = all_variants(
             QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE, plain_sizes=QUICK_SIZES, all_threads=True
@@ -43,17 +42,13 @@ def run(request: Request) -> None:
     for line in work_table(rows, works):
         print(line)
     print(others_line())
-    figures, plot = out / "bench_splat.json", out / "bench_splat.png"
-    figures.write_text(json.dumps(as_json(rows, works), indent=1) + "\n", encoding="utf-8")
-    write_plot(rows, plot)
-    print(f"\nFigures  {figures}\nPlot     {plot}")
+    leave(request.out, "bench_splat", as_json(rows, works), lambda path: write_plot(rows, path))
 
 
 def as_json(rows: Sequence[Row], works: Sequence[Work]) -> dict[str, Any]:
     """All figures, with the machine that they belong to; milliseconds, bytes, and operations and bytes a second."""
     threads = sorted({row.variant.threads for row in rows})
     return {
-        "machine": describe_machine(),
         "limits": [
             {"threads": t, "operations": measured_flops(t), "bytes": measured_copy_bandwidth(t)} for t in threads
         ],

@@ -8,7 +8,6 @@ precision, as a program that stores them would; the truth comes from the unround
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.bench import Request
-from avatar.bench.machine import describe_machine
+from avatar.bench.results import leave, new_figure
 from avatar.gaussians.hyper import Factor, conditional_mean
 
 ATTRIBUTE = 3  # values of a, as of a position
@@ -43,11 +42,8 @@ def run(request: Request) -> None:
     rows = measure(LATENTS[:4] if request.quick else LATENTS, CONDITIONS, count)
     for line in table(rows):
         print(line)
-    figures, plot = request.out / "stability.json", request.out / "stability.png"
-    found = {"machine": describe_machine(), "gaussians": count, "rows": [asdict(row) for row in rows]}
-    figures.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    write_plot(rows, plot)
-    print(f"\nFigures  {figures}\nPlot     {plot}")
+    found = {"gaussians": count, "rows": [asdict(row) for row in rows]}
+    leave(request.out, "stability", found, lambda path: write_plot(rows, path))
 
 
 def measure(latents: Sequence[int], conditions: Sequence[float], count: int) -> list[Row]:
@@ -120,11 +116,7 @@ def table(rows: Sequence[Row]) -> list[str]:
 
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10, 4)
     latents = sorted({row.latent for row in rows})
     shown = [n for n in (8, latents[-1]) if n in latents]
     for axes, latent in zip(figure.subplots(1, len(shown), sharey=True, squeeze=False)[0], shown, strict=True):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from avatar.bench import Request
-from avatar.bench.machine import describe_machine
+from avatar.bench.results import leave, new_figure
 from avatar.bench.train import ONCE_A_FRAME, Row, as_json, measure, share_of_faithful
 
 REPEATS, QUICK_REPEATS, FULL_REPEATS = 15, 2, 41
@@ -19,16 +18,12 @@ def run(request: Request) -> None:
     rows = measure(request, repeats)
     for line in table(rows):
         print(line)
-    figures, plot = request.out / "bench_train.json", request.out / "bench_train.png"
     content = {
-        "machine": describe_machine(),
         "folder": str(request.inputs[0]),
         "overrides": list(request.overrides),
         "rows": as_json(rows),
     }
-    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    write_plot(rows, plot)
-    print(f"\nFigures  {figures}\nPlot     {plot}")
+    leave(request.out, "bench_train", content, lambda path: write_plot(rows, path))
 
 
 def table(rows: Sequence[Row]) -> list[str]:
@@ -73,11 +68,7 @@ def stage_sum(row: Row) -> float:
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:
     """One bar a preset, stacked by stage."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second; only this command needs it
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9, 3.6)
     axes = figure.subplots()
     left = {row.preset: 0.0 for row in rows}
     for index, name in enumerate(name for name in stage_names(rows) if name not in ONCE_A_FRAME):

@@ -7,7 +7,6 @@ transfer's.
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 
 from avatar.bench import Request
-from avatar.bench.machine import describe_machine
+from avatar.bench.results import leave
 from avatar.config import Config, load_config
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
@@ -68,16 +67,13 @@ def run(request: Request) -> None:
     )
     for row in rows:
         print(f"{row.transfer:>12} {row.full:10.2f} {row.head:10.2f}")
-    figures = request.out / "bench_transfer.json"
     content = {
-        "machine": describe_machine(),
         "scale": asdict(scale),
         "neutral_bias": NEUTRAL_BIAS,
         "overrides": request.overrides,
         "rows": [asdict(row) for row in rows],
     }
-    figures.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    print(f"\nFigures  {figures}")
+    leave(request.out, "bench_transfer", content)
 
 
 def measure(scale: Scale, out: Path, overrides: Sequence[str] = ()) -> list[Row]:

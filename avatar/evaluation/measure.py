@@ -95,8 +95,9 @@ class FrameMeasurer:
             network = self._networks[protocol.lpips_net]
             images = self._images(protocol.look, what == "multiply")
             if what in self._masks:
-                images = _masked_crop(images, self._masks[what])
-            self._lpips[key] = _lpips(network, *images) if images else float("nan")
+                self._lpips[key] = lpips_in_mask(network, images, self._masks[what])
+            else:
+                self._lpips[key] = _lpips(network, *images)
         return self._lpips[key]
 
 
@@ -113,12 +114,13 @@ def lpips_crop(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
     return sides[0], sides[1]
 
 
-def _masked_crop(images: tuple[Tensor, Tensor], mask: Float[Tensor, "H W"]) -> tuple[Tensor, Tensor] | None:
+def lpips_in_mask(network: Lpips | None, images: tuple[Tensor, Tensor], mask: Float[Tensor, "H W"]) -> float:
+    """LPIPS of two images [H, W, 3] times the mask, on its crop; NaN without a network or for an empty mask."""
     crop = lpips_crop(mask)
     if crop is None:
-        return None
+        return float("nan")
     inside = mask[crop][..., None]
-    return images[0][crop] * inside, images[1][crop] * inside
+    return _lpips(network, images[0][crop] * inside, images[1][crop] * inside)
 
 
 def _lpips(network: Lpips | None, image: Tensor, target: Tensor) -> float:

@@ -11,8 +11,12 @@ from tracked_folder import write_tracked_folder
 from avatar.bench import Request
 from avatar.bench.clock import Time
 from avatar.bench.quality import Curve, Point, measure, pareto
-from avatar.bench.quality_report import run
+from avatar.bench.quality_report import run, table
 from avatar.errors import UserError
+from avatar.evaluation.evaluate import evaluate
+from avatar.lpips import save_lpips
+from avatar.lpips_network import Lpips
+from avatar.run import load_run
 
 ANY = Time(1.0, 1.0, 1)
 
@@ -47,6 +51,23 @@ def test_runs_of_one_subject_get_a_curve_each(
         assert c["points"][-1]["minutes"] == pytest.approx(12 * rate / 60_000)
         assert f"{c['points'][-1]['psnr']:.2f}" in output
     assert iio.imread(tmp_path / "bench_quality.png").shape[1] > 500
+
+
+def test_figures_are_those_of_the_evaluation(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("AVATAR_LPIPS", str(tmp_path / "weights"))
+    (tmp_path / "weights").mkdir()
+    save_lpips(Lpips("squeeze"), tmp_path / "weights" / "lpips_squeeze.safetensors")
+    train_small(tracked_folder, tmp_path / "run")
+    (found,) = measure([tmp_path / "run"], None, frames=10_000, repeats=1)
+    assert "squeeze, not to be compared with figures of vgg" in capsys.readouterr().out
+    written = evaluate(load_run(tmp_path / "run"), ["hypergaussians"], say=lambda _: None)
+    means = json.loads(written.read_text())["protocols"]["hypergaussians"]["means"]
+    assert found.last.psnr == pytest.approx(means["psnr_head"], abs=1e-6)
+    assert found.last.ssim == pytest.approx(means["ssim_head"], abs=1e-6)
+    assert found.lpips is not None and found.lpips == pytest.approx(means["lpips_head"], rel=1e-5)
+    assert f" {found.lpips:.4f} " in "\n".join(table([found]))
 
 
 def test_runs_of_two_subjects_are_refused(tracked_folder: Path, tmp_path: Path) -> None:
