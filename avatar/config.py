@@ -84,7 +84,7 @@ class TrainerConfig:
     perceptual_start: float
     lpips_net: str
     lpips_every: int
-    lpips_crop: int | None
+    lpips_region: str
     log_every: int
     preview_every: int
     checkpoint_every: int
@@ -110,6 +110,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "model.name": ("hypergaussians", "flashavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
     "trainer.lpips_net": ("vgg", "alex", "squeeze"),
+    "trainer.lpips_region": ("frame", "head"),
     "trainer.initial_colours": ("grey", "frames"),
 }
 RANGES: dict[str, tuple[float, float]] = {
@@ -138,7 +139,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.dssim_weight": (0, math.inf),
     "trainer.perceptual_start": (0, 1),
     "trainer.lpips_every": (1, math.inf),
-    "trainer.lpips_crop": (32, 8192),
     "trainer.log_every": (1, math.inf),
     "trainer.preview_every": (1, math.inf),
     "trainer.checkpoint_every": (1, math.inf),

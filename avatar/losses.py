@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -105,26 +104,24 @@ def dssim(
     return (1.0 - similarity).sum() / (2.0 * similarity.shape[-1] * windows)
 
 
-def on_crop(perceptual: Perceptual, size: int, generator: np.random.Generator) -> Perceptual:
-    """`perceptual` of a random square of at most `size` pixels out of the mask's bounding box, in place of the whole frame.
+def on_head(perceptual: Perceptual, margin: int = 16) -> Perceptual:
+    """`perceptual` of the mask's bounding box, grown by `margin` pixels, in place of the whole frame.
 
-    Squares lie anywhere in the box with the same probability; the value is scaled by the box's share of the frame, so that
-    on average it weighs what the mean over the whole frame does. Networks see less around the pixels at a square's rim.
+    The value is scaled by the box's share of the frame, so it weighs what the mean over the whole frame does: both images
+    are black outside the mask. Only networks that see the frame's border where the box ends can tell.
     """
 
     def cropped(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
         box = bounding_box(mask)
         if box is None:
             return (image * 0.0).sum()
-        crop, share = [], 1.0
-        for side, length in zip(box, mask.shape, strict=True):
-            extent = min(size, length)
-            low, high = min(side.start, length - extent), max(side.stop - extent, side.start)
-            start = int(generator.integers(low, min(high, length - extent) + 1))
-            crop.append(slice(start, start + extent))
-            share *= max(side.stop - side.start, extent) / length
-        rows, columns = crop
-        return share * perceptual(image[rows, columns], target[rows, columns], mask[rows, columns])
+        rows, columns = (
+            slice(max(side.start - margin, 0), min(side.stop + margin, length))
+            for side, length in zip(box, mask.shape, strict=True)
+        )
+        inside = mask[rows, columns]
+        share = inside.numel() / mask.numel()
+        return share * perceptual(image[rows, columns], target[rows, columns], inside)
 
     return cropped
 

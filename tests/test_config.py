@@ -11,7 +11,7 @@ def test_the_papers_recipe(overrides: list[str]) -> None:
     config = load_config(overrides)
     assert (config.model.latent_grid, config.trainer.initial_colours) == (None, "grey")
     assert (config.trainer.lr_warmup, config.trainer.lr_final) == (0, 1.0)
-    assert (config.trainer.lpips_every, config.trainer.lpips_crop) == (1, None)
+    assert (config.trainer.lpips_every, config.trainer.lpips_region) == (1, "frame")
     assert (config.model.name, config.model.latent_dim, config.model.uv_size) == ("hypergaussians", 8, 128)
     assert (config.model.mlp_width, config.model.mlp_layers, config.model.frequencies) == (256, 6, 8)
     rates = config.trainer.learning_rates

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from avatar.losses import dssim, masked_huber, masked_lpips, on_crop, photometric_loss
+from avatar.losses import dssim, masked_huber, masked_lpips, on_head, photometric_loss
+from avatar.lpips_network import Lpips
 from avatar.metrics import ssim
 
 
@@ -87,34 +87,30 @@ def test_sizes_that_disagree_are_named() -> None:
         photometric_loss(image, target, mouth[:20], head)
 
 
-def test_random_squares_weigh_on_average_what_the_whole_frame_does() -> None:
-    """A perceptual term that is a mean over pixels, of an error that is the same everywhere in the mask's box."""
-    mask = torch.zeros(40, 60)
-    mask[5:35, 10:50] = 1.0
-    image, target = torch.full((40, 60, 3), 0.75), torch.full((40, 60, 3), 0.25)
+def test_the_heads_box_weighs_what_the_whole_frame_does() -> None:
+    image, target, _, _ = sample()
+    head = torch.zeros(24, 31, dtype=torch.float64)
+    head[4:12, 20:28] = torch.rand(8, 8) + 0.01
+    seen = []
 
     def mean_error(a, b, m):
-        assert a.shape == (16, 16, 3)
-        return ((a - b) * m[..., None]).mean()
+        seen.append(tuple(m.shape))
+        return (((a - b) * m[..., None]) ** 2).mean()
 
-    generator = np.random.default_rng(0)
-    values = [float(on_crop(mean_error, 16, generator)(image, target, mask)) for _ in range(20)]
-    whole = float(((image - target) * mask[..., None]).mean())
-    assert max(abs(v - whole) for v in values) < 1e-6
+    whole = mean_error(image, target, head)
+    torch.testing.assert_close(on_head(mean_error, margin=3)(image, target, head), whole)
+    assert seen == [(24, 31), (14, 14)]
+    leaf = image.clone().requires_grad_()
+    nothing = on_head(mean_error)(leaf, target, torch.zeros(24, 31, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(nothing, leaf)
+    assert nothing.item() == 0.0 and not gradient.any()
 
 
-def test_a_square_larger_than_head_or_frame_is_cut_to_the_frame_and_no_mask_gives_no_loss() -> None:
-    image = torch.rand(20, 30, 3)
-    mask = torch.zeros(20, 30)
-    mask[18:, 28:] = 1.0
-    shapes = []
-
-    def note(a, b, m):
-        shapes.append(tuple(a.shape))
-        assert m.any(), "the square misses the head"
-        return a.mean()
-
-    for seed in range(5):
-        on_crop(note, 24, np.random.default_rng(seed))(image, image, mask)
-    assert shapes == [(20, 24, 3)] * 5
-    assert float(on_crop(note, 24, np.random.default_rng(0))(image, image, torch.zeros(20, 30))) == 0.0
+def test_a_network_sees_in_the_heads_box_nearly_what_it_sees_in_the_frame() -> None:
+    y, x = torch.meshgrid(torch.arange(160.0), torch.arange(160.0), indexing="ij")
+    head = ((y - 80) ** 2 + (x - 70) ** 2 < 40**2).float()
+    image, target = torch.rand(160, 160, 3), torch.rand(160, 160, 3)
+    distance = masked_lpips(Lpips("squeeze"))
+    with torch.no_grad():
+        whole, box = distance(image, target, head), on_head(distance)(image, target, head)
+    assert abs(float(box / whole) - 1) < 0.1

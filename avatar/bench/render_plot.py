@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from avatar.bench.results import new_figure
+
 if TYPE_CHECKING:
-    from avatar.bench.results import new_figure
-from avatar.bench.render import Row
+    from avatar.bench.render import Row
 
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:

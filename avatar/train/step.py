@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, cast
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,7 +13,7 @@ from torch import Tensor
 from avatar.check import describe_non_finite
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.losses import Perceptual, PhotometricLoss, dssim, masked_lpips, on_crop, photometric_loss
+from avatar.losses import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
 from avatar.lpips import Net, load_lpips
 from avatar.model import Avatar
 from avatar.splat import splat
@@ -22,24 +21,27 @@ from avatar.train.optim import schedule, set_rates
 from avatar.types import Frame, Gaussians
 
 
+class Weighted(NamedTuple):
+    function: Perceptual
+    weight: float
+
+
 @dataclass(frozen=True)
 class PerceptualTerm:
     """What the third term of the loss is in this run."""
 
-    function: Perceptual | None
-    weight: float
     name: str
+    term: Weighted | None = None
     every: int = 1  # takes part in every so many-th step, with so many times the weight
-    crop: int | None = None  # pixels; of a random square of the head in place of the frame
+    between: Weighted | None = None  # stands in for it in the other steps
 
-    def at(self, step: int, start: int, seed: int) -> tuple[Perceptual | None, float]:
-        """Function and weight of step `step` (from 0) when the term takes part from step `start` on."""
-        if self.function is None or step < start or (step - start) % self.every:
-            return None, 0.0
-        function = self.function
-        if self.crop is not None:
-            function = on_crop(function, self.crop, np.random.default_rng([seed, step]))
-        return function, self.weight * self.every
+    def at(self, step: int, start: int) -> Weighted | None:
+        """The term of step `step` (from 0) when there is one from step `start` on."""
+        if self.term is None or step < start:
+            return None
+        if (step - start) % self.every:
+            return self.between
+        return self.term._replace(weight=self.term.weight * self.every)
 
 
 class Outcome(NamedTuple):
@@ -64,14 +66,14 @@ class Objective:
 
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
         start = round(self.config.perceptual_start * self.config.iterations)
-        function, weight = self.perceptual.at(step, start, self.config.seed)
+        term = self.perceptual.at(step, start)
         return photometric_loss(
             image,
             target,
             frame.mouth_mask,
             frame.head_mask,
-            perceptual=function,
-            perceptual_weight=weight,
+            perceptual=term.function if term else None,
+            perceptual_weight=term.weight if term else 0.0,
             mouth_weight=self.config.mouth_weight,
             delta=self.config.huber_delta,
         )
@@ -110,19 +112,19 @@ def choose_perceptual(config: TrainerConfig, say: Callable[[str], None]) -> Perc
     Raises UserError when LPIPS is asked for by name and cannot be had.
     """
     if config.perceptual == "none":
-        return PerceptualTerm(None, 0.0, "none")
+        return PerceptualTerm("none")
+    in_its_place = Weighted(dssim, config.dssim_weight)
     if config.perceptual in ("lpips", "auto"):
         try:
             lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
-            name = f"lpips-{config.lpips_net}"
-            return PerceptualTerm(
-                masked_lpips(lpips), config.perceptual_weight, name, config.lpips_every, config.lpips_crop
-            )
+            function = masked_lpips(lpips) if config.lpips_region == "frame" else on_head(masked_lpips(lpips))
+            term = Weighted(function, config.perceptual_weight)
+            return PerceptualTerm(f"lpips-{config.lpips_net}", term, config.lpips_every, in_its_place)
         except UserError as error:
             if config.perceptual == "lpips":
                 raise
             say(f"Training with D-SSIM in place of LPIPS: {error}")
-    return PerceptualTerm(dssim, config.dssim_weight, "dssim")
+    return PerceptualTerm("dssim", in_its_place)
 
 
 def check_step(step: int, frame: Frame, loss: PhotometricLoss, avatar: Avatar) -> None:

@@ -11,10 +11,11 @@ from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.errors import UserError
+from avatar.losses import dssim
 from avatar.metrics import psnr
 from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
-from avatar.train.step import PerceptualTerm, choose_perceptual
+from avatar.train.step import PerceptualTerm, Weighted, choose_perceptual
 from avatar.train.trainer import interruption, train
 
 
@@ -70,12 +71,13 @@ def test_a_resumed_run_of_the_papers_recipe_has_the_bits_too(tracked_folder: Pat
     assert not [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])]
 
 
-def test_a_sparse_perceptual_term_keeps_its_weight_on_average() -> None:
-    term = PerceptualTerm(lambda image, target, mask: image.sum(), 0.05, "test", every=4)
-    weights = [term.at(step, 10, 0) for step in range(10, 22)]
-    assert [w for _, w in weights] == [0.2, 0, 0, 0] * 3
-    assert [f is None for f, _ in weights] == [False, True, True, True] * 3
-    assert term.at(6, 10, 0) == (None, 0.0)
+def test_a_sparse_perceptual_term_keeps_its_weight_on_average_and_has_a_stand_in() -> None:
+    rare, stand_in = Weighted(lambda image, target, mask: image.sum(), 0.05), Weighted(dssim, 0.03)
+    term = PerceptualTerm("test", rare, every=4, between=stand_in)
+    found = [term.at(step, 10) for step in range(10, 22)]
+    assert found == [Weighted(rare.function, 0.2), stand_in, stand_in, stand_in] * 3
+    assert term.at(6, 10) is None and PerceptualTerm("none").at(6, 0) is None
+    assert [PerceptualTerm("always", rare).at(step, 2) for step in (1, 2, 3)] == [None, rare, rare]
 
 
 def test_another_seed_is_another_avatar(tracked_folder: Path, tmp_path: Path) -> None:
@@ -164,7 +166,7 @@ def test_without_weights_the_default_trains_with_dssim_and_says_so_once() -> Non
     said: list[str] = []
     term = choose_perceptual(small_config().trainer, said.append)
     assert term.name == "dssim" and len(said) == 1 and "D-SSIM in place of LPIPS" in said[0]
-    assert choose_perceptual(small_config("trainer.perceptual=none").trainer, said.append).function is None
+    assert choose_perceptual(small_config("trainer.perceptual=none").trainer, said.append).term is None
     assert len(said) == 1
 
 
