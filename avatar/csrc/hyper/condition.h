@@ -52,6 +52,10 @@ inline void fetch(const float* rows, std::int64_t count) {
     }
 }
 
+// Where the rows of position, rotation and scale begin: among the values, the triangles, and the rows of a dimension.
+constexpr int kValues[kHeads] = {0, 3, 7}, kTriangles[kHeads] = {kOffsets, kOffsets + 6, kOffsets + 16};
+constexpr int kDimensions[kHeads] = {0, 4, 9};
+
 constexpr int lower_row(int i, int j) { return i * (i + 1) / 2 + j; }
 
 // s += C^T d for one dimension of one head, whose rows are mu_b and C.
@@ -89,9 +93,9 @@ void forward(const float* parameters, const float* latents, std::int64_t gaussia
                 for (int i = 0; i < size; ++i) {
                     const float* rows = dimensions + (k + i) * kDimensionRows * kBlock + lane;
                     const Floats value = load(z[i] + lane);
-                    pull<3>(rows, value, s);
-                    pull<4>(rows + 4 * kBlock, value, s + 3);
-                    pull<3>(rows + 9 * kBlock, value, s + 7);
+                    pull<3>(rows + kDimensions[0] * kBlock, value, s + kValues[0]);
+                    pull<4>(rows + kDimensions[1] * kBlock, value, s + kValues[1]);
+                    pull<3>(rows + kDimensions[2] * kBlock, value, s + kValues[2]);
                 }
                 for (int i = 0; i < kOffsets; ++i) store(x[i] + lane, s[i]);
             }
@@ -101,9 +105,9 @@ void forward(const float* parameters, const float* latents, std::int64_t gaussia
             Floats s[kOffsets];
             for (int i = 0; i < kOffsets; ++i) s[i] = load(x[i] + lane);
             const float* rows = constants + lane;
-            solve_upper<3>(rows + kOffsets * kBlock, s);
-            solve_upper<4>(rows + (kOffsets + 6) * kBlock, s + 3);
-            solve_upper<3>(rows + (kOffsets + 16) * kBlock, s + 7);
+            solve_upper<3>(rows + kTriangles[0] * kBlock, s + kValues[0]);
+            solve_upper<4>(rows + kTriangles[1] * kBlock, s + kValues[1]);
+            solve_upper<3>(rows + kTriangles[2] * kBlock, s + kValues[2]);
             for (int i = 0; i < kOffsets; ++i) {
                 store(out[i] + lane, row(rows, i) - s[i]);
                 if (solved != nullptr) store_anywhere(solved + (block * kOffsets + i) * kBlock + lane, s[i]);
@@ -159,10 +163,13 @@ void backward_range(const float* parameters, const float* latents, const float* 
                 g[i] = load(w[i] + lane);
                 if constexpr (kParameters) set_row(to, i, g[i]);
             }
-            const auto below = [&](int i) { return kParameters ? to + i * kBlock : nullptr; };
-            solve_lower<3, kParameters>(rows + kOffsets * kBlock, x, g, below(kOffsets));
-            solve_lower<4, kParameters>(rows + (kOffsets + 6) * kBlock, x + 3 * kBlock, g + 3, below(kOffsets + 6));
-            solve_lower<3, kParameters>(rows + (kOffsets + 16) * kBlock, x + 7 * kBlock, g + 7, below(kOffsets + 16));
+            const auto solve = [&](auto solver, int head) {
+                float* const to_triangle = kParameters ? to + kTriangles[head] * kBlock : nullptr;
+                solver(rows + kTriangles[head] * kBlock, x + kValues[head] * kBlock, g + kValues[head], to_triangle);
+            };
+            solve(solve_lower<3, kParameters>, 0);
+            solve(solve_lower<4, kParameters>, 1);
+            solve(solve_lower<3, kParameters>, 2);
             for (int i = 0; i < kOffsets; ++i) store(w[i] + lane, g[i]);
         }
         for (std::int64_t k = 0; k < n; k += kStrip) {
@@ -175,11 +182,14 @@ void backward_range(const float* parameters, const float* latents, const float* 
                 for (int i = 0; i < size; ++i) {
                     const std::int64_t at = start + (kConstantRows + (k + i) * kDimensionRows) * kBlock + lane;
                     const float* rows = parameters + at;
-                    const auto to = [&](int r) { return kParameters ? gradient + at + r * kBlock : nullptr; };
                     const Floats value = kParameters ? load(z[i] + lane) : Floats{};
-                    Floats sum = push<3, kParameters>(rows, value, v, to(0));
-                    sum += push<4, kParameters>(rows + 4 * kBlock, value, v + 3, to(4));
-                    sum += push<3, kParameters>(rows + 9 * kBlock, value, v + 7, to(9));
+                    const auto of = [&](auto pusher, int head) {
+                        float* const to = kParameters ? gradient + at + kDimensions[head] * kBlock : nullptr;
+                        return pusher(rows + kDimensions[head] * kBlock, value, v + kValues[head], to);
+                    };
+                    Floats sum = of(push<3, kParameters>, 0);
+                    sum += of(push<4, kParameters>, 1);
+                    sum += of(push<3, kParameters>, 2);
                     if constexpr (kLatents) store(grad_z[i] + lane, sum);
                 }
             }

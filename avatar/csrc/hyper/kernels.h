@@ -21,7 +21,7 @@ struct Touching {
 // The heads of position, rotation and scale, with 3, 4 and 3 values. Their parameters are [blocks, rows_of(n), kBlock]: a
 // block holds kBlock Gaussians side by side, the last one zeros beyond the last Gaussian. avatar/gaussians/hyper.py says
 // what the rows are.
-constexpr int kBlock = 16, kOffsets = 3 + 4 + 3;
+constexpr int kBlock = 16, kHeads = 3, kOffsets = 3 + 4 + 3;
 constexpr int kConstantRows = kOffsets + 6 + 10 + 6;  // the mean of the attributes, the triangular factors
 constexpr int kDimensionRows = 3 + kOffsets;          // for each head the mean of the latent and a row of the cross term
 
