@@ -90,11 +90,13 @@ def is_path(value: Any) -> bool:
 
 
 def read_listings(folder: Path) -> list[ListedFrame]:
-    """All frames that the folder lists, in the order of the numbers in their images' names; empty without a listing.
+    """All frames that the folder lists; empty without a listing.
 
     `transforms_{train,val,test}.json`, or `flame_params.json` in train/, val/ and test/, or one `transforms.json` or
     `flame_params.json` for all. An image that several of them list is a test frame if `test` has it, else a training
-    frame if `train` has it. Raises UserError for listings that cannot be read and for two frames of one image.
+    frame if `train` has it. Frames of one folder are in the order of the numbers in their images' names (exporters list
+    them as their processes finish), folders in the order of what they are for: training, validation, test.
+    Raises UserError for listings that cannot be read and for two frames of one image.
     """
     divided = {
         split: path
@@ -111,7 +113,16 @@ def read_listings(folder: Path) -> list[ListedFrame]:
     elif frames and not any(frame.split == "test" for frame in frames.values()):
         held_out = {path for path, frame in frames.items() if frame.split == "val"}
         frames = {path: _resplit(frame, "test") if path in held_out else frame for path, frame in frames.items()}
-    return [frames[path] for path in sorted(frames, key=_natural)]
+    return _in_order(frames)
+
+
+def _in_order(frames: dict[Path, ListedFrame]) -> list[ListedFrame]:
+    first_use = {folder: len(SPLITS) for folder in {path.parent for path in frames}}
+    for path, frame in frames.items():
+        if frame.split is not None:
+            first_use[path.parent] = min(first_use[path.parent], SPLITS.index(frame.split))
+    order = sorted(frames, key=lambda path: (first_use[path.parent], _natural(path)))
+    return [frames[path] for path in order]
 
 
 def _resplit(frame: ListedFrame, split: str) -> ListedFrame:
