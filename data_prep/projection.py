@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
+from scipy.ndimage import binary_fill_holes
 
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
@@ -38,10 +38,8 @@ def silhouette(screen: np.ndarray, faces: np.ndarray, width: int, height: int) -
 
 
 def filled_lips(screen: np.ndarray, lip_faces: np.ndarray, width: int, height: int) -> np.ndarray:
-    """uint8 [H, W], 1 on the lips and on what their outer outline encloses (teeth, tongue)."""
-    lips = silhouette(screen, lip_faces, width, height)
-    outlines, _ = cv2.findContours(lips, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(lips, outlines, -1, 1, thickness=cv2.FILLED)
+    """bool [H, W], true on the lips and on what they enclose (teeth, tongue)."""
+    return binary_fill_holes(silhouette(screen, lip_faces, width, height))  # type: ignore[return-value]
 
 
 def region_faces(head: HeadModel, region: str) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES
+from avatar.data.source import MAX_FPS
 from avatar.errors import UserError, refuse
 from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
 
@@ -182,6 +183,21 @@ def read_frames(
         except BadFrame as error:
             bad[number] = str(error)
     return checked_tracking(frames, bad, paths, complain)
+
+
+def frame_rate(frames: Sequence[ListedFrame]) -> tuple[float | None, tuple[str, ...]]:
+    """Frames a second of the video, where the listing has it under `fps`; and a note where that is no frame rate."""
+    given = next((frame for frame in frames if "fps" in frame.shared), None)
+    if given is None:
+        return None, ()
+    try:
+        fps = float(given.numbers("fps", 1)[0])
+    except BadFrame:
+        fps = math.nan
+    if 0 < fps <= MAX_FPS:
+        return fps, ()
+    shown = str(given.shared["fps"])[:40]
+    return None, (f"fps in {given.listing.name} is {shown}, which is no frame rate: it is not used; give --fps",)
 
 
 def camera_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:

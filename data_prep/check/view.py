@@ -9,17 +9,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from skimage.measure import label, regionprops
 
-from avatar.data.images import decode_image, decode_mask, read_bytes
-from avatar.data.subject import FAINTEST_MATTE
+from avatar.data.images import decode_image, decode_mask, decode_transparency, read_bytes
+from avatar.data.subject import head_of_matte
 from avatar.errors import UserError
 from data_prep import face_parsing
 from data_prep.face_parsing import mask_of
+from data_prep.fit import measured_size
 
 # As FrameFiles.of_kind names them.
 IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
 PARSING, TRACKING = "face parsing", "checkpoint"
-MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distances are given in the frame's own pixels
 FAR = 0.05  # of the image width: further from the person than soft hair reaches
 _ON = 127
 Decode = Callable[[bytes, Path], np.ndarray]
@@ -48,11 +49,6 @@ class View:
     matte: Matte | None = None
 
 
-def measured_size(width: int, height: int) -> tuple[int, int]:
-    scale = min(1.0, MEASURED_WIDTH / width)
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
 def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> View:
     """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing.
 
@@ -63,6 +59,8 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     digest = b""
     for kind, path in paths.items():
         decode: Decode = decode_image if kind == IMAGE else decode_parsing if kind == PARSING else decode_mask
+        if kind == ALPHA and path == paths.get(IMAGE):
+            decode = decode_transparency
         try:
             data = read_bytes(path)
             pixels[kind] = decode(data, path)
@@ -86,7 +84,7 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     }
     image, alpha, head = small[IMAGE], small.get(ALPHA), small.get(HEAD)
     if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
-        head = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))  # as data/subject.py does
+        head = head_of_matte(alpha)
     matte = None
     if alpha is not None and head is not None:
         matte = measure_matte(alpha, head)
@@ -107,17 +105,17 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
 def measure_matte(alpha: np.ndarray, head: np.ndarray) -> Matte:
     """From the matte and the head mask, uint8 [h, w]."""
     weight = alpha.astype(np.float32) * head * (1 / 255**2)
-    on = (weight > 0.5).astype(np.uint8)
-    far = cv2.distanceTransform(1 - on, cv2.DIST_L2, 3) > FAR * weight.shape[1] if on.any() else on == 0
+    on = weight > 0.5
+    apart = cv2.distanceTransform((~on).astype(np.uint8), cv2.DIST_L2, 3)
+    far = apart > FAR * weight.shape[1] if on.any() else ~on
     border = max(3, round(0.04 * weight.shape[1])) | 1
     inner = cv2.erode((head > _ON).astype(np.uint8), np.ones((border, border), np.uint8)) > 0
-    _, _, stats, _ = cv2.connectedComponentsWithStats(on)
-    areas = np.sort(stats[1:, cv2.CC_STAT_AREA])[::-1]
+    areas = sorted((piece.area for piece in regionprops(label(on))), reverse=True)
     return Matte(
         covered=float(on.mean()),
         haze=float(weight[far].mean()) if far.any() else 0.0,
         holes=float((alpha[inner] <= _ON).mean()) if inner.any() else 0.0,
-        specks=float(areas[1:].sum() / areas[0]) if len(areas) else 0.0,
+        specks=float(sum(areas[1:]) / areas[0]) if areas else 0.0,
     )
 
 

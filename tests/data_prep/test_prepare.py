@@ -41,7 +41,8 @@ def test_the_prepared_head_lies_on_the_masks(tmp_path: Path) -> None:
     """Every convention at once: pairing, cameras, 6D rotations, sizes. The renderer of the fixture is the witness."""
     folder = write_tracked_folder(tmp_path / "subject", frames=8, size=80, height=64, offset=2)
     subject, said = prepare_folder(folder, tmp_path / "out", frame_offset=2)
-    assert said[:2] == ["format: metrical-tracker", "image offset 2, given with --frame-offset"]
+    assert said[0] == "format: metrical-tracker"
+    assert said[1].startswith("image offset 2, given with --frame-offset: head overlap 1.000, lips overlap 1.000")
     head = HeadModel(load_head_assets(folder / "head_model"), subject.identity)
     for index in range(len(subject)):
         for size in (None, 40):

@@ -70,7 +70,7 @@ def test_every_protocol_is_verified_and_that_is_recorded(results: Path) -> None:
     for line, entry in zip(said, protocols.values(), strict=True):
         assert "PSNR and SSIM of 3 frames verified" in line
         verified = entry["verified"]
-        assert verified["by"].startswith("scikit-image ") and verified["frames"] == 3 and verified["tolerance"] == 1e-5
+        assert verified["by"].startswith("scikit-image ") and verified["frames"] == 3 and verified["tolerance"] == 2e-6
         assert 0 < verified["largest_difference"] < 1e-6  # frames.csv is rounded to six decimals
         assert f"largest difference {verified['largest_difference']:.1e}" in line
 
@@ -83,10 +83,10 @@ def test_only_the_protocols_that_are_asked_for_are_verified(results: Path) -> No
 
 
 def brighter(folder: Path) -> None:
-    """One pixel inside the head, by one level."""
+    """One channel of one pixel inside the head."""
     path = folder / "renders" / "00008.png"
     image = read_png(path)
-    image[36, 36, 1] = image[36, 36, 1] ^ 1
+    image[36, 36, 1] = image[36, 36, 1] ^ 64
     assert cv2.imwrite(str(path), image)
 
 
@@ -116,7 +116,7 @@ def edit_entry(folder: Path, **values: object) -> None:
 def better_mean(folder: Path) -> None:
     path = folder.parent / "results.json"
     means = json.loads(path.read_text())["protocols"][folder.name]["means"]
-    edit_entry(folder, means=means | {"ssim_head": means["ssim_head"] + 2e-5})
+    edit_entry(folder, means=means | {"ssim_head": means["ssim_head"] + 3e-6})
 
 
 DISAGREEMENTS: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -125,8 +125,8 @@ DISAGREEMENTS: dict[str, tuple[Callable[[Path], None], str]] = {
         r"psnr of frame 00009 is [0-9.]+ in .*strict/frames\.csv, but its pictures give",
     ),
     "a figure of the table": (
-        edit_table("ssim_rest", -2e-5),
-        r"ssim_rest of frame 00009 is .* \(2\.\de-05 apart, 1e-05",
+        edit_table("ssim_rest", -3e-6),
+        r"ssim_rest of frame 00009 is .* \([23]\.\de-06 apart, 2e-06 allowed",
     ),
     "a mean": (better_mean, r"ssim_head of the mean is .*results\.json"),
     "a table that was exchanged": (
