@@ -39,7 +39,7 @@ def silhouette(screen: np.ndarray, faces: np.ndarray, width: int, height: int) -
 
 def filled_lips(screen: np.ndarray, lip_faces: np.ndarray, width: int, height: int) -> np.ndarray:
     """bool [H, W], true on the lips and on what they enclose (teeth, tongue)."""
-    return binary_fill_holes(silhouette(screen, lip_faces, width, height))  # type: ignore[return-value]
+    return np.asarray(binary_fill_holes(silhouette(screen, lip_faces, width, height)))
 
 
 def region_faces(head: HeadModel, region: str) -> np.ndarray:

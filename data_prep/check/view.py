@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.ndimage import binary_fill_holes
 from skimage.measure import label, regionprops
 
 from avatar.data.images import decode_image, decode_mask, decode_transparency, read_bytes
@@ -33,7 +34,7 @@ class Matte:
 
     covered: float  # share of the image with a weight above one half
     haze: float  # mean weight far from the person; 0 where the background is gone
-    holes: float  # share of the inner head mask that the matte makes transparent
+    holes: float  # share of the inner head mask that the matte makes transparent; of the person where there is none
     specks: float  # area of everything but the largest piece / area of the largest piece
 
 
@@ -83,13 +84,14 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
         if array.shape[:2] == (height, width)
     }
     image, alpha, head = small[IMAGE], small.get(ALPHA), small.get(HEAD)
+    matte = None
     if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
         head = head_of_matte(alpha)
-    matte = None
-    if alpha is not None and head is not None:
-        matte = measure_matte(alpha, head)
+        matte = measure_matte(alpha, head, np.asarray(binary_fill_holes(alpha > _ON)))  # its soft rim is no hole
+    elif alpha is not None and head is not None:
+        matte = measure_matte(alpha, head, head > _ON)
     elif head is not None and ALPHA not in paths:
-        matte = measure_matte(np.full_like(head, 255), head)
+        matte = measure_matte(np.full_like(head, 255), head, head > _ON)
     return View(
         problems,
         sizes,
@@ -102,14 +104,14 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     )
 
 
-def measure_matte(alpha: np.ndarray, head: np.ndarray) -> Matte:
-    """From the matte and the head mask, uint8 [h, w]."""
+def measure_matte(alpha: np.ndarray, head: np.ndarray, solid: np.ndarray) -> Matte:
+    """From matte and head mask, uint8 [h, w], and where the matte should have no hole, bool [h, w]."""
     weight = alpha.astype(np.float32) * head * (1 / 255**2)
     on = weight > 0.5
     apart = cv2.distanceTransform((~on).astype(np.uint8), cv2.DIST_L2, 3)
     far = apart > FAR * weight.shape[1] if on.any() else ~on
     border = max(3, round(0.04 * weight.shape[1])) | 1
-    inner = cv2.erode((head > _ON).astype(np.uint8), np.ones((border, border), np.uint8)) > 0
+    inner = cv2.erode(solid.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     areas = sorted((piece.area for piece in regionprops(label(on))), reverse=True)
     return Matte(
         covered=float(on.mean()),
