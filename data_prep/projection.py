@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import torch
-from scipy.ndimage import binary_fill_holes
 
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
@@ -39,7 +39,14 @@ def silhouette(screen: np.ndarray, faces: np.ndarray, width: int, height: int) -
 
 def filled_lips(screen: np.ndarray, lip_faces: np.ndarray, width: int, height: int) -> np.ndarray:
     """bool [H, W], true on the lips and on what they enclose (teeth, tongue)."""
-    return np.asarray(binary_fill_holes(silhouette(screen, lip_faces, width, height)))
+    return filled(silhouette(screen, lip_faces, width, height))
+
+
+def filled(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W]: the mask, uint8 or bool, with its holes filled."""
+    canvas = mask.astype(np.uint8)
+    outlines, _ = cv2.findContours(canvas, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(canvas, outlines, -1, 1, thickness=cv2.FILLED) > 0
 
 
 def region_faces(head: HeadModel, region: str) -> np.ndarray:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_fill_holes
-from skimage.measure import label, regionprops
+from skimage.measure import label
 
 from avatar.data.images import decode_image, decode_mask, decode_transparency, read_bytes
 from avatar.data.subject import head_of_matte
@@ -18,6 +17,7 @@ from avatar.errors import UserError
 from data_prep import face_parsing
 from data_prep.face_parsing import mask_of
 from data_prep.fit import measured_size
+from data_prep.projection import filled
 
 # As FrameFiles.of_kind names them.
 IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
@@ -87,7 +87,7 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     matte = None
     if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
         head = head_of_matte(alpha)
-        matte = measure_matte(alpha, head, np.asarray(binary_fill_holes(alpha > _ON)))  # its soft rim is no hole
+        matte = measure_matte(alpha, head, filled(alpha > _ON))  # its soft rim is no hole
     elif alpha is not None and head is not None:
         matte = measure_matte(alpha, head, head > _ON)
     elif head is not None and ALPHA not in paths:
@@ -112,12 +112,12 @@ def measure_matte(alpha: np.ndarray, head: np.ndarray, solid: np.ndarray) -> Mat
     far = apart > FAR * weight.shape[1] if on.any() else ~on
     border = max(3, round(0.04 * weight.shape[1])) | 1
     inner = cv2.erode(solid.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
-    areas = sorted((piece.area for piece in regionprops(label(on))), reverse=True)
+    areas = np.sort(np.bincount(np.asarray(label(on)).ravel())[1:])[::-1]  # of the pieces; 0 is what lies around
     return Matte(
         covered=float(on.mean()),
         haze=float(weight[far].mean()) if far.any() else 0.0,
         holes=float((alpha[inner] <= _ON).mean()) if inner.any() else 0.0,
-        specks=float(sum(areas[1:]) / areas[0]) if areas else 0.0,
+        specks=float(areas[1:].sum() / areas[0]) if len(areas) else 0.0,
     )
 
 

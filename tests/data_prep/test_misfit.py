@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from exports import write_imavatar, write_vhap
-from folder_damage import matching
+from folder_damage import freeze, matching
 from importing import import_folder
 from tracked_folder import write_head_model, write_tracked_folder
 
@@ -24,6 +24,9 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.check.folder import check_tracked_folder
+from data_prep.fit import Fit
+from data_prep.frame_files import FrameFiles
+from data_prep.misfit import judge
 from data_prep.prepare import prepare
 
 LIPS = r"the tracked lips do not lie on the mouth masks \(overlap 0\.[0-3]\d+, \d+\.\d% of the head's size away\)"
@@ -65,6 +68,50 @@ def roll(folder: Path, pattern: str, rows: int, columns: int) -> None:
         assert cv2.imwrite(str(path), np.roll(read_mask(path), (rows, columns), (0, 1)))
 
 
+@pytest.mark.parametrize(
+    ("head", "inside", "lips", "away", "size", "by_matte", "found"),
+    [
+        (
+            0.31,
+            0.3,
+            0.2,
+            0.024,
+            100,
+            False,
+            None,
+        ),  # a little overlap of the head, and lips that are where they are seen
+        (0.29, 1.0, 0.9, 0.0, 100, False, "head"),
+        (0.10, 0.51, 0.9, 0.0, 100, True, None),  # a matte has clothes in it
+        (0.90, 0.49, 0.9, 0.0, 100, True, "head"),
+        (0.90, 1.0, 0.59, 0.026, 100, False, "lips"),
+        (0.90, 1.0, 0.61, 0.100, 100, False, None),  # large mouths overlap although they are apart
+        (0.90, 1.0, 0.01, 0.024, 100, False, None),  # masks of the teeth alone
+        (0.90, 1.0, 0.50, 0.049, 30, False, None),  # 1.47 pixels are nothing
+        (0.90, 1.0, 0.50, 0.051, 30, False, "lips"),
+        (0.90, 1.0, 0.0, np.nan, 100, False, "lips"),  # lips that are not in the picture
+        (0.20, 0.2, 0.1, 0.500, 100, False, "neither"),
+        (np.nan, np.nan, 0.59, 0.026, 100, False, "lips"),
+        (0.90, 1.0, np.nan, np.nan, 100, False, None),
+        (np.nan, np.nan, np.nan, np.nan, 100, False, None),
+    ],
+)
+def test_where_the_limits_are(
+    head: float, inside: float, lips: float, away: float, size: float, by_matte: bool, found: str | None
+) -> None:
+    paths = {1: Path("x")}
+    files = FrameFiles(Path(), paths, paths, {} if by_matte else paths, paths, paths)
+    usual = Fit(head, inside, 0.0, lips, away * size, 1.0, size)
+    good, bad = Fit(1.0, 1.0, 0.0, 1.0, 0.0, 1.0, size), Fit(0.0, 0.0, 9.0, 0.0, size, 1.0, size)
+    strays = [good, bad] if np.isfinite([head, lips, away]).all() else []
+    for fits in ([usual], [usual, *strays, usual, usual]):  # single frames do not decide
+        judgement = judge(fits, files)
+        assert (
+            None if judgement.problem is None else judgement.problem.split()[0 if found == "neither" else 2]
+        ) == found
+        assert ("head overlap" in judgement.evidence) == np.isfinite(head)
+        assert ("lips overlap" in judgement.evidence) == np.isfinite(lips)
+
+
 @pytest.mark.parametrize("options", [{}, {"frame_offset": 1}], ids=["offset found", "offset given"])
 def test_a_head_model_of_another_topology_is_told_by_its_lips(
     options: dict[str, Any], folder: Path, other_head: Path, tmp_path: Path
@@ -76,6 +123,16 @@ def test_a_head_model_of_another_topology_is_told_by_its_lips(
     (note,) = subject.manifest.notes
     assert note.startswith("the tracked lips do not lie on the mouth masks (")
     assert note.endswith(": taken regardless, as --ignore-misfit says") and f"note: {note}" in said
+
+
+def test_an_offset_that_is_not_clear_is_blamed_on_the_head_model_first(
+    broken: Path, other_head: Path, tmp_path: Path
+) -> None:
+    freeze(broken)
+    with pytest.raises(UserError, match=LIPS + HEAD_LIES + ADVICE):
+        prepared(broken, tmp_path / "out", other_head)
+    with pytest.raises(UserError, match=r"the offset between images and tracking is not clear .* give --frame-offset"):
+        prepared(broken, tmp_path / "out", other_head, ignore_misfit=True)
 
 
 def test_a_paired_folder_is_judged_too(other_head: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from exports import write_imavatar, write_vhap
+from exports import write_imavatar, write_insta, write_vhap
 from importing import FRAMES, import_folder
 
 from avatar.data.images import read_mask
@@ -30,7 +30,7 @@ def make_transparent(folder: Path, images: str, matte_of: Callable[[Path], np.nd
     """Black under the transparent pixels, as many programs leave it."""
     for path in sorted(folder.glob(images)):
         image, matte = cv2.imread(str(path)), matte_of(path)
-        image[matte == 0] = 0
+        image[matte <= 2] = 0
         scale = kind(np.iinfo(kind).max // 255)
         assert cv2.imwrite(str(path), np.dstack((image, matte)).astype(kind) * scale)
 
@@ -93,6 +93,8 @@ def test_one_opaque_frame_among_transparent_ones_is_all_foreground(folder: Path,
     assert cv2.imwrite(str(path), image)
     subject, _ = import_folder(folder, tracked, tmp_path / "out")
     assert (subject.frame(4).alpha == 1).all() and (subject.frame(5).alpha == 0).any()
+    clip = checked(folder, tracked).clip
+    assert clip is not None and clip.views[5].brightest["alpha"] == 255
 
 
 def test_opaque_frames_with_an_alpha_channel_have_no_matte(folder: Path, tracked: Path, tmp_path: Path) -> None:
@@ -121,6 +123,16 @@ def test_a_hole_in_the_face_is_found_and_a_soft_rim_is_none(folder: Path, tracke
     assert cv2.imwrite(str(path), image)
     (finding,) = (one for one in checked(folder, tracked).findings if one.check == "matte-holes")
     assert finding.frames == ("00009",)
+
+
+def test_in_instas_layout_the_transparency_comes_before_the_whole_person(tracked: Path, tmp_path: Path) -> None:
+    """matted/ has shoulders too; the images' own transparency is that of the head. Usual there, and not remarked."""
+    folder = write_insta(tracked, tmp_path / "insta", matted=True)
+    heads = {f"{i:05d}": tracked / "parsing" / f"{i + 1:05d}_neckhead.png" for i in range(FRAMES)}
+    make_transparent(folder, "images/*", lambda path: soft_matte(read_mask(heads[path.stem])))
+    subject, said = import_folder(folder, tracked, tmp_path / "out")
+    assert not any(NOTE in line for line in said)
+    assert_mattes(subject, lambda i: soft_matte(read_mask(heads[subject.manifest.frames[i].name])))
 
 
 @pytest.mark.parametrize("format", ["VHAP", "IMavatar"])
