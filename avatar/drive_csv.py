@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data_prep.safe_pickle import MAX_FILE_BYTES
 from avatar.errors import UserError
+from avatar.files.arrays import MAX_FILE_BYTES
 from avatar.head.expression_names import JAW_TARGETS, NAMES_FILE, ExpressionNames, plain
 
 EYE_COLUMNS = tuple(f"{side}_eye_{axis}" for side in ("left", "right") for axis in "xyz")

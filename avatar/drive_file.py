@@ -27,10 +27,10 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.checkpoint import write_atomically
-from avatar.data_prep.safe_pickle import load_npz
 from avatar.drive import Drive
 from avatar.drive_csv import read_drive_csv
 from avatar.errors import UserError
+from avatar.files.arrays import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames
 from avatar.types import IDENTITY_6D, Camera, HeadParams

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from avatar.data_prep.safe_pickle import UnsafeFileError, load_torch_pickle
 from avatar.data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
 from avatar.errors import UserError, refuse
+from avatar.files.pickles import UnsafeFileError, load_torch_pickle
 from avatar.types import IDENTITY_6D
 
 

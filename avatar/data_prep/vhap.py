@@ -20,7 +20,6 @@ import numpy as np
 
 from avatar.data_prep.frame_files import FrameFiles, KindNames
 from avatar.data_prep.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
-from avatar.data_prep.safe_pickle import load_npz
 from avatar.data_prep.tracked_folder import TrackedFolder, existing, listings_of, numbered
 from avatar.data_prep.tracking import BadFrame, FrameTrack, Tracking, vector
 from avatar.data_prep.transforms import (
@@ -31,6 +30,7 @@ from avatar.data_prep.transforms import (
     read_frames,
 )
 from avatar.errors import UserError
+from avatar.files.arrays import load_npz
 from avatar.head.assets import HeadAssets
 
 NAME = "VHAP"

@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.data_prep.safe_pickle import load_npy, load_npz, load_pickle
 from avatar.errors import UserError
+from avatar.files.arrays import load_npy, load_npz
+from avatar.files.pickles import load_pickle
 from avatar.head.uv_obj import read_uv_obj
 
 IDENTITY_COEFFICIENTS = 300  # FLAME's shapedirs: 300 identity directions, then the expression directions

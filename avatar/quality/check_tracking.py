@@ -9,8 +9,8 @@ import numpy as np
 
 from avatar.data_prep.frame_files import describe_numbers
 from avatar.data_prep.overlap import MIN_OVERLAP
-from avatar.data_prep.safe_pickle import load_torch_pickle
 from avatar.errors import UserError
+from avatar.files.pickles import load_torch_pickle
 from avatar.quality.clip import Clip
 from avatar.quality.findings import Finding, grouped, loss_severity
 from avatar.quality.motion import suddenness

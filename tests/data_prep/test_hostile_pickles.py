@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avatar.data_prep.safe_pickle import UnsafeFileError, load_pickle, load_torch_pickle
 from avatar.errors import UserError
+from avatar.files.pickles import UnsafeFileError, load_pickle, load_torch_pickle
 
 EXTENSION_CODE = 240
 

@@ -13,8 +13,9 @@ import pytest
 import scipy.sparse
 import torch
 
-from avatar.data_prep.safe_pickle import load_npz, load_pickle, load_torch_pickle
 from avatar.errors import UserError
+from avatar.files.arrays import load_npz
+from avatar.files.pickles import load_pickle, load_torch_pickle
 
 
 def assert_same(read: object, written: object) -> None:

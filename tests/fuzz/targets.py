@@ -24,11 +24,12 @@ from avatar.data.subject import Subject
 from avatar.data_prep.formats import open_tracked_folder
 from avatar.data_prep.metrical_tracker import read_tracking
 from avatar.data_prep.prepare import prepare
-from avatar.data_prep.safe_pickle import load_npz, load_pickle, load_torch_pickle
 from avatar.drive import subject_drive
 from avatar.drive_file import read_drive, write_drive
 from avatar.errors import refuse
 from avatar.evaluation.protocol import read_protocol
+from avatar.files.arrays import load_npz
+from avatar.files.pickles import load_pickle, load_torch_pickle
 from avatar.head.assets import load_head_assets
 from avatar.head.expression_names import ExpressionNames
 from avatar.head.uv_obj import read_uv_obj
