@@ -5,7 +5,10 @@ from __future__ import annotations
 import copyreg
 import io
 import pickle
+import re
 import struct
+import sys
+import types
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +17,8 @@ import numpy as np
 import pytest
 
 from avatar.errors import UserError
+from avatar.files import pickles
+from avatar.files.pickled_data import Budget
 from avatar.files.pickles import UnsafeFileError, load_pickle, load_torch_pickle
 
 EXTENSION_CODE = 240
@@ -56,6 +61,10 @@ LIVE: dict[str, tuple[Callable[[Path], bytes], str]] = {
     ),
     "extension registry": (lambda m: b"\x80\x02\x82" + bytes([EXTENSION_CODE]) + b"(" + text(touch(m)) + b"tR.",
                            "instruction EXT1"),
+    "extension registry, 16 bits": (lambda m: b"\x80\x02\x83" + struct.pack("<H", EXTENSION_CODE) + b"(" + text(touch(m))
+                                    + b"tR.", "instruction EXT2"),
+    "extension registry, 32 bits": (lambda m: b"\x80\x02\x84" + struct.pack("<i", EXTENSION_CODE) + b"(" + text(touch(m))
+                                    + b"tR.", "instruction EXT4"),
     "nested pickle": (
         lambda m: b"c_pickle\nloads\n(B" + struct.pack("<I", len(p := b"cbuiltins\neval\n(" + text(touch(m)) + b"tR."))
         + p + b"tR.",
@@ -73,6 +82,11 @@ LIVE: dict[str, tuple[Callable[[Path], bytes], str]] = {
         lambda m: stack_global("numpy", "ndarray.tofile") + b"(" + pickle.dumps(np.zeros(2), 2)[2:-1] + text(str(m))
         + b"tR.",
         "numpy.ndarray.tofile",
+    ),
+    "a class by its attribute": (
+        lambda m: stack_global("builtins", "object.__subclasses__") + b")R0cbuiltins\nopen\n(" + text(str(m)) + text("w")
+        + b"tR.",
+        "builtins.object.__subclasses__",
     ),
     "numpy.f2py": (
         lambda m: stack_global("numpy.f2py.crackfortran", "myeval") + text(touch(m)) + b"\x85R.",
@@ -129,6 +143,7 @@ def test_live_pickles_run_nothing(name: str, marker: Path) -> None:
     with pytest.raises(UnsafeFileError, match=r"^00001\.frame was not read: it "):
         load_torch_pickle(torch_file.getvalue(), "00001.frame")
     assert not marker.exists() and not marker.with_suffix(".npy").exists()
+    assert str(refusal.value).isprintable()
 
     # The bait is real: Python's own reader runs it.
     try:
@@ -136,6 +151,37 @@ def test_live_pickles_run_nothing(name: str, marker: Path) -> None:
     except Exception as error:
         print(error)
     assert marker.exists() or marker.with_suffix(".npy").exists()
+
+
+def test_an_extension_that_python_has_looked_up_before_is_not_handed_out(marker: Path) -> None:
+    data = b"\x80\x02\x82" + bytes([EXTENSION_CODE]) + b"(" + text(touch(marker)) + b"tR."
+    assert pickle.loads(data[:4] + b".") is eval  # from now on Python's readers ask nobody for this code
+    with pytest.raises(UnsafeFileError, match="instruction EXT1"):
+        load_pickle(data)
+    assert not marker.exists()
+
+
+def test_any_name_of_chumpy_is_known_and_none_is_called(marker: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chumpy = types.ModuleType("chumpy")
+    chumpy.__dict__["io"] = io
+    monkeypatch.setitem(sys.modules, "chumpy", chumpy)
+    data = stack_global("chumpy", "io.FileIO") + text(str(marker)) + text("w") + b"\x86R."
+    with pytest.raises(UnsafeFileError, match=r"it calls chumpy\.io\.FileIO in a way that data does not need"):
+        load_pickle(data)
+    assert not marker.exists()
+    pickle.loads(data).close()
+    assert marker.exists()
+
+
+def test_names_on_the_stack_cannot_be_called() -> None:
+    known = [*pickles._NAMES.split(), *pickles._STORAGES, "chumpy.ch.Ch", "scipy.sparse.csc.csc_matrix"]
+    assert len(known) > 20
+    for name in known:
+        machine = pickles._DataUnpickler(io.BytesIO(), Budget(0), None)
+        stand_in = machine.find_class(*name.rsplit(".", 1))
+        assert not callable(stand_in) and not isinstance(stand_in, type)
+        with pytest.raises(UnsafeFileError, match=f"a reference to {re.escape(name)} where data is expected"):
+            load_pickle(stack_global(*name.rsplit(".", 1)) + b".")
 
 
 def array_state(shape: bytes, dtype: str, raw: bytes) -> bytes:
@@ -149,6 +195,30 @@ def array_state(shape: bytes, dtype: str, raw: bytes) -> bytes:
 def sparse(**state: object) -> bytes:
     attributes = pickle.dumps(state, 2)[2:-1]
     return b"\x80\x02cscipy.sparse.csc\ncsc_matrix\n)\x81" + attributes + b"b."
+
+
+def array(value: np.ndarray) -> bytes:
+    return pickle.dumps(value, 2)[2:-1]
+
+
+def buffer(raw: bytes, *shape: int) -> bytes:
+    """The float32 array of this shape that numpy makes of these bytes."""
+    return (
+        b"cnumpy.core.numeric\n_frombuffer\n(C" + bytes([len(raw)]) + raw + b"cnumpy\ndtype\n" + text("f4") + b"\x85R("
+        + b"".join(b"J" + struct.pack("<i", n) for n in shape) + b"t" + text("C") + b"tR"
+    )  # fmt: skip
+
+
+FOUR = buffer(np.arange(4, dtype=np.float32).tobytes(), 4)
+
+
+def tensor(storage: bytes, size: bytes = b"K\x02\x85", stride: bytes = b"K\x01\x85", offset: bytes = b"K\x00") -> bytes:
+    return b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + storage + offset + size + stride + b"tR."
+
+
+def nested_key(begin: bytes, end: bytes) -> tuple[bytes, str]:
+    """A tuple in a tuple in a tuple ..., to be hashed: in C that overflows the stack."""
+    return b"\x80\x04" + begin + b")" + b"\x85" * 100_000 + end + b".", "a tuple as a key"
 
 
 def laughs() -> bytes:
@@ -166,7 +236,7 @@ MISUSED: dict[str, tuple[bytes, str]] = {
         b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\ndtype\n(I0\ntC\x01btR.", "calls numpy.core.multiarray._reconstruct"
     ),
     "encode with another codec": (b"c_codecs\nencode\n(" + text("x") + text("rot13") + b"tR.", "calls _codecs.encode"),
-    "encode of a number": (b"c_codecs\nencode\n(I5\n" + text("latin1") + b"tR.", "int where a str must be"),
+    "encode of a number": (b"c_codecs\nencode\n(I5\n" + text("latin1") + b"tR.", "calls _codecs.encode"),
     "ndarray called": (b"cnumpy\nndarray\n(I5\ntR.", "calls numpy.ndarray"),
     "_reconstructor of another base": (
         b"ccopy_reg\n_reconstructor\n(cchumpy.ch\nCh\nc__builtin__\nset\nNtR.", "calls copyreg._reconstructor"
@@ -178,9 +248,9 @@ MISUSED: dict[str, tuple[bytes, str]] = {
     "chumpy made with arguments": (b"\x80\x02cchumpy.ch\nCh\nI5\n\x85\x81.", "makes an object of chumpy.ch.Ch"),
     "a bare class": (b"(lcnumpy\nndarray\na.", "reference to numpy.ndarray where data is expected"),
     "state on a dictionary": (b"(d(dS'a'\nI1\nsb.", "sets the state of a dict"),
-    "state on a class": (b"cchumpy.ch\nCh\n(d" + text("x") + b"I1\nsb.", "sets the state of a Global"),
-    "state on a function": (b"c_codecs\nencode\n(dS'a'\nI1\nsb.", "sets the state of a Global"),
-    "state twice": (array_state(b"K\x01\x85", "u1", b"C\x01x")[:-1] + b"(NNNNtb.", "sets the state of a ArrayValue"),
+    "state on a class": (b"cchumpy.ch\nCh\n(d" + text("x") + b"I1\nsb.", "sets the state of chumpy.ch.Ch"),
+    "state on a function": (b"c_codecs\nencode\n(dS'a'\nI1\nsb.", "sets the state of _codecs.encode"),
+    "state twice": (array_state(b"K\x01\x85", "u1", b"C\x01x")[:-1] + b"(NNNNtb.", "sets the state of a numpy.ndarray"),
     "persistent id, text": (b"Pstorage\n.", "instruction PERSID"),
     "persistent id": (b"\x80\x02" + text("storage") + b"Q.", "instruction BINPERSID"),
     "out-of-band buffer": (b"\x80\x05\x97.", "instruction NEXT_BUFFER"),
@@ -211,6 +281,61 @@ MISUSED: dict[str, tuple[bytes, str]] = {
     "sparse without shape": (sparse(data=np.ones(1)), "without a two-dimensional shape"),
     "nesting": (b"(l" * 10_000 + b"a" * 9_999 + b".", "nested more than"),
     "tuple as a key": (b"}" + b")" + b"\x85" * 100_000 + b"Ns.", "a tuple as a key"),
+    "tuple as one of several keys": nested_key(b"}(", b"Nu"),
+    "tuple as the key of a new dictionary": nested_key(b"(", b"Nd"),
+    "tuple as the key of an ordered dictionary": nested_key(b"ccollections\nOrderedDict\n](", b"N\x86e\x85R"),
+    "tuple in a set": nested_key(b"\x8f(", b"\x90"),
+    "tuple in a called set": nested_key(b"cbuiltins\nset\n((", b"ltR"),
+    "frozen set": (b"\x80\x04()" + b"\x85" * 100_000 + b"\x91.", "instruction FROZENSET"),
+    "keys that share a hash": (
+        b"}(" + b"".join(b"\x8a\x0b" + (k * (2**61 - 1)).to_bytes(11, "little") + b"N" for k in range(2, 100_000)) + b"u.",
+        "an integer of more than 60 bits as a key",
+    ),
+    "a tuple in a list that holds itself": (b"]q\x00h\x00\x85a.", "contains itself"),
+    "many lists that hold themselves": (b"]q\x00(" + b"h\x00" * 1000 + b"e.", "contains itself"),
+    "a list that is called": (b"])R.", "calls a list"),
+    "an array that is called": (array(np.zeros(3)) + b")R.", "calls a numpy.ndarray"),
+    "an object of a list": (b"\x80\x02])\x81.", "makes an object of a list"),
+    "an object that is made an object of": (b"\x80\x02cchumpy.ch\nCh\n)\x81)\x81.", "makes an object of a chumpy.ch.Ch"),
+    "attributes by slots": (
+        b"\x80\x02cchumpy.ch\nCh\n)\x81N}" + text("cls") + text("numpy.dtype") + b"s\x86b.",
+        "sets the state of a chumpy.ch.Ch",
+    ),
+    "attributes of an array": (array(np.zeros(3)) + b"}" + text("value") + b"Nsb.", "sets the state of a numpy.ndarray"),
+    "attributes of a torch storage type": (b"ctorch\nFloatStorage\n}b.", "sets the state of torch.FloatStorage"),
+    "text as a dtype": (
+        b"cnumpy.core.multiarray\nscalar\n" + text("f8") + b"C\x08" + b"\0" * 8 + b"\x86R.", "malformed shape or dtype"
+    ),
+    "an array as a dtype": (b"cnumpy.core.multiarray\nscalar\n" + array(np.zeros(1)) + b"C\x08" + b"\0" * 8 + b"\x86R.",
+                            "malformed shape or dtype"),
+    "too many dimensions": (array_state(b"(" + b"K\x01" * 9 + b"t", "u1", b"C\x01x"), "malformed shape or dtype"),
+    "text without width": (array_state(b"K\x01\x85", "S", b"C\x00"), "dtype 'S'"),
+    "a tensor of rows without elements": (tensor(buffer(b"", 2**30, 0)), "outside its storage"),
+    "a tensor of a matrix": (tensor(buffer(bytes(16), 2, 2)), "outside its storage"),
+    "a tensor of an array from elsewhere": (tensor(array(np.zeros(4))), "outside its storage"),
+    "a tensor before its storage": (tensor(FOUR, offset=b"J\xff\xff\xff\xff"), "outside its storage"),
+    "a tensor that steps backwards": (tensor(FOUR, stride=b"J\xff\xff\xff\xff\x85"), "outside its storage"),
+    "a tensor that reaches too far": (tensor(FOUR, stride=b"K\x04\x85"), "outside its storage"),
+    "a tensor that repeats one element": (
+        tensor(FOUR, b"J\0\0\0\x20\x85", b"K\x00\x85"), "MiB of arrays"
+    ),
+    "a tensor of absurd stride": (
+        tensor(FOUR, b"K\x01\x85", b"\x8a\x09" + (2**65).to_bytes(9, "little") + b"\x85"),
+        "outside its storage",
+    ),
+    "sparse indptr that wraps round": (
+        sparse(_shape=(1, 2), data=np.ones(1), indices=I(1), indptr=np.array([0, 2**32 - 1, 1], np.uint32)),
+        "indptr does not fit",
+    ),
+    "sparse indptr that wraps round twice": (
+        sparse(_shape=(1, 3), data=np.ones(1), indices=I(1), indptr=np.array([0, 2**63 - 1, -2, 1])), "indptr does not fit"
+    ),
+    "sparse rows of decimals": (
+        sparse(_shape=(2, 1), data=np.ones(1), indices=np.array([0.5]), indptr=np.array([0, 1])), "indices is not a vector"
+    ),
+    "sparse of fewer values than indices": (
+        sparse(_shape=(2, 1), data=np.ones(1), indices=I(2), indptr=np.array([0, 2])), "1 values for 2 rows"
+    ),
     "a list that holds itself": (b"]q\x00h\x00a.", "contains itself"),
     "a dictionary that holds itself": (b"}q\x00" + text("a") + b"h\x00s.", "contains itself"),
     "text encoded again and again": (
@@ -227,6 +352,11 @@ def test_misused_instructions_are_refused(name: str) -> None:
     with pytest.raises(UnsafeFileError) as refusal:
         load_pickle(data, "model.pkl")
     assert str(refusal.value).startswith("model.pkl was not read: it") and reason in str(refusal.value)
+
+
+def test_the_tensor_bait_is_well_formed() -> None:
+    read = load_pickle(tensor(FOUR, offset=b"K\x01", stride=b"K\x02\x85"))
+    np.testing.assert_array_equal(read, np.array([1, 3], np.float32))
 
 
 def test_shared_references_are_not_multiplied() -> None:
@@ -249,6 +379,14 @@ DAMAGED: dict[str, bytes] = {
     "text without quotes": b"Sabc\n.",
     "text that is not UTF-8": b"X\x02\x00\x00\x00\xff\xfe.",
     "an odd number of items": b"}(Nu.",
+    "a mark that is left": b"(N(N.",
+    "items for a dictionary": b"}(Ne.",
+    "an item for a number": b"K\x01Na.",
+    "entries for a list": b"](NNu.",
+    "an entry for a set": b"\x80\x04\x8fNNs.",
+    "elements for a dictionary": b"\x80\x04}(N\x90.",
+    "a protocol of the future": b"\x80\x06N.",
+    "a name that is no text": b"\x80\x04K\x01K\x02\x93.",
     "a number that is none": b"Iabc\n.",
     "digits without end": b"L" + b"9" * 100_000 + b"L\n.",
 }
@@ -286,6 +424,7 @@ TORCH: dict[str, tuple[bytes, str]] = {
     "a storage of another length": (torch_zip(storage(count=9), EIGHT_BYTES), "needs 36 bytes but has 8"),
     "a tensor beyond its storage": (torch_zip(storage(count=1), {"archive/data/0": b"abcd"}), "outside its storage"),
     "an id that is not a storage": (torch_zip(text("module") + b"Q", {}), "not a torch storage"),
+    "a storage of names": (torch_zip(b"(" + text("storage") + b"(ltQ", EIGHT_BYTES), "storage of an unknown type"),
     "compressed members": (torch_zip(storage(), EIGHT_BYTES, zipfile.ZIP_DEFLATED), "compressed members"),
     "a zip of something else": (b"PK\x05\x06" + b"\0" * 18, "a zip file that torch.save did not write"),
     "half a zip": (torch_zip(storage(), EIGHT_BYTES)[:-30], "damaged or cut short"),
