@@ -39,7 +39,7 @@ MAX_INSTRUCTIONS = 3_000_000  # FLAME's pickles have thousands; a list of 10,000
 _ENTRY_BYTES = 128  # of a set or dictionary, at most, beside key and value
 _LEGACY_TORCH_MAGIC = 0x1950A86A20F9469CFC6C  # first pickle of a file that torch.save wrote before 1.6
 _INSTRUCTIONS = """
-    PROTO FRAME MARK STOP POP POP_MARK DUP PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET MEMOIZE
+    PROTO FRAME MARK POP POP_MARK DUP PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET MEMOIZE
     NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING
     UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8
     EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS
@@ -105,12 +105,8 @@ def _budget(data: bytes) -> Budget:
 
 def _unpickle(stream: io.BytesIO, name: str, budget: Budget, read_storage: Callable[[str], bytes] | None = None) -> Any:
     """The data of the next pickle in the stream."""
-    machine = _DataUnpickler(stream, budget, read_storage)
     try:
-        value = machine.load()
-        if machine.stack or machine.metastack:
-            raise ValueError("it ends with more than one value")
-        return plain(value, budget, done={})
+        return plain(_DataUnpickler(stream, budget, read_storage).load(), budget, done={})
     except Refused as error:
         raise UnsafeFileError(f"{name} was not read: {shortened(error)}") from error
     except MALFORMED as error:
@@ -124,16 +120,32 @@ class _DataUnpickler(pickle._Unpickler):
     when a nested tuple is a key, and gives out what extension codes stand for without asking `find_class`.
     """
 
-    stack: list[Any]
-    metastack: list[list[Any]]
-    read: Callable[[int], bytes]
     pop_mark: Callable[[], list[Any]]
 
     def __init__(self, stream: io.BytesIO, budget: Budget, read_storage: Callable[[str], bytes] | None) -> None:
         super().__init__(stream, encoding="latin1")
+        self.read, self.readline = stream.read, stream.readline
         self.budget = budget
         self.read_storage = read_storage
-        self.dispatch: Any = _Dispatch(_STEPS)
+        self.stack: list[Any] = []
+        self.append = self.stack.append
+        self.metastack: list[list[Any]] = []  # one stack per mark
+
+    def load(self) -> Any:
+        for _ in range(MAX_INSTRUCTIONS):
+            code = self.read(1)
+            if code == pickle.STOP:
+                (value,) = self.stack
+                if self.metastack:
+                    raise ValueError("it ends after a mark")
+                return value
+            if code not in _STEPS:
+                raise _no_step(code)
+            _STEPS[code](self)
+        raise Refused(f"it has more than {MAX_INSTRUCTIONS} instructions")
+
+    def load_frame(self) -> None:
+        self.read(8)  # all is in memory, so there is nothing to be read ahead
 
     def find_class(self, module: str, name: str) -> Name:
         known = f"{_RENAMED.get(module, module)}.{name}"
@@ -156,7 +168,7 @@ class _DataUnpickler(pickle._Unpickler):
 
     def load_reduce(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
-        self.stack.append(self._made(described(function), arguments))
+        self.append(self._made(described(function), arguments))
 
     def _made(self, name: str, arguments: Any) -> Any:
         """What a call of `name` would give, for the few that stand for data."""
@@ -193,7 +205,7 @@ class _DataUnpickler(pickle._Unpickler):
 
     def load_newobj(self) -> None:
         arguments, cls = self.stack.pop(), self.stack.pop()
-        self.stack.append(_new_object(cls, arguments))
+        self.append(_new_object(cls, arguments))
 
     def load_build(self) -> None:
         state, target = self.stack.pop(), self.stack[-1]
@@ -211,7 +223,7 @@ class _DataUnpickler(pickle._Unpickler):
 
     def load_dict(self) -> None:
         items = self.pop_mark()
-        self.stack.append({})
+        self.append({})
         self._fill(items)
 
     def load_setitem(self) -> None:
@@ -229,32 +241,22 @@ class _DataUnpickler(pickle._Unpickler):
 
     def load_bytearray8(self) -> None:
         (length,) = struct.unpack("<Q", self.read(8))
-        self.stack.append(bytearray(self.read(length)))  # Python's makes `length` zeros first
-
-
-class _Dispatch(dict[int, Callable[[_DataUnpickler], None]]):
-    """What each instruction does, given out MAX_INSTRUCTIONS times."""
-
-    left = MAX_INSTRUCTIONS
-
-    def __getitem__(self, code: int) -> Callable[[_DataUnpickler], None]:
-        self.left -= 1
-        if self.left < 0:
-            raise Refused(f"it has more than {MAX_INSTRUCTIONS} instructions")
-        return super().__getitem__(code)
-
-    def __missing__(self, code: int) -> Callable[[_DataUnpickler], None]:
-        for opcode in pickletools.opcodes:
-            if opcode.code == chr(code):
-                raise Refused(f"it has the instruction {opcode.name}, which data does not need")
-        raise ValueError(f"unknown instruction {bytes([code])!r}")
+        self.append(bytearray(self.read(length)))  # Python's makes `length` zeros first
 
 
 _STEPS = {
-    ord(opcode.code): getattr(_DataUnpickler, pickle._Unpickler.dispatch[ord(opcode.code)].__name__)
+    opcode.code.encode("latin1"): getattr(_DataUnpickler, pickle._Unpickler.dispatch[ord(opcode.code)].__name__)
     for opcode in pickletools.opcodes
     if opcode.name in _INSTRUCTIONS.split()
 }
+
+
+def _no_step(code: bytes) -> Exception:
+    """Why there is no step for this instruction."""
+    for opcode in pickletools.opcodes:
+        if opcode.code.encode("latin1") == code:
+            return Refused(f"it has the instruction {opcode.name}, which data does not need")
+    return ValueError(f"unknown instruction {code!r}") if code else EOFError()
 
 
 def _new_object(cls: Any, arguments: Any) -> PickledObject:

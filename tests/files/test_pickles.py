@@ -36,6 +36,7 @@ def test_plain_data_round_trips(protocol: int) -> None:
     data = {
         "float64": np.arange(6.0).reshape(2, 3),
         "fortran": np.asfortranarray(np.arange(6, dtype=np.int32).reshape(2, 3)),
+        "permuted": np.arange(24.0).reshape(2, 3, 4).transpose(1, 0, 2),
         "strided": np.arange(24.0).reshape(4, 6)[::2, ::3],
         "big endian": np.arange(5, dtype=">f4"),
         "bool": np.array([True, False]),
@@ -180,6 +181,23 @@ def test_agrees_with_pickle_on_the_development_model(shared_dir: Path) -> None:
     path = shared_dir / "subjects" / "head_model" / "generic_model.pkl"
     with path.open("rb") as file:
         assert_same(load_pickle(path), pickle.load(file))
+
+
+@pytest.mark.shared
+def test_agrees_with_torch_on_development_frames(shared_dir: Path, tmp_path: Path) -> None:
+    frames = sorted((shared_dir / "subjects" / "carla" / "checkpoint").glob("*.frame"))
+    assert len(frames) > 100
+    for path in frames[::100]:
+        written = torch.load(path, weights_only=False)
+        torch.save(written, tmp_path / "legacy.frame", _use_new_zipfile_serialization=False)
+        assert_same(load_torch_pickle(path), written)
+        assert_same(load_torch_pickle(tmp_path / "legacy.frame"), written)
+
+
+def test_what_a_file_calls_things_cannot_steer_the_terminal() -> None:
+    with pytest.raises(UserError) as refusal:
+        load_pickle(b"\x80\x04X\x06\0\0\0os\x1b[2JX\x04\0\0\0a\nb\r\x93.", "model.pkl")
+    assert str(refusal.value).isprintable() and "refers to os\N{REPLACEMENT CHARACTER}[2J.a" in str(refusal.value)
 
 
 def _valid() -> bytes:
