@@ -78,9 +78,7 @@ def make_array(shape: Any, dtype: Any, fortran: Any, raw: Any, budget: Budget) -
     if needed != len(raw):
         raise Refused(f"it holds an array of shape {shape} that needs {needed} bytes but has {len(raw)}")
     budget.take(needed)
-    if isinstance(raw, str):  # bytes of a Python 2 pickle
-        budget.take(needed)
-        raw = raw.encode("latin1")
+    raw = raw.encode("latin1") if isinstance(raw, str) else raw  # text is the bytes of a Python 2 pickle
     array = np.frombuffer(raw, dtype.value).reshape(shape, order="F" if fortran else "C")
     return array.astype(dtype.value.newbyteorder("="), order="C", copy=True)
 
@@ -91,7 +89,6 @@ def make_tensor(storage: Any, offset: Any, size: Any, stride: Any, budget: Budge
         not isinstance(storage, np.ndarray)
         or storage.ndim != 1
         or not all(_are_lengths(lengths) for lengths in ((offset,), size, stride))
-        or len(size) != len(stride)
         or (math.prod(size) and offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) >= len(storage))
     ):
         raise Refused("it holds a torch tensor that reaches outside its storage")
@@ -155,8 +152,7 @@ def _dense(cls: str, state: Mapping[Any, Any], budget: Budget) -> np.ndarray:
     else:
         minor, starts = _vector(cls, state, "indices", budget), _vector(cls, state, "indptr", budget)
         major_size = shape[1] if "csc_" in cls else shape[0]
-        in_range = (starts >= 0) & (starts <= len(minor))
-        if len(starts) != major_size + 1 or starts[0] != 0 or not in_range.all() or (np.diff(starts) < 0).any():
+        if len(starts) != major_size + 1 or starts[0] != 0 or starts.max() > len(minor) or (np.diff(starts) < 0).any():
             raise Refused(f"it holds a {cls} whose indptr does not fit its shape {shape}")
         minor, data = minor[: starts[-1]], data[: starts[-1]]
         major = np.repeat(np.arange(major_size), np.diff(starts))

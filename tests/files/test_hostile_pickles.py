@@ -319,6 +319,7 @@ MISUSED: dict[str, tuple[bytes, str]] = {
     "a tensor that repeats one element": (
         tensor(FOUR, b"J\0\0\0\x20\x85", b"K\x00\x85"), "MiB of arrays"
     ),
+    "a tensor of more strides than sides": (tensor(FOUR, stride=b"K\x00K\x01\x86"), "outside its storage"),
     "a tensor of absurd stride": (
         tensor(FOUR, b"K\x01\x85", b"\x8a\x09" + (2**65).to_bytes(9, "little") + b"\x85"),
         "outside its storage",
@@ -329,6 +330,18 @@ MISUSED: dict[str, tuple[bytes, str]] = {
     ),
     "sparse indptr that wraps round twice": (
         sparse(_shape=(1, 3), data=np.ones(1), indices=I(1), indptr=np.array([0, 2**63 - 1, -2, 1])), "indptr does not fit"
+    ),
+    **{
+        f"sparse indptr that {what}": (
+            sparse(_shape=(2, 2), data=np.ones(2), indices=I(2), indptr=np.array(indptr, np.uint32)), "indptr does not fit"
+        )
+        for what, indptr in (("falls", [0, 2, 1]), ("is short", [0, 2]), ("begins late", [1, 2, 2]), ("is empty", []))
+    },
+    "sparse index below zero": (
+        sparse(_shape=(2, 1), data=np.ones(1), indices=np.array([-1]), indptr=np.array([0, 1])), "index outside its shape"
+    ),
+    "sparse column below zero": (
+        sparse(_shape=(2, 1), data=np.ones(1), row=I(1), col=np.array([-1])).replace(b"csc", b"coo"), "index outside"
     ),
     "sparse rows of decimals": (
         sparse(_shape=(2, 1), data=np.ones(1), indices=np.array([0.5]), indptr=np.array([0, 1])), "indices is not a vector"
