@@ -102,7 +102,7 @@ def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) ->
     sites = samples[generator.choice(len(samples), count, replace=False, p=weight / weight.sum())]
     for _ in range(LLOYD_STEPS):
         _, nearest = KDTree(np.concatenate((fixed, sites))).query(samples)
-        nearest = nearest - len(fixed)
+        nearest = np.asarray(nearest) - len(fixed)
         own = nearest >= 0
         mass = np.bincount(nearest[own], weight[own], count)
         moved = [np.bincount(nearest[own], weight[own] * samples[own, k], count) for k in range(3)]
