@@ -1,18 +1,18 @@
-"""Reading of other programs' pickles (.pkl, .frame) without ever running what they contain.
+"""Reading of other programs' pickles (.pkl, .frame) and arrays (.npz, .npy) without running what they contain.
 
-A pickle is a program. Python's own machine runs it here, without the instructions that data does not need. Names in the
-file are compared with a list and stay names: nothing is imported, and nothing on the machine's stack can be called.
-numpy, scipy, chumpy and torch objects come back as numpy arrays, sparse matrices as dense ones.
+A pickle is a program. `DataUnpickler` follows it only as far as it makes data: nothing is imported or called. Objects of
+numpy, scipy, chumpy and torch come back as numpy arrays, sparse matrices as dense ones.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import pickle
-import pickletools
-import re
 import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,41 +20,15 @@ from typing import Any
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.arrays import BAD_ZIP, MALFORMED, read_bytes, shortened
-from avatar.files.pickled_data import (
-    OBJECT_CLASS,
-    Budget,
-    Name,
-    PickledObject,
-    Refused,
-    described,
-    make_array,
-    make_dtype,
-    make_tensor,
-    plain,
-)
+from avatar.files.data_unpickler import DataUnpickler
+from avatar.files.pickled_data import Budget, Refused, plain
 
+MAX_FILE_BYTES = 2**30  # FLAME's largest pickle has 53 MB
 MIN_BUDGET_BYTES = 2**26
-MAX_INSTRUCTIONS = 3_000_000  # FLAME's pickles have thousands; a list of 10,000 faces has 40,000
-_ENTRY_BYTES = 128  # of a set or dictionary, at most, beside key and value
 _LEGACY_TORCH_MAGIC = 0x1950A86A20F9469CFC6C  # first pickle of a file that torch.save wrote before 1.6
-_INSTRUCTIONS = """
-    PROTO FRAME MARK POP POP_MARK DUP PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET MEMOIZE
-    NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING
-    UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8
-    EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS
-    EMPTY_SET ADDITEMS GLOBAL STACK_GLOBAL REDUCE NEWOBJ BUILD BINPERSID
-"""
-_STORAGES = {"torch.DoubleStorage": "f8", "torch.FloatStorage": "f4", "torch.HalfStorage": "f2"}
-_STORAGES |= {"torch.LongStorage": "i8", "torch.IntStorage": "i4", "torch.ShortStorage": "i2"}
-_STORAGES |= {"torch.CharStorage": "i1", "torch.ByteStorage": "u1", "torch.BoolStorage": "?"}
-_NAMES = """
-    numpy.core.multiarray._reconstruct numpy.core.multiarray.scalar numpy.core.numeric._frombuffer numpy.ndarray
-    numpy.dtype _codecs.encode copyreg._reconstructor builtins.object builtins.set builtins.bytes builtins.bytearray
-    collections.OrderedDict torch._utils._rebuild_tensor_v2
-"""
-_RENAMED = {"__builtin__": "builtins", "copy_reg": "copyreg"}
-_RENAMED |= {f"numpy._core.{part}": f"numpy.core.{part}" for part in ("multiarray", "numeric")}
+_MALFORMED = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, RecursionError)
+_MALFORMED += (EOFError, struct.error, pickle.UnpicklingError)  # what reading nonsense as a pickle runs into
+_BAD_ZIP = (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError)  # the same for an archive
 
 
 class UnsafeFileError(UserError):
@@ -68,13 +42,13 @@ def load_pickle(source: Path | str | bytes, name: str | None = None) -> Any:
     and numpy arrays. Raises UserError, naming the file, when it is damaged, and UnsafeFileError (a
     UserError) when it holds anything else.
     """
-    data, name = read_bytes(source, name)
+    data, name = _read(source, name)
     return _unpickle(io.BytesIO(data), name, _budget(data))
 
 
 def load_torch_pickle(source: Path | str | bytes, name: str | None = None) -> Any:
     """The data in a file written by `torch.save`, tensors as numpy arrays. Raises UserError as `load_pickle` does."""
-    data, name = read_bytes(source, name)
+    data, name = _read(source, name)
     if not data.startswith(b"PK"):
         return _load_legacy_torch(data, name)
     try:
@@ -87,8 +61,49 @@ def load_torch_pickle(source: Path | str | bytes, name: str | None = None) -> An
             root = pickles[0].removesuffix("data.pkl")
             stream = io.BytesIO(archive.read(pickles[0]))
             return _unpickle(stream, name, _budget(data), lambda key: archive.read(f"{root}data/{key}"))
-    except (*BAD_ZIP, *MALFORMED) as error:
-        raise UserError(f"{name} is damaged or cut short ({shortened(error)}); write or copy it again") from error
+    except (*_BAD_ZIP, *_MALFORMED) as error:
+        raise UserError(f"{name} is damaged or cut short ({_short(error)}); write or copy it again") from error
+
+
+def load_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file; pickled objects inside are refused. Raises UserError naming the file."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if sum(info.file_size for info in members) > MAX_FILE_BYTES:
+                raise UserError(f"{path} would unpack to more than {MAX_FILE_BYTES} bytes; such files are not read")
+            return {info.filename.removesuffix(".npy"): _parse_npy(archive.read(info), path) for info in members}
+    except FileNotFoundError as error:
+        raise UserError(f"{path} does not exist") from error
+    except (*_MALFORMED, *_BAD_ZIP, zlib.error) as error:
+        raise UserError(f"{path} is damaged or not a .npz file ({_short(error)})") from error
+
+
+def load_npy(path: Path) -> np.ndarray:
+    """The array of a .npy file; pickled objects are refused. Raises UserError naming the file."""
+    data, _ = _read(path, None)
+    return _parse_npy(data, path)
+
+
+def _parse_npy(data: bytes, path: Path) -> np.ndarray:
+    """numpy allocates what the header says before it looks how much there is, so the header is compared first."""
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, is_fortran, dtype = read_header(stream)
+        if dtype.hasobject:
+            raise UserError(f"{path} holds pickled Python objects; save it again with plain numeric arrays")
+        needed, given = math.prod(shape) * dtype.itemsize, len(data) - stream.tell()
+        if min(shape, default=0) < 0 or needed != given:
+            raise UserError(f"{path} is damaged: an array of shape {list(shape)} needs {needed} bytes, it has {given}")
+        flat = np.frombuffer(data, dtype, offset=stream.tell())
+        return flat.reshape(shape, order="F" if is_fortran else "C").copy()
+    except (*_MALFORMED, SyntaxError, tokenize.TokenError) as error:
+        raise UserError(f"{path} is damaged or holds no numpy arrays ({_short(error)})") from error
 
 
 def _load_legacy_torch(data: bytes, name: str) -> Any:
@@ -106,168 +121,34 @@ def _budget(data: bytes) -> Budget:
 def _unpickle(stream: io.BytesIO, name: str, budget: Budget, read_storage: Callable[[str], bytes] | None = None) -> Any:
     """The data of the next pickle in the stream."""
     try:
-        return plain(_DataUnpickler(stream, budget, read_storage).load(), budget, done={})
+        return plain(DataUnpickler(stream, budget, read_storage).load(), budget, done={})
     except Refused as error:
-        raise UnsafeFileError(f"{name} was not read: {shortened(error)}") from error
-    except MALFORMED as error:
-        raise UserError(f"{name} is damaged, cut short or not a pickle ({shortened(error)})") from error
+        raise UnsafeFileError(f"{name} was not read: {_short(error)}") from error
+    except _MALFORMED as error:
+        raise UserError(f"{name} is damaged, cut short or not a pickle ({_short(error)})") from error
 
 
-class _DataUnpickler(pickle._Unpickler):
-    """Python's pickle machine, in which what would call or import something makes data of known names instead.
-
-    `pickle.Unpickler`, the same in C, will not do: it allocates for whatever memo slot a file names, overflows the stack
-    when a nested tuple is a key, and gives out what extension codes stand for without asking `find_class`.
-    """
-
-    pop_mark: Callable[[], list[Any]]
-
-    def __init__(self, stream: io.BytesIO, budget: Budget, read_storage: Callable[[str], bytes] | None) -> None:
-        super().__init__(stream, encoding="latin1")
-        self.read, self.readline = stream.read, stream.readline
-        self.budget = budget
-        self.read_storage = read_storage
-        self.stack: list[Any] = []
-        self.append = self.stack.append
-        self.metastack: list[list[Any]] = []  # one stack per mark
-
-    def load(self) -> Any:
-        for _ in range(MAX_INSTRUCTIONS):
-            code = self.read(1)
-            if code == pickle.STOP:
-                (value,) = self.stack
-                if self.metastack:
-                    raise ValueError("it ends after a mark")
-                return value
-            if code not in _STEPS:
-                raise _no_step(code)
-            _STEPS[code](self)
-        raise Refused(f"it has more than {MAX_INSTRUCTIONS} instructions")
-
-    def load_frame(self) -> None:
-        self.read(8)  # all is in memory, so there is nothing to be read ahead
-
-    def find_class(self, module: str, name: str) -> Name:
-        known = f"{_RENAMED.get(module, module)}.{name}"
-        if known in _NAMES.split() or known in _STORAGES or OBJECT_CLASS.fullmatch(known):
-            return Name(known)
-        raise Refused(
-            f"it refers to {module}.{name}, which is code and not data; only use files whose origin you trust"
-        )
-
-    def persistent_load(self, pid: Any) -> np.ndarray:
-        """A torch storage as a vector; `pid` is torch's ("storage", type, key, device, element count)."""
-        if self.read_storage is None:
-            raise Refused("it has the instruction BINPERSID, which data does not need")
-        match pid:
-            case ("storage", Name(kind), str(key), _, count) if kind in _STORAGES and re.fullmatch("[0-9]+", key):
-                return make_array((count,), make_dtype(_STORAGES[kind]), False, self.read_storage(key), self.budget)
-            case ("storage", *_):
-                raise Refused("it refers to a torch storage of an unknown type")
-        raise Refused("it refers to outside data that is not a torch storage")
-
-    def load_reduce(self) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
-        self.append(self._made(described(function), arguments))
-
-    def _made(self, name: str, arguments: Any) -> Any:
-        """What a call of `name` would give, for the few that stand for data."""
-        match name, arguments:
-            case "numpy.core.multiarray._reconstruct", (Name("numpy.ndarray"), _, _):
-                return PickledObject("numpy.ndarray")
-            case "numpy.core.multiarray.scalar", (dtype, raw):
-                return make_array((), dtype, False, raw, self.budget)[()]
-            case "numpy.core.numeric._frombuffer", (raw, dtype, shape, order):
-                return make_array(shape, dtype, order == "F", raw, self.budget)
-            case "numpy.core.numeric._frombuffer", (raw, dtype, shape, "K", tuple(axes)):
-                return make_array(shape, dtype, False, raw, self.budget).transpose(axes)
-            case "numpy.dtype", (code, *_):
-                return make_dtype(code)
-            case "_codecs.encode", (str(text), "latin1" | "latin-1"):
-                self.budget.take(len(text))
-                return text.encode("latin1")
-            case "builtins.bytes", ():  # protocols below 3 write empty bytes so
-                return b""
-            case "builtins.bytearray", (bytes(raw),):
-                self.budget.take(len(raw))
-                return bytearray(raw)
-            case "builtins.set" | "collections.OrderedDict", () | (list(),):
-                entries = arguments[0] if arguments else []
-                self.budget.take(_ENTRY_BYTES * len(entries))
-                return {_key(e) for e in entries} if name == "builtins.set" else {_key(k): v for k, v in entries}
-            case "torch._utils._rebuild_tensor_v2", (storage, offset, size, stride, *_):
-                return make_tensor(storage, offset, size, stride, self.budget)
-            case "copyreg._reconstructor", (cls, Name("builtins.object"), None):
-                return _new_object(cls, ())
-            case _, () if OBJECT_CLASS.fullmatch(name):
-                return PickledObject(name)
-        raise Refused(f"it calls {name} in a way that data does not need")
-
-    def load_newobj(self) -> None:
-        arguments, cls = self.stack.pop(), self.stack.pop()
-        self.append(_new_object(cls, arguments))
-
-    def load_build(self) -> None:
-        state, target = self.stack.pop(), self.stack[-1]
-        match target, state:
-            case PickledObject("numpy.ndarray", None), (_, shape, dtype, fortran, raw):
-                target.value = make_array(shape, dtype, fortran, raw, self.budget)
-            case PickledObject("numpy.dtype", dtype), (_, "<" | ">" | "|" | "=" as order, None, None, None, *_):
-                target.value = dtype.newbyteorder(order)
-            case PickledObject("numpy.dtype"), _:
-                raise Refused("it holds a structured array or a malformed dtype, and only plain numbers are read")
-            case PickledObject(value=None), dict():
-                target.value = state
-            case _:
-                raise Refused(f"it sets the state of {described(target)}, which data does not need")
-
-    def load_dict(self) -> None:
-        items = self.pop_mark()
-        self.append({})
-        self._fill(items)
-
-    def load_setitem(self) -> None:
-        self._fill([self.stack.pop(-2), self.stack.pop()])
-
-    def load_setitems(self) -> None:
-        self._fill(self.pop_mark())
-
-    def _fill(self, items: list[Any]) -> None:
-        dict.update(self.stack[-1], ((_key(k), value) for k, value in zip(items[::2], items[1::2], strict=True)))
-
-    def load_additems(self) -> None:
-        items = self.pop_mark()
-        set.update(self.stack[-1], map(_key, items))
-
-    def load_bytearray8(self) -> None:
-        (length,) = struct.unpack("<Q", self.read(8))
-        self.append(bytearray(self.read(length)))  # Python's makes `length` zeros first
+def _read(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
+    if isinstance(source, bytes):
+        data, name = source, name or "the data"
+    else:
+        path = Path(source)
+        name = name or str(path)
+        try:
+            size = path.stat().st_size
+            if size > MAX_FILE_BYTES:
+                raise UserError(f"{name} has {size} bytes; files of more than {MAX_FILE_BYTES} bytes are not read")
+            with path.open("rb") as file:
+                data = file.read(size)  # a device has no size and no end
+        except OSError as error:
+            raise UserError(f"{name} cannot be read: {error.strerror}") from error
+    if not data:
+        raise UserError(f"{name} is empty; write or copy it again")
+    return data, name
 
 
-_STEPS = {
-    opcode.code.encode("latin1"): getattr(_DataUnpickler, pickle._Unpickler.dispatch[ord(opcode.code)].__name__)
-    for opcode in pickletools.opcodes
-    if opcode.name in _INSTRUCTIONS.split()
-}
-
-
-def _no_step(code: bytes) -> Exception:
-    """Why there is no step for this instruction."""
-    for opcode in pickletools.opcodes:
-        if opcode.code.encode("latin1") == code:
-            return Refused(f"it has the instruction {opcode.name}, which data does not need")
-    return ValueError(f"unknown instruction {code!r}") if code else EOFError()
-
-
-def _new_object(cls: Any, arguments: Any) -> PickledObject:
-    if isinstance(cls, Name) and OBJECT_CLASS.fullmatch(cls.text) and arguments == ():
-        return PickledObject(cls.text)
-    raise Refused(f"it makes an object of {described(cls)}")
-
-
-def _key(key: Any) -> Any:
-    """Only flat keys: hashing a deeply nested tuple would overflow the stack, and large integers can share one hash."""
-    if key is None or isinstance(key, (str, float, bytes)) or (isinstance(key, int) and abs(key) < 2**60):
-        return key
-    what = "an integer of more than 60 bits" if isinstance(key, int) else described(key)
-    raise Refused(f"it uses {what} as a key, and only text and numbers are read")
+def _short(error: Exception) -> str:
+    """What went wrong, without the pages of the file that some reasons quote, nor what would steer a terminal."""
+    text = str(error) or ("it ends before the pickle does" if isinstance(error, EOFError) else type(error).__name__)
+    text = text if len(text) <= 400 else f"{text[:300]} ... {text[-80:]}"
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
