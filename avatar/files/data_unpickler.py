@@ -193,8 +193,9 @@ def _no_step(code: bytes) -> Exception:
 
 
 def _new_object(cls: Any, arguments: Any) -> PickledObject:
-    if isinstance(cls, Name) and OBJECT_CLASS.fullmatch(cls.text) and arguments == ():
-        return PickledObject(cls.text)
+    match cls, arguments:
+        case Name(text), () if OBJECT_CLASS.fullmatch(text):
+            return PickledObject(text)
     raise Refused(f"it makes an object of {described(cls)}")
 
 
