@@ -18,7 +18,7 @@ def run_eval(arguments: Namespace) -> int:
     run = open_run(arguments.run, arguments.head, arguments.folder)
     results = evaluate(run, arguments.protocol, write_frames=arguments.frames or arguments.verify)
     if arguments.verify:
-        from avatar.evaluation.verify import verify  # imports scikit-image, which takes half a second
+        from avatar.evaluation.verify import verify  # imports scikit-image, which nothing else here needs
 
         verify(results, [protocol.name for protocol in choose_protocols(arguments.protocol)])
     return OK
