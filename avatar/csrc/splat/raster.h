@@ -3,13 +3,12 @@
 
 #include "splat/scene.h"
 
-// Compositing of the tiles, forward and backward. The kernels are compiled for several instruction sets and chosen when
-// the program runs.
+// Compositing of the tiles, forward and backward: what the kernels (kernels.h) take and give.
 namespace avatar::splat {
 
 // What both directions read.
 struct Raster {
-    const Splat* splats;
+    const Splat* splats;  // [N]
     const Pair* pairs;
     const std::int64_t* tile_begin;
     TileGrid grid;
@@ -63,14 +62,5 @@ struct BackwardTarget {
     float* moments;           // [pairs * kMoments], by slot
     double* grad_background;  // [tiles * 3]
 };
-
-struct Kernels {
-    void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
-    void (*count_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);  // draws as forward_tile and counts
-    void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
-};
-
-// The kernels for a name that choose_instruction_set() takes.
-const Kernels& select_kernels(const char* name);
 
 }  // namespace avatar::splat

@@ -1,8 +1,8 @@
 #pragma once
 // What the forward and the backward kernel share: the pixels of a tile, and the alpha of a splat at them. Both
 // directions must make the same decisions (skipped, drawn) to the last bit, so both get them here.
+#include "exponential.h"
 #include "splat/raster.h"
-#include "simd.h"
 
 namespace avatar::splat {
 namespace {
