@@ -96,11 +96,10 @@ inline Floats fma(Floats a, Floats b, Floats c) {
 #endif
 }
 
-// GCC makes one instruction of the comparison for AVX-512 (and warns of its own header's _mm512_min_ps), not for the
-// others.
+// The second where one is NaN. With a mask of all lanes for AVX-512, because GCC warns of its own header's other form.
 inline Floats min(Floats a, Floats b) {
 #if defined(__AVX512F__)
-    return a < b ? a : b;
+    return (Floats)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b);
 #elif defined(__AVX2__)
     return (Floats)_mm256_min_ps((__m256)a, (__m256)b);
 #elif defined(__SSE2__)
@@ -112,7 +111,7 @@ inline Floats min(Floats a, Floats b) {
 
 inline Floats max(Floats a, Floats b) {
 #if defined(__AVX512F__)
-    return a > b ? a : b;
+    return (Floats)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b);
 #elif defined(__AVX2__)
     return (Floats)_mm256_max_ps((__m256)a, (__m256)b);
 #elif defined(__SSE2__)

@@ -9,7 +9,8 @@
 namespace avatar::splat {
 
 extern const Kernels AVATAR_KERNELS;
-const Kernels AVATAR_KERNELS = {all_finite,          project,            project_backward,
-                                forward_tile<false>, forward_tile<true>, backward_tile};
+const Kernels AVATAR_KERNELS = {kWords,           all_finite,          project,
+                                project_backward, forward_tile<false>, forward_tile<true>,
+                                backward_tile};
 
 }  // namespace avatar::splat

@@ -7,6 +7,8 @@
 namespace avatar::splat {
 
 struct Kernels {
+    // A tile is cut into blocks of as many pixels as a vector has lanes; a set of them takes so many words.
+    int words;
     bool (*all_finite)(const float* values, std::int64_t count);
     void (*project)(const View&, const Gaussians&, std::int64_t begin, std::int64_t end, const Projection&);
     // Writes (does not add) the gradients of Gaussians begin .. end - 1 from moments [pairs * kMoments], by slot.

@@ -19,41 +19,26 @@ struct Raster {
 
 // What drawing one tile took; see Counts in splat.h.
 struct TileCounts {
-    std::int64_t pixels_evaluated, pixels_composited;
+    std::int64_t pairs_processed, pixels_evaluated, pixels_composited;
     std::int32_t blocks, blocks_stopped;
 };
 
-// The kernels work on blocks of as many pixels as a vector has lanes; at least 4.
-constexpr int kMaxBlocks = kTilePixels / 4;
 constexpr int kNeverStops = 0x7fffffff;
 
-// The forward pass on a tile ends after `processed` pairs, when all its pairs are done or all its blocks have stopped.
-struct TileEnd {
-    std::uint32_t processed, stopped_blocks;
-};
-
-// All pixels of `block` have stopped when pair `at` of the tile, which none of them shows, has been looked at.
-struct BlockStop {
-    std::uint32_t at, block;
-};
+typedef unsigned long long Word;  // of a set of blocks, as bits
 
 // Written at the pixels of the region only.
 struct ForwardTarget {
-    float* image;               // [height * width * 3]
-    float* alpha;               // [height * width]
-    float* transmittance;       // [tiles * kTilePixels], in the kernels' own order, as is the next
-    int* stops;                 // the pair of the tile from which on the pixel shows none, 0 outside the region
-    TileEnd* ends;              // [tiles]
-    BlockStop* block_stops;     // [tiles * kMaxBlocks], the first `stopped_blocks` of each tile, by `at`
-    TileCounts* counts;         // [tiles]; written by count_tile only, as is the next
-    unsigned char* composited;  // [pairs], by slot: whether any pixel shows the splat
+    float* image;          // [height * width * 3]
+    float* alpha;          // [height * width]
+    float* ends;           // [tiles * 2 * kTilePixels] how the pixels end, in the kernels' own order
+    Word* drawn_blocks;    // [pairs * Kernels::words], the blocks in which a pixel shows the splat
+    TileCounts* counts;    // [tiles]; written by count_tile only
 };
 
 struct BackwardSource {
-    const float* transmittance;
-    const int* stops;
-    const TileEnd* ends;
-    const BlockStop* block_stops;
+    const float* ends;
+    const Word* drawn_blocks;
     const float* grad_image;  // may be null
     const float* grad_alpha;  // may be null
 };

@@ -13,17 +13,19 @@ constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlocksAcross = kTileWidth / kBlockWidth, kBlocksDown = kTileHeight / kBlockHeight;
 constexpr int kBlocks = kBlocksAcross * kBlocksDown;
 constexpr int kWords = kBlocks / 64;  // sets of blocks are kept as bits
-static_assert(kBlocksAcross == 8 && kLanes <= 2 * kBlocksAcross && kBlocks % 64 == 0 && kBlocks <= kMaxBlocks);
+static_assert(kBlocksAcross == 8 && kLanes <= 2 * kBlocksAcross && kBlocks % 64 == 0);
 
-// The per-pixel arrays of a tile hold block after block, rows of blocks from the top.
+// While it is worked on, a tile holds some vectors for each block, side by side: if each had an array of its own, the
+// places of a block would lie whole pages apart, which the processor takes for the same place until it has compared all of
+// their addresses. Rows of blocks are stored from the top. The index of a pixel's value in the first vector of its block:
+template <int kVectors>
 inline int pixel_at(int row, int column) {
     const int block = row / kBlockHeight * kBlocksAcross + column / kBlockWidth;
-    return block * kLanes + row % kBlockHeight * kBlockWidth + column % kBlockWidth;
+    return block * kVectors * kLanes + row % kBlockHeight * kBlockWidth + column % kBlockWidth;
 }
 
 constexpr int kAhead = 4;  // pairs, for which a splat is fetched before it is needed: they lie all over the memory
 
-typedef unsigned long long Word;
 inline int first_bit(Word bits) { return __builtin_ctzll(bits); }
 
 struct TileArea {
@@ -41,12 +43,12 @@ struct TileArea {
         return first_column == 0 && first_row == 0 && end_column == kTileWidth && end_row == kTileHeight;
     }
 
-    // Calls visit(index in the tile's arrays, index in the image) for the pixels of the region.
-    template <typename Visit>
+    // Calls visit(pixel_at, index in the image) for the pixels of the region.
+    template <int kVectors, typename Visit>
     void for_each_pixel(std::int64_t image_width, const Visit& visit) const {
         for (int row = first_row; row < end_row; ++row)
             for (int column = first_column; column < end_column; ++column)
-                visit(pixel_at(row, column), (top + row) * image_width + left + column);
+                visit(pixel_at<kVectors>(row, column), (top + row) * image_width + left + column);
     }
 
     // The blocks that have a pixel in the region.
@@ -61,66 +63,99 @@ struct TileArea {
     int first_column, first_row, end_column, end_row;  // the part of the tile inside the region
 };
 
-// One splat as seen from one tile.
-struct SplatInTile {
-    Floats opacity;
-    Floats u_lane, v_lane;  // (u, v) of a pixel is that of its block's first pixel plus that of its lane
-    alignas(64) float u_block[kBlocks], v_block[kBlocks];
-    Word blocks[kWords];  // those that may have a pixel where alpha reaches alpha_min
+// One splat as seen from one tile: (u, v) of a pixel is (u0 + a d_x + b d_y, v0 + c d_y) at distance d from the centre of
+// the tile's first pixel.
+struct Local {
+    float a, b, c, u0, v0;
 
-    SplatInTile(const Splat& s, const TileArea& area) {
+    Local() = default;
+    Local(const Splat& s, const TileArea& area) : a(float(s.a)), b(float(s.b)), c(float(s.c)) {
         const double dx = area.left + 0.5 - s.x, dy = area.top + 0.5 - s.y;
-        const float a = float(s.a), b = float(s.b), c = float(s.c);
-        opacity = broadcast(s.opacity);
-        u_lane = fma(broadcast(b), lane_rows(), broadcast(a) * lane_columns());
-        v_lane = broadcast(c) * lane_rows();
+        u0 = float(s.a * dx + s.b * dy);
+        v0 = float(s.c * dy);
+    }
+};
 
-        // The ranges of u and v in a block (a and c are above 0), and their values nearest to the splat's centre.
-        const float b_height = b * (kBlockHeight - 1);
-        const Floats u_less = broadcast(b_height < 0.0f ? b_height : 0.0f);
-        const Floats u_more = broadcast(a * (kBlockWidth - 1) + (b_height > 0.0f ? b_height : 0.0f));
-        const Floats v_more = broadcast(c * (kBlockHeight - 1));
-        const Floats b_step = broadcast(b * kBlockHeight), c_step = broadcast(c * kBlockHeight);
-        const Floats u0 = broadcast(float(s.a * dx + s.b * dy)), v0 = broadcast(float(s.c * dy));
-        const Floats reach = broadcast(s.reach), zero{};
-        for (int w = 0; w < kWords; ++w) blocks[w] = 0;
-        const Floats u_first = fma(broadcast(a * kBlockWidth), remainders(kBlocksAcross), u0);
-        const auto test_rows = [&](int row) {  // this row of blocks, and the next where a vector holds two
-            const Floats y = quotients(kBlocksAcross) + broadcast(float(row));
-            const Floats v = fma(c_step, y, v0), nearest_v = max(v, zero) + min(v + v_more, zero);
-            for (int column = 0; column < kBlocksAcross; column += kLanes) {
-                const int block = row * kBlocksAcross + column;
-                const Floats u = fma(b_step, y, u_first) + broadcast(a * (kBlockWidth * column));
-                store(u_block + block, u);
-                store(v_block + block, v);
-                const Floats nearest_u = max(u + u_less, zero) + min(u + u_more, zero);
-                const Ints reached = fma(nearest_u, nearest_u, nearest_v * nearest_v) <= reach;
-                blocks[block / 64] |= Word(signs(reached)) << (block % 64);
-            }
-        };
-        if (kLanes > kBlocksAcross) {
-            for (int row = 0; row < kBlocksDown; row += 2) test_rows(row);
-        } else {
-            Word rows = 0;  // by v alone: most splats are much smaller than a tile
-            for (int y = 0; y < kBlocksDown; y += kLanes) {
-                const Floats v = fma(c_step, remainders(kLanes) + broadcast(float(y)), v0);
-                const Floats nearest_v = max(v, zero) + min(v + v_more, zero);
-                rows |= Word(signs(nearest_v * nearest_v <= reach)) << y;
-            }
-            for (; rows != 0; rows &= rows - 1) test_rows(first_bit(rows));
-        }
+// (u, v) of the pixels of a block: that of the block's first pixel plus that of the lane.
+class Coordinates {
+public:
+    Coordinates() = default;
+    explicit Coordinates(const Local& s)
+        : a_(s.a), u_lane_(fma(broadcast(s.b), lane_rows(), broadcast(s.a) * lane_columns())),
+          v_lane_(broadcast(s.c) * lane_rows()), u_step_(broadcast(s.b * kBlockHeight)),
+          v_step_(broadcast(s.c * kBlockHeight)), v0_(broadcast(s.v0)) {
+        store(u_first_, first_u(s));
     }
 
-    Floats u(int block) const { return broadcast(u_block[block]) + u_lane; }
-    Floats v(int block) const { return broadcast(v_block[block]) + v_lane; }
+    Floats u(int block) const {
+        const int x = block % kBlocksAcross;
+        Floats first = fma(u_step_, row_of(block), broadcast(u_first_[x % kLanes]));
+        if constexpr (kLanes < kBlocksAcross) first += broadcast(a_ * float(kBlockWidth * (x - x % kLanes)));
+        return first + u_lane_;
+    }
+    Floats v(int block) const { return fma(v_step_, row_of(block), v0_) + v_lane_; }
 
-    // Times the opacity it is the alpha before clamping.
-    static Floats falloff(Floats u, Floats v) { return exp2_negative(fma(-u, u, -(v * v))); }
+    // u at the first pixel of as many blocks of the first row as a vector has lanes.
+    static Floats first_u(const Local& s) {
+        return fma(broadcast(s.a * kBlockWidth), remainders(kBlocksAcross), broadcast(s.u0));
+    }
 
 private:
     static Floats lane_columns() { return remainders(kBlockWidth); }
     static Floats lane_rows() { return quotients(kBlockWidth); }
+    static Floats row_of(int block) { return broadcast(kWholeNumbers[block / kBlocksAcross]); }
+    static constexpr float kWholeNumbers[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
+                                                16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
+    static_assert(kBlocksDown <= 32);
+
+    float a_;
+    Floats u_lane_, v_lane_, u_step_, v_step_, v0_;
+    alignas(64) float u_first_[kLanes];
 };
+
+// The blocks that may have a pixel where alpha reaches alpha_min: u^2 + v^2 <= reach.
+inline void find_blocks(const Local& s, float within, Word blocks[kWords]) {
+    // The ranges of u and v in a block (a and c are above 0), and their values nearest to the splat's centre.
+    const float b_height = s.b * (kBlockHeight - 1);
+    const Floats u_less = broadcast(b_height < 0.0f ? b_height : 0.0f);
+    const Floats u_more = broadcast(s.a * (kBlockWidth - 1) + (b_height > 0.0f ? b_height : 0.0f));
+    const Floats v_more = broadcast(s.c * (kBlockHeight - 1));
+    const Floats b_step = broadcast(s.b * kBlockHeight), c_step = broadcast(s.c * kBlockHeight);
+    const Floats v0 = broadcast(s.v0), reach = broadcast(within), zero{};
+    for (int w = 0; w < kWords; ++w) blocks[w] = 0;
+    const Floats u_first = Coordinates::first_u(s);
+    const auto test_rows = [&](int row) {  // this row of blocks, and the next where a vector holds two
+        const Floats y = quotients(kBlocksAcross) + broadcast(float(row));
+        const Floats v = fma(c_step, y, v0), nearest_v = max(v, zero) + min(v + v_more, zero);
+        for (int column = 0; column < kBlocksAcross; column += kLanes) {
+            const int block = row * kBlocksAcross + column;
+            const Floats u = fma(b_step, y, u_first) + broadcast(s.a * (kBlockWidth * column));
+            const Floats nearest_u = max(u + u_less, zero) + min(u + u_more, zero);
+            const Ints reached = fma(nearest_u, nearest_u, nearest_v * nearest_v) <= reach;
+            blocks[block / 64] |= Word(signs(reached)) << (block % 64);
+        }
+    };
+    if (kLanes > kBlocksAcross) {
+        for (int row = 0; row < kBlocksDown; row += 2) test_rows(row);
+    } else {
+        Word rows = 0;  // by v alone: most splats are much smaller than a tile
+        for (int y = 0; y < kBlocksDown; y += kLanes) {
+            const Floats v = fma(c_step, remainders(kLanes) + broadcast(float(y)), v0);
+            const Floats nearest_v = max(v, zero) + min(v + v_more, zero);
+            rows |= Word(signs(nearest_v * nearest_v <= reach)) << y;
+        }
+        for (; rows != 0; rows &= rows - 1) test_rows(first_bit(rows));
+    }
+}
+
+// Times the opacity it is the alpha before clamping.
+inline Floats falloff_at(Floats u, Floats v) { return exp2_negative(fma(-u, u, -(v * v))); }
+
+inline bool is_empty(const Word set[kWords]) {
+    Word any = 0;
+    for (int w = 0; w < kWords; ++w) any |= set[w];
+    return any == 0;
+}
 
 }  // namespace
 }  // namespace avatar::splat

@@ -79,28 +79,30 @@ void add_outside(const Drawing& drawing, const float* grad_image, double grad_ba
 }
 
 void count_drawing(const Drawing& drawing, const std::vector<Visibility>& visibility,
-                   const std::vector<TileCounts>& tile_counts, const std::vector<unsigned char>& composited,
-                   Counts& counts) {
+                   const std::vector<TileCounts>& tile_counts, Counts& counts) {
     constexpr Visibility reasons[4] = {Visibility::kTransparent, Visibility::kNear, Visibility::kFlat,
                                        Visibility::kOutside};
     for (int k = 0; k < 4; ++k) counts.hidden[k] = std::count(visibility.begin(), visibility.end(), reasons[k]);
     counts.visible = std::count(visibility.begin(), visibility.end(), Visibility::kVisible);
     const TileLists& lists = drawing.lists;
     const TileGrid grid(drawing.view.region);
+    std::vector<bool> shown(visibility.size());
+    const std::int64_t words = drawing.kernels->words;
+    for (std::int64_t k = 0; k < lists.pair_count; ++k)
+        for (std::int64_t w = 0; w < words; ++w)
+            if (drawing.drawn_blocks[k * words + w] != 0) shown[lists.pairs[k].splat] = true;
+    counts.without_effect = counts.visible - std::count(shown.begin(), shown.end(), true);
     for (std::size_t i = 0; i < visibility.size(); ++i) {
         if (visibility[i] != Visibility::kVisible) continue;
-        const auto begin = composited.begin() + lists.slot_begin[i], end = composited.begin() + lists.slot_begin[i + 1];
-        counts.without_effect += std::find(begin, end, 1) == end;
         counts.pairs_in_boxes += tiles_of_box(drawing.splats[i], grid);
         counts.pairs_in_squares += tiles_of_square(drawing.splats[i], grid);
     }
     counts.tiles = static_cast<std::int64_t>(tile_counts.size());
-    for (std::int64_t tile = 0; tile < counts.tiles; ++tile) {
-        const TileCounts& t = tile_counts[tile];
+    for (const TileCounts& t : tile_counts) {
         counts.tiles_stopped += t.blocks == t.blocks_stopped;
         counts.blocks += t.blocks;
         counts.blocks_stopped += t.blocks_stopped;
-        counts.pairs_processed += drawing.ends[tile].processed;
+        counts.pairs_processed += t.pairs_processed;
         counts.pixels_evaluated += t.pixels_evaluated;
         counts.pixels_composited += t.pixels_composited;
     }
@@ -165,34 +167,26 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                                  {},
                                                  {},
                                                  {},
-                                                 {},
-                                                 {},
                                                  {}});
     const std::optional<std::vector<Visibility>> visibility = project_all(gaussians, *drawing);
     if (!visibility) return nullptr;
 
     const std::int64_t tiles = TileGrid(region).count();
     // Not initialised: the kernels write all that they read.
-    drawing->transmittance.reset(new float[tiles * kTilePixels]);
-    drawing->stops.reset(new int[tiles * kTilePixels]);
-    drawing->ends.reset(new TileEnd[tiles]);
-    drawing->block_stops.reset(new BlockStop[tiles * kMaxBlocks]);
+    drawing->ends.reset(new float[tiles * 2 * kTilePixels]);
+    drawing->drawn_blocks.reset(new Word[drawing->lists.pair_count * kernels.words]);
     const Raster raster = raster_of(*drawing);
     std::vector<TileCounts> tile_counts(counts != nullptr ? tiles : 0);
-    std::vector<unsigned char> composited(counts != nullptr ? drawing->lists.pair_count : 0, 0);
     const ForwardTarget target{image,
                                alpha,
-                               drawing->transmittance.get(),
-                               drawing->stops.get(),
                                drawing->ends.get(),
-                               drawing->block_stops.get(),
-                               tile_counts.data(),
-                               composited.data()};
+                               drawing->drawn_blocks.get(),
+                               tile_counts.data()};
     const auto draw_tile = counts != nullptr ? kernels.count_tile : kernels.forward_tile;
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t k = begin; k < end; ++k) draw_tile(raster, drawing->lists.tile_order[k], target);
     });
-    if (counts != nullptr) count_drawing(*drawing, *visibility, tile_counts, composited, *counts);
+    if (counts != nullptr) count_drawing(*drawing, *visibility, tile_counts, *counts);
     if (!is_whole_image(drawing->view)) draw_outside(*drawing, image, alpha);
     return drawing;
 }
@@ -204,8 +198,8 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
     std::vector<double> tile_backgrounds(3 * tiles);
     const Raster raster = raster_of(drawing);
-    const BackwardSource source{drawing.transmittance.get(), drawing.stops.get(), drawing.ends.get(),
-                                drawing.block_stops.get(),   grad_image,          grad_alpha};
+    const BackwardSource source{drawing.ends.get(), drawing.drawn_blocks.get(), grad_image,
+                                grad_alpha};
     const BackwardTarget target{moments.get(), tile_backgrounds.data()};
     parallel_for(drawing.threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t k = begin; k < end; ++k)

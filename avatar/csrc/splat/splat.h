@@ -31,10 +31,8 @@ struct Drawing {
     int threads;
     std::unique_ptr<Splat[]> splats;  // [N], written where the Gaussian is visible
     TileLists lists;
-    std::unique_ptr<float[]> transmittance;  // this and the rest: see ForwardTarget
-    std::unique_ptr<int[]> stops;
-    std::unique_ptr<TileEnd[]> ends;
-    std::unique_ptr<BlockStop[]> block_stops;
+    std::unique_ptr<float[]> ends;  // this and the next: see ForwardTarget
+    std::unique_ptr<Word[]> drawn_blocks;
 };
 
 // Draws the region into image [height * width * 3] and alpha [height * width]; the rest of them shows the background.
