@@ -1,13 +1,13 @@
 #pragma once
-// Exponentials of vectors, each by the same plan: the exponent's whole part goes into the result's bits, a polynomial takes
-// the rest. They differ in range, in error and in whether products and sums are fused, so no two give the same bits.
+// Exponentials of vectors, all by one plan: the exponent's whole part goes into the result's bits, a polynomial takes the
+// rest. They differ in range, in error and in whether products and sums are fused, so no two give the same bits.
 // Included only by the kernels, as simd.h.
 #include "simd.h"
 
 namespace {
 
-// Adding it to a number of magnitude below 2^22 rounds that to the nearest whole number, which stands in the last bits of
-// the sum; taking it off again leaves the whole number.
+// Adding it to a number of magnitude below 2^22 rounds that to the nearest whole number, which stands in the last bits
+// of the sum; taking it off again leaves the whole number.
 constexpr float kRounder = 12582912.0f;  // 1.5 * 2^23
 
 // p 2^k for whole k = rounded - kRounder from -150 to 128. In two factors: 2^128 and 2^-150 are no floats, the product
@@ -36,7 +36,7 @@ inline Floats exp2_negative(Floats x) {
 // e^x = 2^n e^f with |f| <= ln(2) / 2, within 2 units in the last place; NaN of NaN. The constants are those of expf in
 // the Cephes library.
 inline Floats exponential(Floats x) {
-    x = min(broadcast(89.0f), max(broadcast(-104.0f), x));  // beyond them: infinity and 0
+    x = min(broadcast(89.0f), max(broadcast(-104.0f), x));  // beyond them: infinity and 0; NaN stays
     const Floats shifted = fma(x, broadcast(1.44269504f), broadcast(kRounder));
     const Floats n = shifted - kRounder;
     Floats f = fma(n, broadcast(-0.693359375f), x);
@@ -51,8 +51,9 @@ inline Floats exponential(Floats x) {
     return times_power_of_two(p, shifted);
 }
 
-// The same with every product and sum rounded by itself, so that the bits are the same for any width of a vector: relative
-// error below 2e-7 where the result is a normal number. The Taylor polynomial of degree 7, whose remainder is below 6e-9.
+// The same with every product and sum rounded by itself, so that the bits are the same for any width of a vector:
+// relative error below 2e-7 where the result is a normal number. The Taylor polynomial of degree 7, whose remainder is
+// below 6e-9.
 inline Floats exponential_unfused(Floats x) {
     x = x < -104.0f ? broadcast(-104.0f) : x;  // false for NaN, which stays
     x = x > 89.0f ? broadcast(89.0f) : x;

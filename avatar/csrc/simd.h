@@ -180,6 +180,15 @@ inline unsigned signs(Longs v) {
 #endif
 }
 
+// Bit i says whether lane i of a is at most that of b.
+inline unsigned at_most(Floats a, Floats b) {
+#if defined(__AVX512F__)
+    return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OS);  // GCC goes a longer way from the comparison
+#else
+    return signs(a <= b);
+#endif
+}
+
 constexpr unsigned kAllLanes = (1u << kLanes) - 1;
 
 typedef float Four __attribute__((vector_size(16)));
@@ -190,6 +199,28 @@ inline Four load_four(const float* p) {
     return v;
 }
 inline void store_four(float* p, Four v) { __builtin_memcpy(p, &v, sizeof v); }
+
+// Three values of each of four pixels, side by side in memory.
+inline void store_interleaved(float* p, Four x, Four y, Four z) {
+#if defined(__SSE2__)
+    const __m128 r = (__m128)x, g = (__m128)y, b = (__m128)z;
+    _mm_storeu_ps(p, _mm_shuffle_ps(_mm_unpacklo_ps(r, g), _mm_shuffle_ps(b, r, 0x50), 0x84));
+    _mm_storeu_ps(p + 4, _mm_shuffle_ps(_mm_shuffle_ps(g, b, 0x55), _mm_unpackhi_ps(r, g), 0x48));
+    _mm_storeu_ps(p + 8, _mm_shuffle_ps(_mm_shuffle_ps(b, r, 0xfa), _mm_shuffle_ps(g, b, 0xff), 0x88));
+#else
+    for (int k = 0; k < 4; ++k) p[3 * k] = x[k], p[3 * k + 1] = y[k], p[3 * k + 2] = z[k];
+#endif
+}
+inline void load_interleaved(const float* p, Four& x, Four& y, Four& z) {
+#if defined(__SSE2__)
+    const __m128 a = _mm_loadu_ps(p), b = _mm_loadu_ps(p + 4), c = _mm_loadu_ps(p + 8);
+    x = (Four)_mm_shuffle_ps(a, _mm_shuffle_ps(b, c, 0x5a), 0x8c);
+    y = (Four)_mm_shuffle_ps(_mm_shuffle_ps(a, b, 0x05), _mm_shuffle_ps(b, c, 0xaf), 0x88);
+    z = (Four)_mm_shuffle_ps(_mm_shuffle_ps(a, b, 0x5a), c, 0xc8);
+#else
+    for (int k = 0; k < 4; ++k) x[k] = p[3 * k], y[k] = p[3 * k + 1], z[k] = p[3 * k + 2];
+#endif
+}
 
 // The sums of the lanes of four vectors. In few instructions: the backward pass takes nine for each splat in a tile.
 

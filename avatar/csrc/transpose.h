@@ -22,7 +22,7 @@ inline Floats load_quarters(const float* const* rows, int column) {
 
 inline void store_quarters(Floats v, float* const* rows, int column) {
 #if defined(__AVX512F__)
-    _mm_storeu_ps(rows[0] + column, _mm512_castps512_ps128((__m512)v));
+    __builtin_memcpy(rows[0] + column, &v, sizeof(__m128));
     _mm_storeu_ps(rows[4] + column, _mm512_maskz_extractf32x4_ps(0xf, (__m512)v, 1));
     _mm_storeu_ps(rows[8] + column, _mm512_maskz_extractf32x4_ps(0xf, (__m512)v, 2));
     _mm_storeu_ps(rows[12] + column, _mm512_maskz_extractf32x4_ps(0xf, (__m512)v, 3));

@@ -1,6 +1,6 @@
 #pragma once
-// Activations of vectors of floats, within 2 units in the last place over the whole range; NaN stays NaN. Included only by
-// the kernels, as simd.h, whose min and max return their second argument where one is NaN.
+// Activations of vectors of floats, within 2 units in the last place over the whole range; NaN stays NaN. Included only
+// by the kernels, as simd.h.
 #include "exponential.h"
 
 namespace {

@@ -50,17 +50,14 @@ std::int64_t tiles_of_square(const Splat& s, const TileGrid& grid) {
 
 Span* SpanStore::take(void* store, std::int64_t count) {
     auto& self = *static_cast<SpanStore*>(store);
-    if (self.taken.fetch_add(count, std::memory_order_relaxed) + count > self.most) return nullptr;
-    if (count > self.left) {
-        constexpr std::int64_t kBlock = 512;
-        self.left = std::max(count, kBlock);
-        self.blocks.emplace_back(new Span[self.left]);
-        self.next = self.blocks.back().get();
+    if (count > self.left_) {
+        constexpr std::int64_t kBlock = 1024;
+        self.left_ = std::max(count, kBlock);
+        self.blocks_.emplace_back(new Span[self.left_]);
+        self.next_ = self.blocks_.back().get();
     }
-    Span* const spans = self.next;
-    self.next += count;
-    self.left -= count;
-    return spans;
+    self.left_ -= count;
+    return std::exchange(self.next_, self.next_ + count);
 }
 
 std::vector<std::uint32_t> depth_order(const double* depths, const Visibility* visibility, std::int64_t count) {
@@ -102,30 +99,37 @@ std::vector<std::uint32_t> depth_order(const double* depths, const Visibility* v
     return order;
 }
 
-void fill_tile_lists(const std::vector<std::uint32_t>& order, const TileSpans* tiles_of, const TileGrid& grid,
-                     int threads, TileLists& lists) {
+void fill_tile_lists(const std::vector<std::uint32_t>& order,
+                     const std::vector<std::vector<std::uint32_t>>& tiles_of, const TileGrid& grid, int threads,
+                     TileLists& lists) {
     const std::int64_t tiles = grid.count(), count = static_cast<std::int64_t>(order.size());
 
-    // A stable counting sort by tile. The splats are cut into one chunk a thread; each chunk counts its pairs for every
-    // tile, and then knows where its own begin. The result does not depend on the number of chunks.
-    const std::int64_t chunks = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, count / 1024));
+    // A stable counting sort by tile. Where it is worth waking the threads, the splats are cut into one chunk for each;
+    // a chunk counts its pairs for every tile, and then knows where its own begin. The result is the same for any number
+    // of chunks.
+    constexpr std::int64_t kWorthwhile = 1 << 15;
+    const std::int64_t chunks = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, count / kWorthwhile));
     const std::int64_t chunk_size = (count + chunks - 1) / chunks;
     std::vector<std::uint32_t> next(chunks * tiles, 0);
-    const auto for_each_tile = [&](std::int64_t chunk, const auto& visit) {
+    const auto for_each_pair = [&](std::int64_t chunk, const auto& visit) {
         const std::int64_t end = std::min((chunk + 1) * chunk_size, count);
         for (std::int64_t rank = chunk * chunk_size; rank < end; ++rank) {
-            const std::uint32_t index = order[rank];
-            const TileSpans& own = tiles_of[index];
-            std::uint32_t slot = lists.slot_begin[index];
-            for (std::uint32_t k = 0; k < own.count; ++k)
-                for (std::uint32_t tile = own.spans[k].first; tile <= own.spans[k].last; ++tile)
-                    visit(tile, Pair{index, slot++});
+            const std::int64_t index = order[rank], range = index / kRange;
+            const std::uint32_t first = lists.slot_begin[range * kRange], last = lists.slot_begin[index + 1];
+            const std::uint32_t* const tiles_here = tiles_of[range].data();
+            for (std::uint32_t slot = lists.slot_begin[index]; slot < last; ++slot)
+                visit(tiles_here[slot - first], Pair{static_cast<std::uint32_t>(index), slot});
         }
     };
-    parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
-        std::uint32_t* const counts = next.data() + chunk * tiles;
-        for_each_tile(chunk, [&](std::uint32_t tile, const Pair&) { ++counts[tile]; });
-    });
+    if (chunks == 1) {
+        for (const std::vector<std::uint32_t>& some : tiles_of)
+            for (const std::uint32_t tile : some) ++next[tile];
+    } else {
+        parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
+            std::uint32_t* const counts = next.data() + chunk * tiles;
+            for_each_pair(chunk, [&](std::uint32_t tile, const Pair&) { ++counts[tile]; });
+        });
+    }
 
     lists.tile_begin.resize(tiles + 1);
     std::int64_t sum = 0;
@@ -143,7 +147,7 @@ void fill_tile_lists(const std::vector<std::uint32_t>& order, const TileSpans* t
     lists.pairs.reset(new Pair[lists.pair_count]);  // not initialised: every element is written below
     parallel_for(threads, chunks, 1, [&](std::int64_t chunk, std::int64_t) {
         std::uint32_t* const position = next.data() + chunk * tiles;
-        for_each_tile(chunk, [&](std::uint32_t tile, const Pair& pair) { lists.pairs[position[tile]++] = pair; });
+        for_each_pair(chunk, [&](std::uint32_t tile, const Pair& pair) { lists.pairs[position[tile]++] = pair; });
     });
 }
 

@@ -18,23 +18,25 @@ struct TileLists {
     std::int64_t pair_count = 0;
 };
 
-// The spans of tiles of a few Gaussians. `taken` counts the spans of all stores; there are no more beyond `most`.
-struct SpanStore {
-    std::int64_t most;
-    std::atomic<std::int64_t>& taken;
-    std::vector<std::unique_ptr<Span[]>> blocks;
-    Span* next = nullptr;
-    std::int64_t left = 0;
-
+// Memory for the spans of a few Gaussians.
+class SpanStore {
+public:
     static Span* take(void* store, std::int64_t count);  // as Projection::take
+
+private:
+    std::vector<std::unique_ptr<Span[]>> blocks_;
+    Span* next_ = nullptr;
+    std::int64_t left_ = 0;
 };
 
 // The visible of `count` Gaussians by increasing depth (> 0), equal depths by index.
 std::vector<std::uint32_t> depth_order(const double* depths, const Visibility* visibility, std::int64_t count);
 
-// The lists of the Gaussians `order`, front to back; lists.slot_begin is filled already.
-void fill_tile_lists(const std::vector<std::uint32_t>& order, const TileSpans* tiles_of, const TileGrid& grid,
-                     int threads, TileLists& lists);
+// The lists of the Gaussians `order`, front to back; lists.slot_begin is filled already. tiles_of[i / kRange] holds the
+// tiles of kRange Gaussians, one Gaussian after the other.
+constexpr std::int64_t kRange = 256;
+void fill_tile_lists(const std::vector<std::uint32_t>& order, const std::vector<std::vector<std::uint32_t>>& tiles_of,
+                     const TileGrid& grid, int threads, TileLists& lists);
 
 // How many tiles other ways of choosing them would take: the box around the ellipse, and the square of three standard
 // deviations of the longer axis.

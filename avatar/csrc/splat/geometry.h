@@ -61,7 +61,7 @@ inline Doubles clamp(Doubles value, const double range[2], Longs& clamped) {
 inline Longs is_finite(Doubles v) { return v - v == 0.0; }
 
 // Of the Gaussians in lanes `at` and following of the batch.
-inline Geometry geometry_of(const View& view, const Batch& batch, int at) {
+__attribute__((always_inline)) inline Geometry geometry_of(const View& view, const Batch& batch, int at) {
     const Camera& camera = view.camera;
     Geometry g;
     const double* R = camera.rotation;

@@ -2,13 +2,12 @@
 #include "splat/project.h"
 #include "splat/raster.h"
 
-// The loops over Gaussians and pixels, compiled for several instruction sets and chosen when the program runs. Every kernel
-// does a range of Gaussians, or a tile, and writes nothing else, so any split over threads gives the same bits.
+// The loops over Gaussians and pixels, compiled for several instruction sets and chosen when the program runs. Every
+// kernel does a range of Gaussians, or a tile, and writes nothing else, so any split over threads gives the same bits.
 namespace avatar::splat {
 
 struct Kernels {
-    // A tile is cut into blocks of as many pixels as a vector has lanes; a set of them takes so many words.
-    int words;
+    int words;  // in a set of a tile's blocks, which have as many pixels as a vector has lanes
     bool (*all_finite)(const float* values, std::int64_t count);
     void (*project)(const View&, const Gaussians&, std::int64_t begin, std::int64_t end, const Projection&);
     // Writes (does not add) the gradients of Gaussians begin .. end - 1 from moments [pairs * kMoments], by slot.

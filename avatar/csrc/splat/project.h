@@ -40,10 +40,10 @@ struct Projection {
     Splat* splats;            // [N]
     double* depths;           // [N] of the centres
     Visibility* visibility;   // [N]
-    TileSpans* tiles;         // [N]
+    TileSpans* tiles;         // of the first Gaussian that is projected and those that follow it
     std::uint32_t* pairs;     // [N] tiles in all spans of a Gaussian, 0 where it is hidden
-    Span* (*take)(void* owner, std::int64_t count);  // memory for so many spans; null where there shall be no more
-    void* owner;
+    Span* (*take)(void* store, std::int64_t count);  // memory for so many spans
+    void* store;
 };
 
 }  // namespace avatar::splat

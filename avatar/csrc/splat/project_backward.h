@@ -16,8 +16,8 @@ struct alignas(64) BatchGradients {
 };
 
 // dL/dF (2x3) -> scales, quaternion and, through T, the camera-space centre.
-inline void covariance_backward(const View& view, const Geometry& g, const Doubles grad_F[2][3], Doubles grad_p[3], int at,
-                                BatchGradients& to) {
+inline void covariance_backward(const View& view, const Geometry& g, const Doubles grad_F[2][3], Doubles grad_p[3],
+                                int at, BatchGradients& to) {
     const Doubles* R = g.rotation;
     // F = T M, M = rotation * diag(scales)
     Doubles G[9], grad_T[2][3] = {};

@@ -14,8 +14,8 @@ struct alignas(64) Outlines {
     Footprints footprints;
     float opacity[kBatch];
     double depth[kBatch];
-    double log_reach[kBatch];          // what reach is the logarithm of, then reach
-    double xx[kBatch], yy[kBatch];     // of the covariance
+    double over_cutoff[kBatch];     // the opacity over alpha_min
+    double xx[kBatch], yy[kBatch];  // of the covariance
     std::int64_t visibility[kBatch];
 };
 
@@ -24,7 +24,8 @@ inline void outline(const View& view, const Batch& batch, int at, Outlines& to) 
     const Camera& camera = view.camera;
     const Settings& settings = view.settings;
     const Geometry g = geometry_of(view, batch, at);
-    const Doubles root = square_root(g.yy), root_det = square_root(g.det), given = load_as_doubles(batch.opacities + at);
+    const Doubles root = square_root(g.yy), root_det = square_root(g.det);
+    const Doubles given = load_as_doubles(batch.opacities + at);
     store_as_floats(to.opacity + at, settings.antialiased ? given * g.area / root_det : given);
     const Doubles opacity = load_as_doubles(to.opacity + at);
     store(to.depth + at, g.p[2]);
@@ -34,7 +35,7 @@ inline void outline(const View& view, const Batch& batch, int at, Outlines& to) 
     store(to.footprints.b + at, -kWhitening * g.xy / (root * root_det));
     store(to.footprints.c + at, kWhitening / root);
     const double alpha_min = settings.alpha_min;
-    store(to.log_reach + at, opacity / alpha_min);
+    store(to.over_cutoff + at, opacity / alpha_min);
     store(to.xx + at, g.xx);
     store(to.yy + at, g.yy);
     const Longs transparent = lanes_of(Visibility::kTransparent);
@@ -53,10 +54,11 @@ inline void find_reach(const View& view, Outlines& to) {
         for (float& reach : to.footprints.reach) reach = __builtin_inff();
         return;
     }
-    for (int lane = 0; lane < kBatch; ++lane) to.log_reach[lane] = __builtin_log2(to.log_reach[lane]);
+    alignas(64) double reach_of[kBatch];
+    for (int lane = 0; lane < kBatch; ++lane) reach_of[lane] = __builtin_log2(to.over_cutoff[lane]);
     const Region& region = view.region;
     for (int at = 0; at < kBatch; at += kDoubles) {
-        const Doubles reach = load(to.log_reach + at) + kReachMargin;
+        const Doubles reach = load(reach_of + at) + kReachMargin;
         store_as_floats(to.footprints.reach + at, reach);
         const Doubles half_x = square_root(reach * load(to.xx + at) / kHalfLog2E);
         const Doubles half_y = square_root(reach * load(to.yy + at) / kHalfLog2E);
@@ -65,7 +67,8 @@ inline void find_reach(const View& view, Outlines& to) {
                               (y + half_y < double(region.top)) | (y - half_y > double(region.bottom));
         Longs visibility;
         __builtin_memcpy(&visibility, to.visibility + at, sizeof visibility);
-        visibility = outside & (visibility == lanes_of(Visibility::kVisible)) ? lanes_of(Visibility::kOutside) : visibility;
+        const Longs left_out = outside & (visibility == lanes_of(Visibility::kVisible));
+        visibility = left_out ? lanes_of(Visibility::kOutside) : visibility;
         __builtin_memcpy(to.visibility + at, &visibility, sizeof visibility);
     }
 }
@@ -105,13 +108,13 @@ void project(const View& view, const Gaussians& gaussians, std::int64_t begin, s
                     colour[c] = channel > 0.0f ? channel : 0.0f;
                 }
                 visible[lane] = visibility == Visibility::kVisible;
-                to.splats[i] = {f.x[lane],           f.y[lane],     f.a[lane], f.b[lane], f.c[lane],
-                                outlines.opacity[lane], f.reach[lane], colour[0], colour[1], colour[2], 0.0f};
+                to.splats[i] = {f.x[lane], f.y[lane], f.a[lane], f.b[lane], f.c[lane], outlines.opacity[lane],
+                                f.reach[lane], colour[0], colour[1], colour[2], 0.0f};
                 to.depths[i] = outlines.depth[lane];
             }
             to.visibility[i] = visibility;
         }
-        find_tiles(f, visible, first, count, to);
+        find_tiles(to, f, visible, count, to.tiles + (first - begin), to.pairs + first);
     }
 }
 

@@ -23,22 +23,24 @@ struct TileCounts {
     std::int32_t blocks, blocks_stopped;
 };
 
-constexpr int kNeverStops = 0x7fffffff;
+constexpr int kNeverStops = 0x7fffffff;  // a pair's number
 
 typedef unsigned long long Word;  // of a set of blocks, as bits
 
 // Written at the pixels of the region only.
 struct ForwardTarget {
-    float* image;          // [height * width * 3]
-    float* alpha;          // [height * width]
-    float* ends;           // [tiles * 2 * kTilePixels] how the pixels end, in the kernels' own order
-    Word* drawn_blocks;    // [pairs * Kernels::words], the blocks in which a pixel shows the splat
-    TileCounts* counts;    // [tiles]; written by count_tile only
+    float* image;  // [height * width * 3]
+    float* alpha;  // [height * width]
+    // [tiles * 2 * kTilePixels], in the kernels' own order, the transmittance behind all splats, and the bits of a number:
+    // the pair of the tile from which on the pixel shows none, 0 outside the region.
+    float* ends;
+    Word* blocks;        // [pairs * Kernels::words] that were looked at; from count_tile: that show the splat
+    TileCounts* counts;  // [tiles]; written by count_tile only
 };
 
 struct BackwardSource {
     const float* ends;
-    const Word* drawn_blocks;
+    const Word* blocks;
     const float* grad_image;  // may be null
     const float* grad_alpha;  // may be null
 };

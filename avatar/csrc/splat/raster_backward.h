@@ -4,6 +4,34 @@
 namespace avatar::splat {
 namespace {
 
+// (u, v) at the pixels of a block.
+class Coordinates {
+public:
+    explicit Coordinates(const Local& s) : s_(s), u_lane_(s.u_lane()), v_lane_(s.v_lane()) {
+        store(first_row_, s.first_row_u());
+    }
+
+    Floats u(int block) const {
+        const int x = block % kBlocksAcross;
+        Floats first = s_.u(row_of(block), broadcast(first_row_[x % kLanes]));
+        if constexpr (kLanes < kBlocksAcross) first += s_.u_to_column(x - x % kLanes);
+        return first + u_lane_;
+    }
+    Floats v(int block) const { return s_.v(row_of(block)) + v_lane_; }
+
+private:
+    static Floats row_of(int block) {
+        static constexpr float numbers[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
+                                              16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
+        static_assert(kBlocksDown <= 32);
+        return broadcast(numbers[block / kBlocksAcross]);
+    }
+
+    const Local s_;
+    const Floats u_lane_, v_lane_;
+    alignas(64) float first_row_[kLanes];
+};
+
 // Back to front, from the last splat that each pixel shows. With g = dL/dcolour of a pixel, T_k the transmittance in
 // front of splat k and A = 1 - T_end the alpha output, splat k's alpha has the gradient
 //     T_k g.c_k - behind_k / (1 - alpha_k) = (T_{k+1} g.c_k - behind_k) / (1 - alpha_k),
@@ -13,21 +41,32 @@ namespace {
 void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& source, const BackwardTarget& target) {
     const TileArea area(r, tile);
     enum { kTransmittance, kStops, kBehind, kGradient, kVectors = kGradient + 3 };
-    alignas(64) float pixels[kVectors * kTilePixels];
+    Pixels<kVectors> pixels;
     const float* const ends = source.ends + tile * 2 * kTilePixels;
     for (int block = 0; block < kBlocks; ++block) {
-        float* const p = pixels + block * kVectors * kLanes;
+        float* const p = pixels.of(block);
         for (int k = 0; k < 2; ++k) store(p + k * kLanes, load_anywhere(ends + (2 * block + k) * kLanes));
         for (int k = kBehind; k < kVectors; ++k) store(p + k * kLanes, Floats{});
     }
-    area.for_each_pixel<kVectors>(r.width, [&](int i, std::int64_t pixel) {
-        if (source.grad_image != nullptr)
-            for (int c = 0; c < 3; ++c) pixels[i + (kGradient + c) * kLanes] = source.grad_image[3 * pixel + c];
-        if (source.grad_alpha != nullptr) pixels[i + kBehind * kLanes] = source.grad_alpha[pixel];
+    area.for_each_row<kVectors>(r.width, [&](int i, std::int64_t pixel, int count) {
+        float *const gradient = pixels.values + i + kGradient * kLanes;
+        float *const behind = pixels.values + i + kBehind * kLanes;
+        if (source.grad_image != nullptr && count == 4) {
+            Four red, green, blue;
+            load_interleaved(source.grad_image + 3 * pixel, red, green, blue);
+            store_four(gradient, red);
+            store_four(gradient + kLanes, green);
+            store_four(gradient + 2 * kLanes, blue);
+        } else if (source.grad_image != nullptr) {
+            for (int k = 0; k < count; ++k)
+                for (int c = 0; c < 3; ++c) gradient[k + c * kLanes] = source.grad_image[3 * (pixel + k) + c];
+        }
+        if (source.grad_alpha != nullptr)
+            for (int k = 0; k < count; ++k) behind[k] = source.grad_alpha[pixel + k];
     });
     Floats ground_red{}, ground_green{}, ground_blue{};
     for (int block = 0; block < kBlocks; ++block) {
-        float* const p = pixels + block * kVectors * kLanes;
+        float* const p = pixels.of(block);
         const Floats t = load(p + kTransmittance * kLanes), g_red = load(p + kGradient * kLanes),
                      g_green = load(p + (kGradient + 1) * kLanes), g_blue = load(p + (kGradient + 2) * kLanes);
         ground_red = fma(t, g_red, ground_red);
@@ -42,11 +81,11 @@ void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& sou
 
     const Floats alpha_min = broadcast(r.alpha_min), alpha_max = broadcast(r.alpha_max), one = broadcast(1.0f);
     const std::int64_t begin = r.tile_begin[tile], count = r.tile_begin[tile + 1] - begin;
-    const Word* const drawn_blocks = source.drawn_blocks + begin * kWords;
+    const Word* const blocks_of_pairs = source.blocks + begin * kWords;
     for (std::int64_t at = count - 1; at >= 0; --at) {
         const Pair pair = r.pairs[begin + at];
         float* const moments = target.moments + std::int64_t{pair.slot} * kMoments;
-        const Word* const blocks = drawn_blocks + at * kWords;
+        const Word* const blocks = blocks_of_pairs + at * kWords;
         if (is_empty(blocks)) {
             for (int k = 0; k < kMoments; ++k) moments[k] = 0.0f;
             continue;
@@ -63,7 +102,7 @@ void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& sou
         for (int w = 0; w < kWords; ++w) {
             for (Word bits = blocks[w]; bits != 0; bits &= bits - 1) {
                 const int block = 64 * w + first_bit(bits);
-                float* const p = pixels + block * kVectors * kLanes;
+                float* const p = pixels.of(block);
                 const Floats u = coordinates.u(block), v = coordinates.v(block);
                 const Floats falloff = falloff_at(u, v), unclamped = opacity * falloff;
                 const Floats clamped = min(unclamped, alpha_max);

@@ -10,149 +10,147 @@ inline int size_of(const Word set[kWords]) {
     return size;
 }
 
-// Draws the pixels of one tile. What a splat needs at a block is a long chain of operations, and a processor looks ahead
-// over less than two of those. So the work is cut into short loops over many blocks of some splats: which blocks, their
-// alphas, and what these do to the pixels.
-template <bool kCount>
-class Painter {
-public:
-    Painter(const Raster& raster, std::int64_t tile) : r_(raster), area_(raster, tile) {
-        const bool whole = area_.is_whole();
-        for (int block = 0; block < kBlocks; ++block) {
-            float* const p = pixels_ + block * kVectors * kLanes;
-            store(p, broadcast(whole ? 1.0f : -1.0f));
-            store(p + kStops * kLanes, (Floats)(Ints{} + (whole ? kNeverStops : 0)));
-            for (int k = kRed; k <= kBlue; ++k) store(p + k * kLanes, Floats{});
-        }
-        if (!whole) {
-            area_.for_each_pixel<kVectors>(r_.width, [&](int i, std::int64_t) {
-                pixels_[i] = 1.0f;
-                __builtin_memcpy(pixels_ + i + kStops * kLanes, &kNeverStops, sizeof kNeverStops);
-            });
-        }
-        area_.blocks(alive_);
-        if (kCount) counts_.blocks = size_of(alive_);
-    }
+// (u, v) at the first pixels of blocks, and which blocks may have a pixel where alpha reaches alpha_min. The former are
+// there for the rows of the latter only.
+struct Blocks {
+    alignas(64) float u[kBlocks], v[kBlocks];
+    Word reached[kWords];
 
-    // Draws the pairs, front to back, until all blocks have stopped.
-    void draw(const Pair* pairs, std::int64_t count, Word* drawn_blocks) {
-        __builtin_memset(drawn_blocks, 0, count * kWords * sizeof(Word));
-        std::int64_t first = 0;
-        for (; first < count && !is_empty(alive_); first += kGroup) {
-            const std::int64_t end = first + kGroup < count ? first + kGroup : count;
-            find_candidates(pairs, first, end, count);
-            for (int k = 0; k < candidates_; ++k) {
-                for (int w = 0; w < kWords; ++w) drawn_blocks[group_[k].at * kWords + w] = group_[k].blocks[w];
-                if (items_ + kBlocks > kMostItems) draw_items(drawn_blocks);
-                for (int w = 0; w < kWords; ++w)
-                    for (Word bits = group_[k].blocks[w]; bits != 0; bits &= bits - 1)
-                        item_[items_++] = {static_cast<unsigned char>(k), static_cast<unsigned char>(64 * w + first_bit(bits))};
+    Blocks(const Local& s, float reach) {
+        // The ranges of u and v in a block (a and c are above 0), and their values nearest to the splat's centre.
+        const float b_height = s.b * (kBlockHeight - 1);
+        const Floats u_less = broadcast(b_height < 0.0f ? b_height : 0.0f);
+        const Floats u_more = broadcast(s.a * (kBlockWidth - 1) + (b_height > 0.0f ? b_height : 0.0f));
+        const Floats v_more = broadcast(s.c * (kBlockHeight - 1)), within = broadcast(reach), zero{};
+        for (int w = 0; w < kWords; ++w) reached[w] = 0;
+        const Floats first_row = s.first_row_u();
+        const auto test_rows = [&](int row) {  // this row of blocks, and the next where a vector holds two
+            const Floats y = quotients(kBlocksAcross) + broadcast(float(row));
+            const Floats own_v = s.v(y), nearest_v = max(own_v, zero) + min(own_v + v_more, zero);
+            for (int column = 0; column < kBlocksAcross; column += kLanes) {
+                const int block = row * kBlocksAcross + column;
+                const Floats own_u = s.u(y, first_row) + s.u_to_column(column);
+                store(u + block, own_u);
+                store(v + block, own_v);
+                const Floats nearest_u = max(own_u + u_less, zero) + min(own_u + u_more, zero);
+                const unsigned found = at_most(fma(nearest_u, nearest_u, nearest_v * nearest_v), within);
+                reached[block / 64] |= Word(found) << (block % 64);
             }
-            draw_items(drawn_blocks);
-        }
-        if (kCount) counts_.pairs_processed = first < count ? first : count;
-    }
-
-    void write(std::int64_t tile, const ForwardTarget& target) {
-        float* const ends = target.ends + tile * 2 * kTilePixels;
-        for (int block = 0; block < kBlocks; ++block) {
-            float* const p = pixels_ + block * kVectors * kLanes;
-            store(p, (Floats)((Ints)load(p) & ~sign_bits()));
-            for (int k = 0; k < 2; ++k) store_anywhere(ends + (2 * block + k) * kLanes, load(p + k * kLanes));
-        }
-        area_.for_each_pixel<kVectors>(r_.width, [&](int i, std::int64_t pixel) {
-            const float t = pixels_[i];
-            for (int c = 0; c < 3; ++c)
-                target.image[3 * pixel + c] = pixels_[i + (kRed + c) * kLanes] + t * r_.background[c];
-            target.alpha[pixel] = 1.0f - t;
-        });
-        if (!kCount) return;
-        counts_.blocks_stopped = counts_.blocks - size_of(alive_);
-        target.counts[tile] = counts_;
-    }
-
-private:
-    static constexpr int kGroup = 8;                 // pairs looked at together
-    static constexpr int kMostItems = 2 * kBlocks;   // blocks of splats drawn together
-    // A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance; nothing
-    // is drawn there any more.
-    enum { kTransmittance, kStops, kRed, kGreen, kBlue, kVectors };
-
-    // A splat that may show, and in which blocks.
-    struct Candidate {
-        Coordinates coordinates;
-        float opacity, red, green, blue;
-        std::int64_t at;  // among the pairs of the tile
-        Word blocks[kWords];
-    };
-    struct Item {
-        unsigned char candidate, block;
-    };
-
-    void find_candidates(const Pair* pairs, std::int64_t first, std::int64_t end, std::int64_t count) {
-        candidates_ = 0;
-        for (std::int64_t at = first; at < end; ++at) {
-            if (at + kAhead < count) __builtin_prefetch(r_.splats + pairs[at + kAhead].splat);
-            const Splat& s = r_.splats[pairs[at].splat];
-            const Local local(s, area_);
-            Candidate& candidate = group_[candidates_];
-            candidate.coordinates = Coordinates(local);
-            candidate.opacity = s.opacity, candidate.red = s.red, candidate.green = s.green, candidate.blue = s.blue;
-            candidate.at = at;
-            find_blocks(local, s.reach, candidate.blocks);
-            for (int w = 0; w < kWords; ++w) candidate.blocks[w] &= alive_[w];
-            candidates_ += !is_empty(candidate.blocks);
-        }
-    }
-
-    void draw_items(Word* drawn_blocks) {
-        const Floats alpha_min = broadcast(r_.alpha_min), alpha_max = broadcast(r_.alpha_max), t_min = broadcast(r_.t_min);
-        for (int i = 0; i < items_; ++i) {
-            const Candidate& s = group_[item_[i].candidate];
-            const int block = item_[i].block;
-            const Floats falloff = falloff_at(s.coordinates.u(block), s.coordinates.v(block));
-            store(alphas_ + i * kLanes, min(broadcast(s.opacity) * falloff, alpha_max));
-        }
-        for (int i = 0; i < items_; ++i) {
-            const Candidate& s = group_[item_[i].candidate];
-            float* const p = pixels_ + item_[i].block * kVectors * kLanes;
-            const Floats alpha = load(alphas_ + i * kLanes), before = load(p), next = fma(-before, alpha, before);
-            const Ints hit = alpha >= alpha_min, enough = next >= t_min, drawn = hit & enough;
-            const Floats weight = (Floats)((Ints)(before * alpha) & drawn);
-            const Ints stopping = hit & ~enough & (before > 0.0f);
-            const Ints after = (Ints)(drawn ? next : before) | (stopping & sign_bits());
-            store(p, (Floats)after);
-            store(p + kRed * kLanes, fma(weight, broadcast(s.red), load(p + kRed * kLanes)));
-            store(p + kGreen * kLanes, fma(weight, broadcast(s.green), load(p + kGreen * kLanes)));
-            store(p + kBlue * kLanes, fma(weight, broadcast(s.blue), load(p + kBlue * kLanes)));
-            store(p + kStops * kLanes, stopping ? (Floats)(Ints{} + static_cast<int>(s.at)) : load(p + kStops * kLanes));
-            if (signs(after) == kAllLanes) alive_[item_[i].block / 64] &= ~(Word{1} << (item_[i].block % 64));
-            if (kCount) {
-                counts_.pixels_evaluated += kLanes;
-                counts_.pixels_composited += __builtin_popcount(signs(drawn));
-                if (signs(drawn) == 0) drawn_blocks[s.at * kWords + item_[i].block / 64] &= ~(Word{1} << (item_[i].block % 64));
+        };
+        if (kLanes > kBlocksAcross) {
+            for (int row = 0; row < kBlocksDown; row += 2) test_rows(row);
+        } else {
+            Word rows = 0;  // by v alone: most splats are much smaller than a tile
+            for (int y = 0; y < kBlocksDown; y += kLanes) {
+                const Floats own_v = s.v(remainders(kLanes) + broadcast(float(y)));
+                const Floats nearest_v = max(own_v, zero) + min(own_v + v_more, zero);
+                rows |= Word(at_most(nearest_v * nearest_v, within)) << y;
             }
+            for (; rows != 0; rows &= rows - 1) test_rows(first_bit(rows));
         }
-        items_ = 0;
     }
-
-    const Raster& r_;
-    const TileArea area_;
-    alignas(64) float pixels_[kVectors * kTilePixels];
-    alignas(64) float alphas_[kMostItems * kLanes];
-    Candidate group_[kGroup];
-    Item item_[kMostItems];
-    int candidates_ = 0, items_ = 0;
-    Word alive_[kWords];
-    TileCounts counts_{};
 };
 
 template <bool kCount>
 void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& target) {
-    Painter<kCount> painter(r, tile);
-    const std::int64_t begin = r.tile_begin[tile];
-    painter.draw(r.pairs + begin, r.tile_begin[tile + 1] - begin, target.drawn_blocks + begin * kWords);
-    painter.write(tile, target);
+    const TileArea area(r, tile);
+    // A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance; nothing
+    // is drawn there any more.
+    enum { kTransmittance, kStops, kRed, kGreen, kBlue, kVectors };
+    Pixels<kVectors> pixels;
+    const bool whole = area.is_whole();
+    for (int block = 0; block < kBlocks; ++block) {
+        float* const p = pixels.of(block);
+        store(p, broadcast(whole ? 1.0f : -1.0f));
+        store(p + kStops * kLanes, (Floats)(Ints{} + (whole ? kNeverStops : 0)));
+        for (int k = kRed; k <= kBlue; ++k) store(p + k * kLanes, Floats{});
+    }
+    if (!whole) {
+        area.for_each_row<kVectors>(r.width, [&](int i, std::int64_t, int count) {
+            for (int k = i; k < i + count; ++k) {
+                pixels.values[k] = 1.0f;
+                __builtin_memcpy(pixels.values + k + kStops * kLanes, &kNeverStops, sizeof kNeverStops);
+            }
+        });
+    }
+    Word alive[kWords];
+    area.blocks(alive);
+    TileCounts counts{};
+    if (kCount) counts.blocks = size_of(alive);
+
+    const Floats alpha_min = broadcast(r.alpha_min), alpha_max = broadcast(r.alpha_max), t_min = broadcast(r.t_min);
+    const std::int64_t begin = r.tile_begin[tile], count = r.tile_begin[tile + 1] - begin;
+    Word* const blocks_of_pairs = target.blocks + begin * kWords;
+    std::int64_t at = 0;
+    for (; at < count && !is_empty(alive); ++at) {
+        const Pair pair = r.pairs[begin + at];
+        if (at + kAhead < count) __builtin_prefetch(r.splats + r.pairs[begin + at + kAhead].splat);
+        const Splat& s = r.splats[pair.splat];
+        const Local local(s, area);
+        const Blocks blocks(local, s.reach);
+        const Floats u_lane = local.u_lane(), v_lane = local.v_lane(), opacity = broadcast(s.opacity);
+        const Floats s_red = broadcast(s.red), s_green = broadcast(s.green), s_blue = broadcast(s.blue);
+        for (int w = 0; w < kWords; ++w) {
+            const Word looked_at = blocks.reached[w] & alive[w];
+            blocks_of_pairs[at * kWords + w] = looked_at;
+            for (Word bits = looked_at; bits != 0; bits &= bits - 1) {
+                const int bit = first_bit(bits), block = 64 * w + bit;
+                float* const p = pixels.of(block);
+                const Floats u = broadcast(blocks.u[block]) + u_lane, v = broadcast(blocks.v[block]) + v_lane;
+                const Floats alpha = min(opacity * falloff_at(u, v), alpha_max);
+                const Floats before = load(p), next = fma(-before, alpha, before);
+                const Ints hit = alpha >= alpha_min, enough = next >= t_min, drawn = hit & enough;
+                const Floats weight = (Floats)((Ints)(before * alpha) & drawn);
+                store(p + kRed * kLanes, fma(weight, s_red, load(p + kRed * kLanes)));
+                store(p + kGreen * kLanes, fma(weight, s_green, load(p + kGreen * kLanes)));
+                store(p + kBlue * kLanes, fma(weight, s_blue, load(p + kBlue * kLanes)));
+                const Floats after = drawn ? next : before;
+                store(p, after);
+                const Ints stopping = hit & ~enough & (before > 0.0f);
+                if (signs(stopping) != 0) {
+                    const Ints stopped = (Ints)after | (stopping & sign_bits());
+                    store(p, (Floats)stopped);
+                    store(p + kStops * kLanes,
+                          stopping ? (Floats)(Ints{} + static_cast<int>(at)) : load(p + kStops * kLanes));
+                    if (signs(stopped) == kAllLanes) alive[w] &= ~(Word{1} << bit);
+                }
+                if (kCount) {
+                    counts.pixels_evaluated += kLanes;
+                    counts.pixels_composited += __builtin_popcount(signs(drawn));
+                    if (signs(drawn) == 0) blocks_of_pairs[at * kWords + w] &= ~(Word{1} << bit);
+                }
+            }
+        }
+    }
+    __builtin_memset(blocks_of_pairs + at * kWords, 0, (count - at) * kWords * sizeof(Word));
+    if (kCount) {
+        counts.pairs_processed = at;
+        counts.blocks_stopped = counts.blocks - size_of(alive);
+        target.counts[tile] = counts;
+    }
+
+    float* const ends = target.ends + tile * 2 * kTilePixels;
+    for (int block = 0; block < kBlocks; ++block) {
+        float* const p = pixels.of(block);
+        store(p, (Floats)((Ints)load(p) & ~sign_bits()));
+        for (int k = 0; k < 2; ++k) store_anywhere(ends + (2 * block + k) * kLanes, load(p + k * kLanes));
+    }
+    area.for_each_row<kVectors>(r.width, [&](int i, std::int64_t pixel, int count) {
+        const float* const p = pixels.values + i;
+        float *const image = target.image + 3 * pixel, *const alpha = target.alpha + pixel;
+        if (count == 4) {
+            const Four t = load_four(p);
+            store_four(alpha, 1.0f - t);
+            store_interleaved(image, load_four(p + kRed * kLanes) + t * r.background[0],
+                              load_four(p + kGreen * kLanes) + t * r.background[1],
+                              load_four(p + kBlue * kLanes) + t * r.background[2]);
+            return;
+        }
+        for (int k = 0; k < count; ++k) {
+            for (int c = 0; c < 3; ++c) image[3 * k + c] = p[k + (kRed + c) * kLanes] + p[k] * r.background[c];
+            alpha[k] = 1.0f - p[k];
+        }
+    });
 }
 
 }  // namespace

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <numeric>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -11,9 +12,8 @@
 namespace avatar::splat {
 namespace {
 
-// 8 bytes a pair in the forward pass and 36 more in the backward pass: 3 GB at most.
+// 12 bytes and a set of blocks, of 8 to 32 bytes, a pair in the forward pass and 36 more in the backward pass: 6 GB at most.
 constexpr std::int64_t kMaxPairs = std::int64_t{1} << 26;
-constexpr std::int64_t kGrain = 256;  // Gaussians handed to a thread at a time
 constexpr std::int64_t kRows = 64;    // rows of the image handed to a thread at a time
 
 bool all_finite(const Kernels& kernels, const Gaussians& g, std::int64_t begin, std::int64_t end) {
@@ -90,7 +90,7 @@ void count_drawing(const Drawing& drawing, const std::vector<Visibility>& visibi
     const std::int64_t words = drawing.kernels->words;
     for (std::int64_t k = 0; k < lists.pair_count; ++k)
         for (std::int64_t w = 0; w < words; ++w)
-            if (drawing.drawn_blocks[k * words + w] != 0) shown[lists.pairs[k].splat] = true;
+            if (drawing.blocks[k * words + w] != 0) shown[lists.pairs[k].splat] = true;
     counts.without_effect = counts.visible - std::count(shown.begin(), shown.end(), true);
     for (std::size_t i = 0; i < visibility.size(); ++i) {
         if (visibility[i] != Visibility::kVisible) continue;
@@ -109,30 +109,44 @@ void count_drawing(const Drawing& drawing, const std::vector<Visibility>& visibi
     counts.pairs = lists.pair_count;
 }
 
+std::vector<std::uint32_t> tiles_in(const TileSpans* spans_of, std::int64_t count, std::int64_t tile_count) {
+    std::vector<std::uint32_t> tiles(tile_count);
+    std::uint32_t* next = tiles.data();
+    for (std::int64_t i = 0; i < count; ++i)
+        for (std::uint32_t k = 0; k < spans_of[i].count; ++k)
+            for (std::uint32_t tile = spans_of[i].spans[k].first; tile <= spans_of[i].spans[k].last; ++tile)
+                *next++ = tile;
+    return tiles;
+}
+
 // Projects all Gaussians and makes the tile lists of the visible ones, whose visibility it gives. Empty when an input is
 // not finite.
 std::optional<std::vector<Visibility>> project_all(const Gaussians& gaussians, Drawing& drawing) {
-    const std::int64_t count = gaussians.count, ranges = (count + kGrain - 1) / kGrain;
+    const std::int64_t count = gaussians.count, ranges = (count + kRange - 1) / kRange;
     const Kernels& kernels = *drawing.kernels;
     const TileGrid grid(drawing.view.region);
     TileLists& lists = drawing.lists;
-    drawing.splats.reset(new Splat[count]);  // not initialised, as the next two: written where they are read
+    drawing.splats.reset(new Splat[count]);  // not initialised, as the next: written where they are read
     const std::unique_ptr<double[]> depths(new double[count]);
-    const std::unique_ptr<TileSpans[]> tiles_of(new TileSpans[count]);
     std::vector<Visibility> visibility(count);
     lists.slot_begin.resize(count + 1);
-    std::atomic<std::int64_t> spans{0};
-    std::vector<SpanStore> stores;
-    for (std::int64_t k = 0; k < ranges; ++k) stores.push_back({kMaxPairs, spans, {}});
+    std::vector<std::vector<std::uint32_t>> tiles_of(ranges);
+    std::atomic<std::int64_t> kept{0};  // pairs whose tiles are
     std::atomic<bool> finite{kernels.all_finite(drawing.background, 3)};
-    parallel_for(drawing.threads, count, kGrain, [&](std::int64_t begin, std::int64_t end) {
+    parallel_for(drawing.threads, count, kRange, [&](std::int64_t begin, std::int64_t end) {
         if (!all_finite(kernels, gaussians, begin, end)) {
             finite = false;
             return;
         }
+        SpanStore store;
+        TileSpans spans[kRange];
+        std::uint32_t* const pairs_of = lists.slot_begin.data() + 1;
         kernels.project(drawing.view, gaussians, begin, end,
-                        {grid, drawing.splats.get(), depths.get(), visibility.data(), tiles_of.get(),
-                         lists.slot_begin.data() + 1, SpanStore::take, &stores[begin / kGrain]});
+                        {grid, drawing.splats.get(), depths.get(), visibility.data(), spans, pairs_of, SpanStore::take,
+                         &store});
+        const std::int64_t pairs = std::accumulate(pairs_of + begin, pairs_of + end, std::int64_t{0});
+        if (kept.fetch_add(pairs) + pairs > kMaxPairs) return;  // refused below: only their number still matters
+        tiles_of[begin / kRange] = tiles_in(spans, end - begin, pairs);
     });
     if (!finite) return std::nullopt;
 
@@ -144,14 +158,13 @@ std::optional<std::vector<Visibility>> project_all(const Gaussians& gaussians, D
         pairs += lists.slot_begin[i + 1];
         lists.slot_begin[i + 1] = static_cast<std::uint32_t>(pairs);
     }
-    pairs = std::max(pairs, spans.load());  // a row of tiles that a splat has no pixel in takes as much memory as one
     if (pairs > kMaxPairs)
         throw std::length_error("drawing needs " + std::to_string(pairs) + " pairs of a tile of " +
                                 std::to_string(kTileWidth) + "x" + std::to_string(kTileHeight) +
                                 " pixels and a splat, the limit is " + std::to_string(kMaxPairs) +
                                 "; are the scales too large for this camera?");
     const std::vector<std::uint32_t> order = depth_order(depths.get(), visibility.data(), count);
-    fill_tile_lists(order, tiles_of.get(), grid, drawing.threads, lists);
+    fill_tile_lists(order, tiles_of, grid, drawing.threads, lists);
     return visibility;
 }
 
@@ -174,13 +187,13 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
     const std::int64_t tiles = TileGrid(region).count();
     // Not initialised: the kernels write all that they read.
     drawing->ends.reset(new float[tiles * 2 * kTilePixels]);
-    drawing->drawn_blocks.reset(new Word[drawing->lists.pair_count * kernels.words]);
+    drawing->blocks.reset(new Word[drawing->lists.pair_count * kernels.words]);
     const Raster raster = raster_of(*drawing);
     std::vector<TileCounts> tile_counts(counts != nullptr ? tiles : 0);
     const ForwardTarget target{image,
                                alpha,
                                drawing->ends.get(),
-                               drawing->drawn_blocks.get(),
+                               drawing->blocks.get(),
                                tile_counts.data()};
     const auto draw_tile = counts != nullptr ? kernels.count_tile : kernels.forward_tile;
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
@@ -198,7 +211,7 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
     std::vector<double> tile_backgrounds(3 * tiles);
     const Raster raster = raster_of(drawing);
-    const BackwardSource source{drawing.ends.get(), drawing.drawn_blocks.get(), grad_image,
+    const BackwardSource source{drawing.ends.get(), drawing.blocks.get(), grad_image,
                                 grad_alpha};
     const BackwardTarget target{moments.get(), tile_backgrounds.data()};
     parallel_for(drawing.threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
@@ -211,7 +224,7 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     if (grad_image != nullptr && !is_whole_image(drawing.view)) add_outside(drawing, grad_image, total);
     for (int c = 0; c < 3; ++c) grad_background[c] = static_cast<float>(total[c]);
 
-    parallel_for(drawing.threads, gaussians.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
+    parallel_for(drawing.threads, gaussians.count, kRange, [&](std::int64_t begin, std::int64_t end) {
         drawing.kernels->project_backward(drawing.view, gaussians, begin, end, lists.slot_begin.data(), moments.get(),
                                           gradients);
     });

@@ -32,7 +32,7 @@ struct Drawing {
     std::unique_ptr<Splat[]> splats;  // [N], written where the Gaussian is visible
     TileLists lists;
     std::unique_ptr<float[]> ends;  // this and the next: see ForwardTarget
-    std::unique_ptr<Word[]> drawn_blocks;
+    std::unique_ptr<Word[]> blocks;
 };
 
 // Draws the region into image [height * width * 3] and alpha [height * width]; the rest of them shows the background.

@@ -35,24 +35,26 @@ inline Doubles round_up(Doubles v) {
 // there is none. An end that is NaN is taken for infinitely far.
 struct PixelRange {
     PixelRange(Doubles low, Doubles high, int begin, int end) {
-        const Doubles least = Doubles{} + double(begin), most = Doubles{} + double(end), start = low - 0.5, stop = high - 0.5;
+        const Doubles least = Doubles{} + double(begin), most = Doubles{} + double(end);
+        const Doubles start = low - 0.5, stop = high - 0.5;
         first = round_up(start > least ? (start < most ? start : most) : least);
         last = round_down(stop < most - 1.0 ? larger(stop, least - 1.0) : most - 1.0);
     }
     Doubles first, last;
 };
 
-// The spans of splats `first` to first + count - 1, of those that are visible. One for each row of tiles that an ellipse
-// spans, which may have no pixel in it.
-inline void find_tiles(const Footprints& from, const bool* visible, std::int64_t first, int count,
-                       const Projection& to) {
+// The spans of `count` splats, of those that are visible, and how many tiles are in them. A span for each row of tiles
+// that an ellipse reaches over, which may have no pixel in it.
+inline void find_tiles(const Projection& to, const Footprints& from, const bool* visible, int count, TileSpans* tiles,
+                       std::uint32_t* pair_counts) {
     constexpr double kHeight = kTileHeight, kWidth = kTileWidth;
     const TileGrid& grid = to.grid;
     alignas(64) double top[kBatch], bottom[kBatch];
     Span* place[kBatch];
     std::int64_t rows[kBatch], needed = 0;
     for (int at = 0; at < kBatch; at += kDoubles) {
-        const Doubles y = load(from.y + at), c = load(from.c + at), half = square_root(load_as_doubles(from.reach + at)) / c;
+        const Doubles y = load(from.y + at), radius = square_root(load_as_doubles(from.reach + at));
+        const Doubles half = radius / load(from.c + at);
         const PixelRange pixels(y - half, y + half, grid.region.top, grid.region.bottom);
         store(top + at, pixels.first);
         store(bottom + at, pixels.last);
@@ -63,13 +65,12 @@ inline void find_tiles(const Footprints& from, const bool* visible, std::int64_t
         needed += rows[lane];
     }
     for (int lane = count; lane < kBatch; ++lane) rows[lane] = 0;
-    Span* const memory = needed > 0 ? to.take(to.owner, needed) : nullptr;
+    Span* memory = to.take(to.store, needed);
     std::uint32_t pairs[kBatch] = {};
-    std::int64_t before = 0;
     for (int lane = 0; lane < count; ++lane) {
-        place[lane] = memory == nullptr ? nullptr : memory + before;
-        before += rows[lane];
-        to.tiles[first + lane] = {place[lane], static_cast<std::uint32_t>(memory == nullptr ? 0 : rows[lane])};
+        place[lane] = memory;
+        memory += rows[lane];
+        tiles[lane] = {place[lane], static_cast<std::uint32_t>(rows[lane])};
     }
 
     for (int at = 0; at < kBatch; at += kDoubles) {
@@ -101,13 +102,13 @@ inline void find_tiles(const Footprints& from, const bool* visible, std::int64_t
             store(last_tile, any ? start + round_down(pixels.last * (1.0 / kWidth)) : Doubles{});
             for (int lane = 0; lane < kDoubles; ++lane) {
                 if (row >= rows[at + lane]) continue;
-                const Span span{static_cast<std::uint32_t>(first_tile[lane]), static_cast<std::uint32_t>(last_tile[lane])};
+                Span& span = place[at + lane][row];
+                span = {static_cast<std::uint32_t>(first_tile[lane]), static_cast<std::uint32_t>(last_tile[lane])};
                 pairs[at + lane] += span.last + 1 - span.first;
-                if (memory != nullptr) place[at + lane][row] = span;
             }
         }
     }
-    for (int lane = 0; lane < count; ++lane) to.pairs[first + lane] = pairs[lane];
+    for (int lane = 0; lane < count; ++lane) pair_counts[lane] = pairs[lane];
 }
 
 }  // namespace
