@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from avatar.data.background import Colour
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
-from avatar.evaluation.protocol import Colour, Look
+from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
 from avatar.splat import splat

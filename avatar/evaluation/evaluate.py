@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from avatar.data.background import colour_name
 from avatar.data.loader import FrameLoader
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
@@ -31,7 +32,7 @@ from avatar.evaluation.networks import find_networks
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
 from avatar.evaluation.protocol import SHARED_CHOICES, Protocol, choose_protocols
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
-from avatar.evaluation.report import colour_name, frames_csv, table
+from avatar.evaluation.report import frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
 from avatar.files.atomic import write_atomically
 from avatar.files.video import video_writer
@@ -155,7 +156,7 @@ def background_notes(protocols: Sequence[Protocol], trained: Sequence[float]) ->
             notes.append(
                 f"{' and '.join(names)}: drawn over {colour_name(background)}, trained over {colour_name(trained)}; where "
                 "the avatar has learned to let its background through, the other colour shines through and counts as "
-                f"error; train with 'data.background={list(background)}' to compare by this protocol"
+                f"error; train with 'data.background={colour_name(background)}' to compare by this protocol"
             )
     return notes
 
