@@ -19,7 +19,13 @@ from data_prep.open import open_subject
 def run_reenact(arguments: Namespace) -> int:
     trained = open_trained(arguments.run, arguments.head)
     choices = Choices(
-        arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
+        arguments.transfer,
+        arguments.strength,
+        arguments.smoothing,
+        arguments.camera,
+        arguments.intrinsics,
+        arguments.neutral,
+        arguments.driver_neutral,
     )
     driver: Path = arguments.driver
     out = arguments.out or default_video(arguments.run, driver, choices)

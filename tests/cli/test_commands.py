@@ -124,6 +124,8 @@ def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, dr
         "smoothing": 1.5,
         "camera": "driver",
         "intrinsics": "target",
+        "neutral": None,
+        "driver_neutral": None,
     }
     assert recorded["driver"] == {"name": "driver", "frames": 8, "fps": 25.0, "has_cameras": True}
     assert recorded["intrinsics"]["shown"]["fx"] == recorded["intrinsics"]["avatar"]["fx"]

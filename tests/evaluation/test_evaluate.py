@@ -219,12 +219,12 @@ def test_protocols_measure_what_they_share_once(
 ) -> None:
     """Five protocols over three backgrounds: three renderings and, with one masked pair, four SSIM maps a frame."""
     calls: list[str] = []
-    for module, name in ((draw_module, "splat"), (measure_module, "ssim_map")):
+    for module, name in ((draw_module, "drawn"), (measure_module, "ssim_map")):
         real = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, real=real, name=name: (calls.append(name), real(*a))[1])
     evaluate(make_run(tmp_path / "run", subject), say=lambda _: None)
     worst = 3  # drawn again for the contact sheet
-    assert (calls.count("splat"), calls.count("ssim_map")) == (3 * len(TEST) + worst, 4 * len(TEST))
+    assert (calls.count("drawn"), calls.count("ssim_map")) == (3 * len(TEST) + worst, 4 * len(TEST))
 
 
 def test_jitter_can_be_recomputed_from_the_pictures(tmp_path: Path, subject: Subject) -> None:
@@ -285,7 +285,7 @@ def test_an_avatar_without_error_has_no_worst_frame(
 ) -> None:
     """Infinite PSNR is no figure: results stay valid JSON, and there is nothing to look at."""
     monkeypatch.setattr(
-        draw_module, "splat", lambda gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), None)
+        draw_module, "drawn", lambda gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), None)
     )
     monkeypatch.setattr(Frame, "composite", lambda self, colour: colour.expand(SIZE, SIZE, 3))
     run = make_run(tmp_path / "run", subject)
