@@ -11,6 +11,7 @@ import torch
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
+from avatar.commands.outputs import check_run_folder
 from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
@@ -35,7 +36,9 @@ def run_train(arguments: Namespace) -> int:
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder)
     load_config(overrides)  # a mistake in it before one in the folder
-    return train_new(source_of(arguments), overrides, run)
+    source = source_of(arguments)
+    check_run_folder(run, [source.folder, source.head, source.tracking])
+    return train_new(source, overrides, run)
 
 
 def default_run(folder: Path | None) -> Path:
