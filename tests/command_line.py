@@ -1,4 +1,4 @@
-"""`avatar ...` as a user types it, run in this process."""
+"""The command line, run in this process."""
 
 from __future__ import annotations
 

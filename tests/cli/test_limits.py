@@ -114,6 +114,6 @@ def test_an_avatar_file_larger_than_the_memory_is_refused(
 ) -> None:
     run = tmp_path / "run"
     avatar("train", tracked_folder, "--frame-offset", 1, "--out", run, *QUICK)
-    monkeypatch.setattr(memory, "available_memory", lambda: 2**16)
+    monkeypatch.setattr(memory, "available_bytes", lambda: 2.0**16)
     output = avatar("reenact", run, "--driver", tracked_folder, "--frame-offset", 1, status=1)
     assert re.search(r"opening .*avatar.safetensors needs about [0-9]+ MiB of memory, and 0 MiB are available", output)
