@@ -15,6 +15,7 @@ from avatar.commands.outputs import check_run_folder
 from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
+from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
@@ -52,6 +53,7 @@ def train_new(source: Source, overrides: list[str], run: Path) -> int:
     with locked(run):
         refuse_trained(run)
         subject, assets = open_subject(source, split_sizes(config))
+        check_divided(subject.split)
         perceptual = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
         avatar = new_avatar(assets, subject, config, perceptual.name)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))

@@ -49,7 +49,7 @@ def available_bytes() -> float:
     Infinite where the system does not say.
     """
     found = [float("inf")]
-    with suppress(OSError, ValueError, IndexError):
+    with suppress(OSError, ValueError, IndexError, StopIteration):
         lines = Path("/proc/meminfo").read_text().splitlines()
         found.append(1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")))
     if len(found) == 1:

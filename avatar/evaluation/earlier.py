@@ -25,7 +25,8 @@ def earlier_results(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
         earlier = json.loads((folder / "results.json").read_text(encoding="utf-8"))
         if _identity(earlier) != _identity(json.loads(json.dumps(results))):
             return {}
-        others = {name: entry for name, entry in earlier["protocols"].items() if name not in results["protocols"]}
+        asked = {*results["protocols"], *results["left_out"]}
+        others = {name: entry for name, entry in earlier["protocols"].items() if name not in asked}
         return {name: entry for name, entry in others.items() if _is_whole(folder / name, entry)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):  # none, or not of this program
         return {}

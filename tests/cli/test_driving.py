@@ -1,110 +1,110 @@
-"""Driving an avatar: whose neutral face, through whose lens."""
+"""Drivers as people have them: a single frame, a video of another frame rate; and what of them is recorded."""
 
 from __future__ import annotations
 
-import csv
 import json
-import re
 from pathlib import Path
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
-import tracked_folder as folders
-from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
+from avatar.cli import main
+from avatar.data.subject import Subject
+from avatar.runs.trained import load_avatar
+
 
 @pytest.fixture(scope="module")
-def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Trained on a video of 30 frames a second."""
     run = tmp_path_factory.mktemp("runs") / "run"
-    avatar("train", tracked_folder, "--frame-offset", 1, "--out", run, *SMALL, "trainer.iterations=4")
+    options = ["--frame-offset", "1", "--size", "40", "--fps", "30", *SMALL, "trainer.iterations=4"]
+    assert main(["train", str(tracked_folder), "--out", str(run), *options]) == 0
     return run
 
 
-@pytest.fixture(scope="module")
-def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tracked_folder(tmp_path_factory.mktemp("drivers") / "driver", frames=8, size=48, seed=5)
+@pytest.fixture
+def still(tmp_path: Path) -> Path:
+    return write_tracked_folder(tmp_path / "still", frames=1, size=48, seed=5)
 
 
-def distances(video: Path) -> list[str]:
-    return [row["distance"] for row in csv.DictReader(video.with_name(f"{video.stem}.distances.csv").open())]
-
-
-def test_neutral_faces_can_be_chosen_without_the_training_video(trained: Path, driver: Path, tmp_path: Path) -> None:
-    head = driver / "head_model"
-    options = ("--driver", driver, "--frame-offset", 1, "--head", head)
-    file = trained / "avatar.safetensors"
-    output = avatar("reenact", file, *options, "--neutral", 3, "--driver-neutral", "00005", "--out", tmp_path / "a.mp4")
-    assert "Neutral expression: frame 00005 of driver, frame 00003 of someone" in output
-    recorded = json.loads((tmp_path / "a.choices.json").read_text())
-    assert recorded["neutral_frames"] == {"driver": "00005", "someone": "00003"}
-    assert (recorded["choices"]["neutral"], recorded["choices"]["driver_neutral"]) == ("3", "00005")
-    avatar("reenact", file, *options, "--neutral", 3, "--driver-neutral", 6, "--out", tmp_path / "b.mp4")
-    avatar("reenact", file, *options, "--neutral", 4, "--driver-neutral", 5, "--out", tmp_path / "c.mp4")
-    avatar("reenact", file, *options, "--neutral", "00003", "--driver-neutral", 5, "--out", tmp_path / "d.mp4")
-    a, b, c, d = (distances(tmp_path / f"{name}.mp4") for name in "abcd")
-    assert a == d and a != b and a != c
-
-
-def test_the_drivers_own_neutral_frame_becomes_the_avatars(trained: Path, driver: Path, tmp_path: Path) -> None:
-    """In the frame that was chosen for the driver, the avatar has the face of the frame that was chosen for it."""
-    options = ("--driver", driver, "--frame-offset", 1, "--transfer", "relative")
-    avatar("reenact", trained, *options, "--neutral", 9, "--driver-neutral", 2, "--out", tmp_path / "a.mp4")
-    own = ("--driver", trained_video(trained), "--frame-offset", 1, "--transfer", "raw")
-    avatar("reenact", trained, *own, "--out", tmp_path / "raw.mp4")
-    assert float(distances(tmp_path / "a.mp4")[1]) == pytest.approx(float(distances(tmp_path / "raw.mp4")[8]), abs=2e-4)
-
-
-def trained_video(run: Path) -> Path:
-    return Path(json.loads((run / "run.json").read_text())["source"]["folder"])
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (
-            ("--neutral", "99"),
-            "the training of someone has no frame '99' to choose; there are 00001 to 00024 (24 frames)",
-        ),
-        (("--neutral", "30"), "the training of someone has no frame '30'"),  # held out
-        (("--driver-neutral", "x"), "driver has no frame 'x' to choose; there are 00001 to 00008 (8 frames)"),
-        (
-            ("--neutral", "3", "--transfer", "raw"),
-            "--neutral chooses what --transfer relative or pca measures from; raw",
-        ),
-        (("--driver-neutral", "3", "--transfer", "mean"), "--driver-neutral chooses what --transfer relative or pca"),
-    ],
-)
-def test_a_neutral_frame_that_cannot_be_is_refused_before_anything_is_drawn(
-    trained: Path, driver: Path, tmp_path: Path, options: tuple[str, ...], sentence: str
+def test_a_single_frame_drives_once_its_offset_is_given(
+    run: Path, still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    video = tmp_path / "out.mp4"
-    output = avatar("reenact", trained, "--driver", driver, "--frame-offset", 1, "--out", video, *options, status=1)
-    assert sentence in output and not list(tmp_path.iterdir())
+    command = ["reenact", str(run), "--driver", str(still), "--out", str(tmp_path / "still.mp4")]
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert (
+        "there are too few frames to find the offset between images and tracking (1 images, 1 tracking frames" in said
+    )
+    assert "lie on" not in said and "give --frame-offset (1 where images are numbered from 1" in said
+    for transfer in ("raw", "relative", "mean", "pca"):
+        assert main([*command, "--frame-offset", "1", "--transfer", transfer]) == 0
+        assert len(iio.imread(tmp_path / "still.mp4")) == 1
+    assert (
+        "note: there is a single frame: it can drive an avatar, and none can be trained on it"
+        in capsys.readouterr().out
+    )
 
 
-def test_the_help_says_what_a_frame_is_called_by() -> None:
-    assert "by its name or number (12 is 00012" in re.sub(r"\s+", " ", avatar("reenact", "--help"))
+def test_a_single_frame_makes_a_drive_file(still: Path, tmp_path: Path) -> None:
+    file = tmp_path / "still.npz"
+    assert main(["drive-file", str(still), "--frame-offset", "1", "--out", str(file)]) == 0
+    assert len(np.load(file)["expression"]) == 1
 
 
-def test_another_lens_is_warned_of_where_it_shows(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_single_frame_is_not_trained_on(still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", str(still), "--frame-offset", "1", "--out", str(tmp_path / "run")]) == 1
+    assert "the subject has 1 usable frame(s); at least 2 are needed, one to train" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "run.json").exists()
+    assert main(["check", str(still), "--frame-offset", "1", "--json"]) == 2
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    assert [one["check"] for one in findings if one["severity"] == "error"] == ["too-few-frames"]
+
+
+def test_the_frame_rate_of_a_video_stays_with_the_avatar(run: Path, tracked_folder: Path) -> None:
+    assert json.loads((run / "run.json").read_text())["source"]["fps"] == 30.0
+    assert load_avatar(run, tracked_folder / "head_model").recording.fps == 30.0
+    assert main(["eval", str(run), "--protocol", "strict"]) == 0
+    assert iio.immeta(run / "eval" / "truth_render_error.mp4")["fps"] == 30.0
+
+
+def test_the_frame_rate_of_a_driver_is_that_of_its_video_and_its_drive_file(
+    run: Path, tracked_folder: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(folders, "FOCAL", 1.4)  # half of the avatar's
-    other = write_tracked_folder(tmp_path / "other", frames=6, size=48)
-    options = ("--driver", other, "--frame-offset", 1, "--out", tmp_path / "out.mp4")
-    warned = avatar("reenact", trained, *options)
-    assert "Warning: the driver's camera sees 39.3 degrees, the avatar's 20.2" in warned
-    assert "--intrinsics target keeps its own lens" in warned
-    assert "Warning" not in avatar("reenact", trained, *options, "--intrinsics", "target")
-    assert "Warning" not in avatar("reenact", trained, *options, "--camera", "target")
+    folder = write_tracked_folder(tmp_path / "driver", frames=8, size=48, seed=5)
+    reading = ["--frame-offset", "1", "--fps", "60"]
+    file, video = tmp_path / "driver.npz", tmp_path / "driver.mp4"
+    assert main(["drive-file", str(folder), *reading, "--out", str(file)]) == 0
+    assert float(np.load(file)["fps"]) == 60.0
+    for driver in ([str(folder), *reading], [str(file)]):
+        assert main(["reenact", str(run), "--driver", *driver, "--out", str(video)]) == 0
+        meta = iio.immeta(video)
+        assert meta["fps"] == 60.0 and meta["duration"] == pytest.approx(8 / 60, abs=0.02)
+        assert json.loads((tmp_path / "driver.choices.json").read_text())["driver"]["fps"] == 60.0
+    assert main(["prepare", str(folder), *reading, "--out", str(tmp_path / "prepared")]) == 0
+    assert Subject.open(tmp_path / "prepared").fps == 60.0
 
 
-@pytest.mark.parametrize(("longer", "warns"), [(1.09, False), (0.91, False), (1.11, True), (0.89, True)])
-def test_a_tenth_of_the_focal_length_is_no_other_lens(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, longer: float, warns: bool
+def test_eval_verifies_what_it_has_written(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(run), "--verify", "--protocol", "strict", "--protocol", "hypergaussians"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("PSNR and SSIM of 6 frames verified from their pictures") == 2
+    entries = json.loads((run / "eval" / "results.json").read_text())["protocols"]
+    assert all(entry["verified"]["frames"] == 6 for entry in entries.values())
+    assert len(list((run / "eval" / "strict" / "renders").glob("*.png"))) == 6
+
+
+def test_eval_that_does_not_agree_with_its_pictures_fails(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(folders, "FOCAL", longer * folders.FOCAL)
-    other = write_tracked_folder(tmp_path / "other", frames=4, size=64)  # pictures of another size are not another lens
-    output = avatar("reenact", trained, "--driver", other, "--frame-offset", 1, "--out", tmp_path / "out.mp4")
-    assert ("Warning: the driver's camera sees" in output) == warns
+    from avatar.evaluation import measure
+
+    real = measure.ssim_map
+    monkeypatch.setattr(measure, "ssim_map", lambda *images: real(*images) * 0.9999)
+    assert main(["eval", str(run), "--verify", "--protocol", "strict"]) == 1
+    error = capsys.readouterr().err
+    assert "avatar: ssim of frame 00025 is 0." in error and "strict/frames.csv, but its pictures give 0." in error
+    assert "verified" not in json.loads((run / "eval" / "results.json").read_text())["protocols"]["strict"]
