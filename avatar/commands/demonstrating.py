@@ -33,13 +33,13 @@ def run_demo(arguments: Namespace) -> int:
     actor, driver, run = out / "actor", out / "driver", out / "run"
     check_folder_output(out)
     check_outputs([out, run], [])
+    begun = (run / RUN_FILE).is_file() and list_checkpoints(run / "checkpoints")
+    if begun and read_run_info(run).source.folder.resolve() != actor.resolve():
+        raise UserError(f"{run} is a run of another video; choose another folder for the demo")
     if not actor.is_dir():
         make_subject(actor, 500, 192, 1, "speech")
     if not driver.is_dir():
         make_subject(driver, 100, 192, 2, "speech")
-    begun = (run / RUN_FILE).is_file() and list_checkpoints(run / "checkpoints")
-    if begun and read_run_info(run).source.folder.resolve() != actor.resolve():
-        raise UserError(f"{run} is a run of another video; choose another folder for the demo")
     status = resume_run(run) if begun else train_new(Source(actor, actor / "head_model"), RECIPE, run)
     if status != OK:
         return status
