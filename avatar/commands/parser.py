@@ -63,6 +63,9 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the preset's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on from RUN's newest checkpoint")
+    train.add_argument(
+        "--refine", type=int, metavar="N", help="first improve the tracking N times through a shorter training's avatar"
+    )
     train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
@@ -75,6 +78,11 @@ def build_parser() -> argparse.ArgumentParser:
         help="only this protocol, by name or as FILE.yaml; may be repeated",
     )
     evaluate.add_argument("--frames", action="store_true", help="write every render, truth and mask as PNG too")
+
+    refine = commands.add_parser("refine", help="improve the tracking of a run's video through its avatar")
+    add_run(refine)
+    add_folder(refine)
+    refine.add_argument("--out", type=Path, metavar="SUBJECT", help="a new tracked folder (default: RUN/refined/NAME)")
 
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
     add_run(report)

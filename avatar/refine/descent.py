@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -57,40 +58,41 @@ def curvature(likeness: Likeness, problem: Problem, level: int) -> Float[Tensor,
     return OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian.T @ jacobian) / (3.0 * target.area)
 
 
+class Descent(NamedTuple):
+    moves: Float[Tensor, " F"]
+    picture: Float[Tensor, "h w 3"]  # with them, at full size
+
+
 def descend(
-    likeness: Likeness,
-    problem: Problem,
-    factors: Sequence[Float[Tensor, "F F"]],
-    steps: Sequence[int],
-) -> Float[Tensor, " F"]:
+    likeness: Likeness, problem: Problem, factors: Sequence[Float[Tensor, "F F"]], steps: Sequence[int]
+) -> Descent:
     """The moves of a frame that minimise misfit + half their squared length, within their bounds.
 
     factors   lower Cholesky factors of the curvature with the prior's, by level
     steps     of each level at most; the coarsest, which is the last, comes first
     """
-    moves = torch.zeros(len(problem.freedom.index))
+    found = Descent(torch.zeros(len(problem.freedom.index)), problem.targets[0].picture)
     for level in reversed(range(len(problem.targets))):
-        moves = _descend_level(likeness, problem, level, moves, factors[level], steps[level])
-    return moves
+        found = _descend_level(likeness, problem, level, found.moves, factors[level], steps[level])
+    return found
 
 
 def _descend_level(
     likeness: Likeness, problem: Problem, level: int, moves: Tensor, factor: Tensor, steps: int
-) -> Float[Tensor, " F"]:
+) -> Descent:
     low, high = problem.freedom.bounds(problem.frame)
     target, unit, index = problem.targets[level], problem.freedom.unit, problem.freedom.index
 
-    def evaluate(moves: Tensor) -> tuple[float, Tensor]:
-        misfit, gradient = likeness.fit(problem.freedom.values(problem.frame, moves), problem.given, target)
-        return misfit + 0.5 * float(moves @ moves), gradient[index] * unit + moves
+    def evaluate(moves: Tensor) -> tuple[float, Tensor, Tensor]:
+        fit = likeness.fit(problem.freedom.values(problem.frame, moves), problem.given, target)
+        return fit.misfit + 0.5 * float(moves @ moves), fit.gradient[index] * unit + moves, fit.picture
 
     memory: deque[tuple[Tensor, Tensor]] = deque(maxlen=MEMORY)
-    value, gradient = evaluate(moves)
+    value, gradient, picture = evaluate(moves)
     length = 1.0
     for _ in range(steps):
-        direction = _quasi_newton(gradient, memory, factor)
-        trial = torch.minimum(torch.maximum(moves - length * direction, low), high)
-        new_value, new_gradient = evaluate(trial)
+        trial = torch.minimum(torch.maximum(moves - length * _quasi_newton(gradient, memory, factor), low), high)
+        new_value, new_gradient, new_picture = evaluate(trial)
         step, change = trial - moves, new_gradient - gradient
         if float(step @ change) > 1e-8 * float(step @ step):
             memory.append((step, change))
@@ -98,10 +100,10 @@ def _descend_level(
             length *= SHRINK
             continue
         gain = value - new_value
-        moves, value, gradient, length = trial, new_value, new_gradient, 1.0
+        moves, value, gradient, picture, length = trial, new_value, new_gradient, new_picture, 1.0
         if gain < ENOUGH * new_value:
             break
-    return moves
+    return Descent(moves, picture)
 
 
 def _quasi_newton(

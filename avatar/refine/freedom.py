@@ -97,5 +97,3 @@ def _white_noise(second_differences: Float[Tensor, "T P"]) -> Float[Tensor, " P"
     By the median of the absolute values, so that quick movements do not count as noise.
     """
     return 1.4826 * second_differences.abs().median(dim=0).values / math.sqrt(6.0)
-
-

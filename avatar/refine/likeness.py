@@ -17,7 +17,7 @@ from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor
 from torch.nn.functional import huber_loss, normalize
 
-from avatar.metrics import bounding_box
+from avatar.losses.metrics import bounding_box, psnr
 from avatar.model import Avatar
 from avatar.refine.motion import HeadPose, head_params, moved_pose
 from avatar.splat import splat
@@ -38,6 +38,7 @@ class Target(NamedTuple):
     camera: Camera
     box: tuple[slice, slice]  # rows and columns that are compared
     picture: Float[Tensor, "h w 3"]  # of the box
+    mask: Float[Tensor, "h w"]  # of the head
     area: float  # of the head, pixels
     blur: float  # for the splatter: as much of the scene as the full size's
 
@@ -59,8 +60,16 @@ def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Tar
             for side, length in zip(box, head.shape, strict=True)
         )
         camera = frame.camera.resized(width, height)
-        crop = small[rows, columns].contiguous()
-        made.append(Target(camera, (rows, columns), crop, float(head.sum()), BLUR * (width / frame.camera.width) ** 2))
+        made.append(
+            Target(
+                camera=camera,
+                box=(rows, columns),
+                picture=small[rows, columns].contiguous(),
+                mask=head[rows, columns].contiguous(),
+                area=float(head.sum()),
+                blur=BLUR * (width / frame.camera.width) ** 2,
+            )
+        )
     return made
 
 
@@ -70,11 +79,17 @@ def _resized(image: Tensor, width: int, height: int) -> Tensor:
     return torch.from_numpy(cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA))
 
 
+def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> float:
+    """Of the head alone, dB."""
+    return float(psnr(picture.clamp(0.0, 1.0), target.picture, target.mask))
+
+
 class Fit(NamedTuple):
     """Of one frame at one tracking."""
 
     misfit: float  # half the sum of squares, in observations
     gradient: Float[Tensor, " P"]  # of the misfit in the frame's values
+    picture: Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -108,12 +123,13 @@ class Likeness:
         seen_from = eye.detach().requires_grad_()
         colours = sh_colours(gaussians.sh, normalize(gaussians.means - seen_from, dim=-1), self.avatar.config.sh_degree)
         flat = ((colours - 0.5) / C0)[:, None]
-        misfit = self._misfit(self._draw(drawn, camera, flat, target), target)
+        picture = self._draw(drawn, camera, flat, target)
+        misfit = self._misfit(picture, target)
         sources = (values, drawn.means, drawn.quats, seen_from)
         by_values, by_means, by_quats, by_eye = torch.autograd.grad(misfit, sources)
         by_pose = camera_gradient(drawn, camera, by_means, by_quats)
         (through_pose,) = torch.autograd.grad((*pose, eye), values, (*by_pose, by_eye))
-        return Fit(float(misfit.detach()), by_values + through_pose)
+        return Fit(float(misfit.detach()), by_values + through_pose, picture.detach())
 
     def _draw(self, gaussians: Gaussians, pose: HeadPose, sh: Tensor, target: Target) -> Float[Tensor, "h w 3"]:
         camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)

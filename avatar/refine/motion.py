@@ -67,9 +67,7 @@ def head_params(values: Float[Tensor, " P"]) -> HeadParams:
     return HeadParams(values[EXPRESSION], jaw, torch.cat((left, right)), values[EYELIDS], neck)
 
 
-def moved_pose(
-    values: Float[Tensor, "*B P"], given: HeadPose, centre: Float[Tensor, 3]
-) -> HeadPose:
+def moved_pose(values: Float[Tensor, "*B P"], given: HeadPose, centre: Float[Tensor, 3]) -> HeadPose:
     """The given head pose turned about `centre` (the head's, in its own space, metres) and shifted; differentiable."""
     turn, shift = rotation(values[..., TURN]), values[..., SHIFT]
     pivot = (given.R @ centre) + given.t

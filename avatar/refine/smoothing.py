@@ -34,7 +34,7 @@ def smoothed(
     numbers   of the frames in the video: frames that are not neighbours there are not tied to each other
     """
     differences = second_differences(numbers)
-    if differences.shape[0] == 0:
+    if not len(_middles(numbers)):
         return moves
     root = calm.double().sqrt()
     strengths, basis = torch.linalg.eigh(curvature.double() / root[:, None] / root)
