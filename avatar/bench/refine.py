@@ -207,8 +207,8 @@ def recovered(rows: Sequence[Row]) -> float:
 def report(rows: Sequence[Row], config: Config) -> str:
     head = f"{'PSNR':>7}{'SSIM':>8}{'LPIPS':>8}{'mouth':>7}"
     lines = [
-        f"Held-out frames, head alone, {config.trainer.iterations} steps. Driven by the tracking that was trained on (own), "
-        "by what that was before refining, and by the given one",
+        f"Held-out frames, head alone, {config.trainer.iterations} steps. Driven by the tracking that was trained on "
+        "(own), by what that was before refining, and by the given one",
         f"{'trained on':>20} {'own'.center(30)} {'before'.center(30)} {'given'.center(30)}   vertices, mm and px  outside",
         f"{'':>20} {head} {head} {head}",
     ]
