@@ -16,7 +16,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from avatar.errors import UserError
 from data_prep import avatar_track
 from data_prep.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
 from data_prep.tracked_folder import TrackedFolder
-from data_prep.tracking import FrameTrack
+from data_prep.tracking import FrameTrack, Tracking
 from data_prep.transforms import read_json
 
 REFINEMENT_FILE, GIVEN_FILE = "refinement.json", "given.npz"
@@ -61,8 +61,15 @@ def open_folder(folder: Path) -> TrackedFolder:
         division=division,
         notes=(*tracked.notes, note),
         refinement=refinement,
-        read_given=lambda complain: avatar_track.read_tracks(folder, GIVEN_FILE, complain),
+        read_given=lambda complain: _read_given(folder, files.tracking, complain),
     )
+
+
+def _read_given(folder: Path, tracked: Mapping[int, Path], complain: Callable[[str], object]) -> Tracking:
+    given = avatar_track.read_tracks(folder, GIVEN_FILE, complain)
+    if missing := sorted(tracked.keys() - given.frames.keys()):
+        complain(f"{folder / GIVEN_FILE} lacks {len(missing)} of the frames, the first is {missing[0]}; refine again")
+    return given
 
 
 def check_target(target: Path) -> None:

@@ -20,6 +20,7 @@ DEGREE = math.pi / 180
 # Standard deviations of a tracker's error that are assumed at least. Depth hardly shows in the picture, so that a blurred
 # avatar's preference for a size would move it without bound: it is trusted more.
 TURN_UNIT, SHIFT_UNIT, DEPTH_UNIT, NECK_UNIT = 0.5 * DEGREE, 1e-3, 0.5e-3, 0.5 * DEGREE
+HEAD_REACH = 20.0  # of these: a head that is farther off was not tracked
 SPREAD_SHARE = 0.5  # of a coefficient's standard deviation over the training frames
 # Trackers err smoothly: on real people a fifth of the error comes and goes from frame to frame, and that fifth can be seen.
 JITTER_SHARE = 0.2
@@ -76,14 +77,16 @@ def find_freedom(tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3])
     least = given.new_zeros(given.shape[1])
     least[TURN], least[SHIFT], least[NECK] = TURN_UNIT, SHIFT_UNIT, NECK_UNIT
     least[SHIFT.stop - 1] = DEPTH_UNIT
-    seen = _white_noise(motion[inner]) / JITTER_SHARE if inner else motion.new_zeros(motion.shape[1])
+    seen = _white_noise(motion[inner]) / JITTER_SHARE
     head = slice(POSE.start, NECK.stop)
     unit[head] = least[head].maximum(seen[head].to(unit))
+
+    lowest, highest = training.amin(dim=0).minimum(given), training.amax(dim=0).maximum(given)
+    lowest[:, head] = given[:, head] - HEAD_REACH * unit[head]
+    highest[:, head] = given[:, head] + HEAD_REACH * unit[head]
     index = (unit > 0).nonzero()[:, 0]
     unit = unit[index]
 
-    lowest, highest = training.amin(dim=0).minimum(given), training.amax(dim=0).maximum(given)
-    lowest[:, head], highest[:, head] = -torch.inf, torch.inf
     weight = torch.full_like(typical, FACE_CALM)
     weight[head] = HEAD_CALM
     scale = (typical[index] / unit).clamp(min=LEAST_ACCELERATION)
@@ -91,9 +94,13 @@ def find_freedom(tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3])
     return Freedom(given, lowest, highest, index, unit, motion[:, index] / unit, calm)
 
 
-def _white_noise(second_differences: Float[Tensor, "T P"]) -> Float[Tensor, " P"]:
-    """Standard deviation of white noise with these second differences, whose variance is 1 + 4 + 1 times its own.
+def _white_noise(accelerations: Float[Tensor, "T P"]) -> Float[Tensor, " P"]:
+    """Standard deviation of what comes and goes from frame to frame in a motion with these second differences.
 
-    By the median of the absolute values, so that quick movements do not count as noise.
+    From the fourth differences, in which smooth motion hardly shows and whose variance is 1 + 16 + 36 + 16 + 1 times that
+    of white noise; by the median of their absolute values, so that quick movements do not count as noise.
     """
-    return 1.4826 * second_differences.abs().median(dim=0).values / math.sqrt(6.0)
+    if len(accelerations) < 3:
+        return accelerations.new_zeros(accelerations.shape[1])
+    fourth = accelerations[2:] - 2.0 * accelerations[1:-1] + accelerations[:-2]
+    return 1.4826 * fourth.abs().median(dim=0).values / math.sqrt(70.0)

@@ -84,10 +84,17 @@ def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> float:
     return float(psnr(picture.clamp(0.0, 1.0), target.picture, target.mask))
 
 
+class Measure(NamedTuple):
+    """Of one frame at one tracking."""
+
+    misfit: float
+    psnr: float  # of the head alone, dB
+
+
 class Fit(NamedTuple):
     """Of one frame at one tracking."""
 
-    misfit: float  # half the sum of squares, in observations
+    misfit: float
     gradient: Float[Tensor, " P"]  # of the misfit in the frame's values
     picture: Float[Tensor, "h w 3"]
 
@@ -107,9 +114,10 @@ class Likeness:
             gaussians = self.avatar(head_params(values))
             return self._draw(gaussians, pose, gaussians.sh, target)
 
-    def misfit(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> float:
-        """As `fit`, without its gradient."""
-        return float(self._misfit(self.picture(values, given, target), target))
+    def measure(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Measure:
+        """Without a gradient."""
+        picture = self.picture(values, given, target)
+        return Measure(float(misfit(picture, target)), head_psnr(picture, target))
 
     def fit(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Fit:
         """How far the avatar's picture is from the target's, and how that changes with the values."""
@@ -124,21 +132,23 @@ class Likeness:
         colours = sh_colours(gaussians.sh, normalize(gaussians.means - seen_from, dim=-1), self.avatar.config.sh_degree)
         flat = ((colours - 0.5) / C0)[:, None]
         picture = self._draw(drawn, camera, flat, target)
-        misfit = self._misfit(picture, target)
+        error = misfit(picture, target)
         sources = (values, drawn.means, drawn.quats, seen_from)
-        by_values, by_means, by_quats, by_eye = torch.autograd.grad(misfit, sources)
+        by_values, by_means, by_quats, by_eye = torch.autograd.grad(error, sources)
         by_pose = camera_gradient(drawn, camera, by_means, by_quats)
         (through_pose,) = torch.autograd.grad((*pose, eye), values, (*by_pose, by_eye))
-        return Fit(float(misfit.detach()), by_values + through_pose, picture.detach())
+        return Fit(error.item(), by_values + through_pose, picture.detach())
 
     def _draw(self, gaussians: Gaussians, pose: HeadPose, sh: Tensor, target: Target) -> Float[Tensor, "h w 3"]:
         camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)
         drawing = splat(gaussians._replace(sh=sh), camera, self.background, region=target.box, blur=target.blur)
         return drawing.image[target.box]
 
-    def _misfit(self, image: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
-        total = huber_loss(image, target.picture, delta=HUBER_DELTA, reduction="sum")
-        return OBSERVATIONS / PIXEL_SIGMA**2 * total / (3.0 * target.area)
+
+def misfit(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
+    """Half the sum of squared errors, in observations; of large errors less."""
+    total = huber_loss(picture, target.picture, delta=HUBER_DELTA, reduction="sum")
+    return OBSERVATIONS / PIXEL_SIGMA**2 * total / (3.0 * target.area)
 
 
 @torch.no_grad()

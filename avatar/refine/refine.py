@@ -26,7 +26,7 @@ from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
 from avatar.refine.descent import Problem, curvature, descend
 from avatar.refine.freedom import Freedom, find_freedom
-from avatar.refine.likeness import Likeness, Target, head_psnr, targets
+from avatar.refine.likeness import Likeness, Measure, Target, head_psnr, targets
 from avatar.refine.motion import HeadPose, moved_tracks
 from avatar.refine.parallel import in_order
 from avatar.refine.smoothing import smoothed
@@ -36,6 +36,7 @@ COARSEST = 112  # pixels of width: a coarser picture shows nothing that a finer 
 COARSE_STEPS, FINE_STEPS = 3, 5
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
+UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
 PROGRESS_FORMAT = 1  # grows with every change of what refinement finds
 
 
@@ -46,13 +47,13 @@ class Refined:
     tracks: dict[str, Tensor]  # as `Recording.tracks`
     before: Float[np.ndarray, " T"]
     after: Float[np.ndarray, " T"]
-    kept: Bool[np.ndarray, " T"]  # frames that fitted no better, and so kept the tracking that they had
+    kept: Bool[np.ndarray, " T"]  # frames whose pictures fitted no better, and so kept the tracking that they had
 
 
 class _Found(NamedTuple):
     moves: Float[Tensor, " F"]
-    before: float
-    after: float
+    before: Measure
+    psnr: float  # with the moves
 
 
 def refine_subject(
@@ -79,14 +80,14 @@ def refine_subject(
         with tqdm(total=len(subject), initial=len(moves), desc="refine", unit="frame", dynamic_ncols=True) as bar:
             for found in in_order(lambda frame: work.refine(frame, factors), todo):
                 moves.append(found.moves)
-                figures.append((found.before, found.after))
+                figures.append((*found.before, found.psnr))
                 bar.update(1)
-                bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)), refresh=False)
+                bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
                 if len(moves) % SAVE_EVERY == 0 or interrupted():
                     _write_progress(progress, key, moves, figures)
                 if interrupted():
                     return None
-        result = work.finish(torch.stack(moves), factors[0] @ factors[0].T, np.array(figures)[:, 0])
+        result = work.finish(torch.stack(moves), factors[0] @ factors[0].T, np.array(figures)[:, :2])
     with suppress(OSError):
         progress.unlink()
     return result
@@ -154,36 +155,34 @@ class _Work:
     def refine(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> _Found:
         made = self.targets(frame, self.levels)
         if made is None:
-            return _Found(torch.zeros(len(self.freedom.index)), float("nan"), float("nan"))
+            return _Found(torch.zeros(len(self.freedom.index)), UNSEEN, UNSEEN.psnr)
         problem = Problem(self.pose(frame), made, frame, self.freedom)
         steps = [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)]
         found = descend(self.likeness, problem, factors, steps)
-        given = self.likeness.picture(self.freedom.given[frame], problem.given, made[0])
-        return _Found(found.moves, head_psnr(given, made[0]), head_psnr(found.picture, made[0]))
+        before = self.likeness.measure(self.freedom.given[frame], problem.given, made[0])
+        return _Found(found.moves, before, head_psnr(found.picture, made[0]))
 
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, and keep the given tracking of frames that then fit no better than with it."""
         freedom, numbers = self.freedom, [record.tracking for record in self.subject.manifest.frames]
         moves = smoothed(moves, matrix, freedom.acceleration, freedom.calm, numbers)
         values = freedom.all_values(moves)
-        after = np.array(list(in_order(lambda frame: self._psnr(frame, values[frame]), range(len(values)))))
-        kept = ~(after >= before)
+        after = np.array(list(in_order(lambda frame: self.measure(frame, values[frame]), range(len(values)))))
+        kept = ~(after[:, 0] <= before[:, 0])
         after[kept] = before[kept]
         tracks = moved_tracks(self.tracks, values, freedom.changed(), self.likeness.centre)
         keep = torch.from_numpy(kept)
         for name, given in self.tracks.items():
             if name != "shape":
                 tracks[name] = torch.where(keep.reshape(-1, *[1] * (given.ndim - 1)), given, tracks[name])
-        return Refined(tracks, before, after, kept)
+        return Refined(tracks, before[:, 1], after[:, 1], kept)
 
-    def _psnr(self, frame: int, values: Tensor) -> float:
+    def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:
         made = self.targets(frame, 1)
-        if made is None:
-            return float("nan")
-        return head_psnr(self.likeness.picture(values, self.pose(frame), made[0]), made[0])
+        return UNSEEN if made is None else self.likeness.measure(values, self.pose(frame), made[0])
 
 
-def _read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list[tuple[float, float]]]:
+def _read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list[tuple[float, ...]]]:
     """Moves and figures of the frames that are done; none from a file that is damaged or of something else."""
     try:
         with safe_open(path, framework="pt") as file:
@@ -192,11 +191,11 @@ def _read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], lis
             moves, figures = file.get_tensor("moves"), file.get_tensor("figures")
     except (SafetensorError, OSError, ValueError):
         return [], []
-    if moves.shape[1:] != (values,) or figures.shape != (len(moves), 2):
+    if moves.shape[1:] != (values,) or figures.shape != (len(moves), 3):
         return [], []
-    return list(moves), [(before, after) for before, after in figures.tolist()]
+    return list(moves), [tuple(row) for row in figures.tolist()]
 
 
-def _write_progress(path: Path, key: str, moves: list[Tensor], figures: list[tuple[float, float]]) -> None:
+def _write_progress(path: Path, key: str, moves: list[Tensor], figures: list[tuple[float, ...]]) -> None:
     tensors = {"moves": torch.stack(moves), "figures": torch.tensor(figures, dtype=torch.float64)}
     write_atomically(path, serialize(tensors, metadata={"key": key}))
