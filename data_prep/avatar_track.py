@@ -173,9 +173,10 @@ def _tracks(
     bad: dict[int, str] = {}
     for row, number in enumerate(arrays["number"].tolist()):
         try:
-            values = {name: vector(arrays[name][row], name) for name in ARRAYS}
+            values: dict[str, Any] = {name: vector(arrays[name][row], name) for name in ARRAYS}
+            values["R"] = nearest_rotation(values["R"].reshape(3, 3), "R")
             frames[number] = FrameTrack(
-                **values | {"R": nearest_rotation(values["R"].reshape(3, 3), "R")},
+                **values,
                 shape=vector(arrays["shape"], "shape"),
                 intrinsics=np.array(info.intrinsics),
                 size=(info.width, info.height),

@@ -118,7 +118,7 @@ class Trial:
         config, subject = self.config, replace(self.subject, recording=recording)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(self.assets, subject.identity, config.model)
-        train(avatar, subject, config, self.scratch / name, choose_perceptual(config.trainer, lambda _: None))
+        train(avatar, subject, config, self.scratch / name, choose_perceptual(config.trainer, print))
         return avatar.eval()
 
     def refined(self, avatar: Avatar, recording: Recording) -> tuple[Recording, float]:
