@@ -25,6 +25,7 @@ PROBE = 0.1  # units that a value is moved by to see what it does
 MEMORY = 5  # steps that the frame's own curvature is learned from
 SHRINK = 0.35  # of a step that made things worse
 ENOUGH = 1e-3  # relative gain of a step after which the next would not show
+COARSE_ENOUGH = 1e-2  # where a finer picture follows
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def _descend_level(
             continue
         gain = value - new_value
         moves, value, gradient, picture, length = trial, new_value, new_gradient, new_picture, 1.0
-        if gain < ENOUGH * new_value:
+        if gain < (COARSE_ENOUGH if level else ENOUGH) * new_value:
             break
     return Descent(moves, picture)
 
