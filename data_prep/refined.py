@@ -164,13 +164,17 @@ def _link(source: Path, target: Path) -> None:
 def _info(subject: Subject, head_path: str) -> TrackingInfo:
     manifest = subject.manifest
     left_out = {int(match[0]): why for name, why in manifest.left_out.items() if (match := re.search(r"\d+$", name))}
+    focal, is_assumed = "that of the tracking before", False
+    if manifest.format == avatar_track.NAME:
+        before = avatar_track.read_info(Path(manifest.source))
+        focal, is_assumed = before.focal, before.focal_is_assumed
     return TrackingInfo(
         fps=manifest.fps,
         width=manifest.width,
         height=manifest.height,
         intrinsics=manifest.intrinsics,
-        focal="that of the tracking before",
-        focal_is_assumed=False,
+        focal=focal,
+        focal_is_assumed=is_assumed,
         head_path=head_path,
         head_fingerprint=manifest.head_fingerprint,
         source={"folder": manifest.source, "format": manifest.format, "data_hash": manifest.data_hash},

@@ -66,6 +66,9 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument(
         "--refine", type=int, metavar="N", help="first improve the tracking N times through a shorter training's avatar"
     )
+    train.add_argument(
+        "--minutes", type=float, metavar="M", help="with --refine: about what all of it may take, by fewer steps"
+    )
     train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")

@@ -7,6 +7,7 @@ interruption loses a few seconds. What is found does not depend on the number of
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,7 +22,9 @@ from safetensors.torch import save as serialize
 from torch import Tensor
 from tqdm import tqdm
 
+from avatar.compute.native import thread_count
 from avatar.data.subject import Subject
+from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
 from avatar.refine.descent import Problem, curvature, descend
@@ -36,6 +39,7 @@ COARSEST = 112  # pixels of width: a coarser picture shows nothing that a finer 
 COARSE_STEPS, FINE_STEPS = 3, 5
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
+TIMED_FRAMES = 4  # for an estimate
 UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
 PROGRESS_FORMAT = 1  # grows with every change of what refinement finds
 
@@ -67,7 +71,7 @@ def refine_subject(
     """Refine all frames at `size` pixels of width; None after an interruption (Ctrl-C or SIGTERM).
 
     progress   file for what is done so far: the next call with the same avatar and subject goes on from it
-    Raises UserError for a frame that cannot be read and when the disk refuses.
+    Raises UserError for a frame that cannot be read, when no training frame shows a head and when the disk refuses.
     """
     with frozen(avatar), interruption() as interrupted:
         work = _Work(avatar, subject, size, background)
@@ -91,6 +95,24 @@ def refine_subject(
     with suppress(OSError):
         progress.unlink()
     return result
+
+
+def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, background: Float[Tensor, 3]) -> float:
+    """About how long `refine_subject` would take, from a few frames; an avatar that has not been trained will do.
+
+    Raises UserError as `refine_subject`.
+    """
+    workers = thread_count()
+    with frozen(avatar):
+        work = _Work(avatar, subject, size, background)
+        frames = work.samples(max(TIMED_FRAMES, workers))
+        begin = time.perf_counter()
+        factors = [torch.linalg.cholesky(matrix) for matrix in work.curvatures(workers)]
+        middle = time.perf_counter()
+        list(in_order(lambda frame: work.refine(frame, factors), frames))
+        list(in_order(lambda frame: work.measure(frame, work.freedom.given[frame]), frames))
+        end = time.perf_counter()
+    return (middle - begin) * SAMPLES / workers + (end - middle) * len(subject) / len(frames)
 
 
 @contextmanager
@@ -137,11 +159,18 @@ class _Work:
     def targets(self, frame: int, levels: int) -> list[Target] | None:
         return targets(self.subject.frame(frame, self.size), self.likeness.background, levels)
 
-    def curvatures(self) -> list[Float[Tensor, "F F"]]:
-        """By level: the mean over a few training frames, with the prior's, which is one."""
+    def samples(self, count: int) -> list[int]:
+        """Training frames, evenly spread; fewer where there are fewer."""
         train = self.subject.split.train
-        chosen = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, SAMPLES).round().astype(int))]
-        sampled = [found for found in in_order(self._curvatures, chosen) if found is not None]
+        return [train[i] for i in np.unique(np.linspace(0, len(train) - 1, count).round().astype(int))]
+
+    def curvatures(self, count: int = SAMPLES) -> list[Float[Tensor, "F F"]]:
+        """By level: the mean over a few training frames, with the prior's, which is one."""
+        sampled = [found for found in in_order(self._curvatures, self.samples(count)) if found is not None]
+        if not sampled:
+            raise UserError(
+                f"no head is to be seen in the training frames of {self.subject.recording.name}: look at its masks"
+            )
         prior = torch.eye(len(self.freedom.index))
         return [torch.stack(level).mean(dim=0) + prior for level in zip(*sampled, strict=True)]
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-import signal
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
+from avatar.commands import plan, rounds
+from avatar.data.source import Source
 from avatar.refine import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 
@@ -154,6 +157,66 @@ def test_training_in_rounds(folder: Path, tmp_path: Path) -> None:
     assert "holds a run already" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
 
 
+def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    words = ["train", folder, "--out", run, "--frame-offset", 1, *QUICK, "trainer.iterations=1000"]
+    assert "--minutes goes with --refine" in avatar(*words, "--minutes", 2, status=1)
+    assert "must be a positive number" in avatar(*words, "--refine", 1, "--minutes", 0, status=1)
+    output = avatar(*words, "--refine", 1, "--minutes", 0.001, status=1)
+    assert "too little for --refine 1 of 14 frames" in output and not (run / "rounds").exists()
+
+    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 4.0)
+    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.5))
+    monkeypatch.setattr(plan, "LEAST_STEPS", 5)
+    output = avatar(*words, "--refine", 1, "--minutes", 0.2)
+    assert "allow 11 steps; 11 are taken" in output and "of 0.2 minutes" in output
+    steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (run, first(run))]
+    assert steps == [11, 4]
+    assert "with --minutes 0.2, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
+    assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 0.2, "--resume")
+
+
+def first(run: Path) -> Path:
+    """The run of the first round."""
+    return run / "rounds" / "1" / "run"
+
+
+def test_what_the_first_folder_was_allowed_later_ones_are(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Source] = []
+    monkeypatch.setattr(rounds, "go_on_or_begin", lambda source, *_: opened.append(source) or 0)
+    monkeypatch.setattr(rounds, "open_run", lambda *_: None)
+    monkeypatch.setattr(rounds, "refine_run", lambda *_: 0)
+    words = ("--frame-offset", 1, "--fps", 30, "--max-left-out", 0.5, "--ignore-misfit", "--refine", 1)
+    avatar("train", folder, "--out", tmp_path / "run", *words, *QUICK)
+    given, later = opened
+    assert (given.folder, given.frame_offset, given.fps) == (folder, 1, 30.0)
+    assert later == Source(
+        tmp_path / "run" / "rounds" / "1" / "someone", given.head, max_left_out=0.5, ignore_misfit=True
+    )
+
+
+def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after, run = tmp_path / "before" / "someone", tmp_path / "after" / "other", tmp_path / "run"
+    shutil.copytree(folder, before)
+
+    @contextmanager
+    def at_once():
+        yield lambda: True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(refine_module, "interruption", at_once)
+        avatar("train", before, "--out", run, "--frame-offset", 1, "--refine", 1, *QUICK, status=130)
+    after.parent.mkdir()
+    before.rename(after)
+    assert "give the tracked video folder" in avatar("train", "--resume", "--out", run, status=1)
+    head = after / "head_model"
+    output = avatar("train", after, "--head", head, "--resume", "--out", run)
+    assert "going on after 1 of 14 frames" in output and "10/10" in output
+    assert (run / "rounds" / "1" / "someone" / "tracking.npz").is_file()
+
+
 def test_rounds_go_on_where_they_stopped(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "run"
     words = ["train", folder, "--out", run, "--frame-offset", 1, "--refine", 1, *QUICK]
@@ -172,6 +235,7 @@ def test_rounds_go_on_where_they_stopped(folder: Path, tmp_path: Path, monkeypat
     assert "began with --refine 1, not 2" in avatar("train", "--resume", "--out", run, "--refine", 2, status=1)
     changed = avatar("train", "--resume", "--out", run, "trainer.iterations=11", status=1)
     assert "leave the overrides out" in changed
+    assert "began with --frame-offset 1" in avatar("train", "--resume", "--out", run, "--frame-offset", 2, status=1)
     other = write_tracked_folder(tmp_path / "other", frames=4, size=24)
     assert "began on" in avatar("train", other, "--resume", "--out", run, status=1)
     output = avatar("train", "--resume", "--out", run)
@@ -189,12 +253,3 @@ def test_a_plain_run_and_a_damaged_plan(run: Path, folder: Path, tmp_path: Path)
     for text, said in (("{", "cannot be read"), ('{"format": 9}', "another version"), ('{"format": 1}', "damaged")):
         plan.write_text(text)
         assert said in avatar("train", "--resume", "--out", tmp_path / "y", status=1)
-
-
-def test_signals_are_heard() -> None:
-    from avatar.train.interruption import interruption
-
-    with interruption() as asked:
-        assert not asked()
-        signal.raise_signal(signal.SIGINT)
-        assert asked()

@@ -18,6 +18,7 @@ from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from data_prep import refined
+from data_prep.avatar_track import read_info
 from data_prep.check.folder import check_tracked_folder
 from data_prep.formats import open_tracked_folder
 from data_prep.open import find_head, open_subject
@@ -71,6 +72,18 @@ def test_it_is_read_back_with_both_trackings(written: Path, subject: Subject) ->
     assert again.recording.intrinsics == pytest.approx(subject.recording.intrinsics)
     assert (written / "refinement.csv").read_bytes() == b"frame\n"
     assert any("was refined through the avatar of /runs/first" in note for note in again.manifest.notes)
+
+
+def test_what_was_assumed_of_the_focal_length_stays_assumed(written: Path, tmp_path: Path) -> None:
+    assert not read_info(written).focal_is_assumed
+    shutil.copytree(written, tmp_path / "tracked")
+    info = json.loads((tmp_path / "tracked" / "tracking.json").read_text())
+    info |= {"focal": "that of a field of view of 63 degrees", "focal_is_assumed": True}
+    (tmp_path / "tracked" / "tracking.json").write_text(json.dumps(info))
+    own = opened(tmp_path / "tracked")
+    write_folder(tmp_path / "again", own, better(own), history(own), {})
+    again = read_info(tmp_path / "again")
+    assert (again.focal, again.focal_is_assumed) == ("that of a field of view of 63 degrees", True)
 
 
 def test_frames_are_the_same_pixels_and_take_no_room(written: Path, subject: Subject) -> None:

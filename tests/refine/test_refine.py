@@ -14,11 +14,12 @@ import torch
 from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
 
 from avatar.data.subject import Subject
+from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.refine import refine as refine_module
 from avatar.refine.motion import EXPRESSION, values_of
 from avatar.refine.record import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary
-from avatar.refine.refine import Refined, fingerprint, frozen, refine_subject
+from avatar.refine.refine import SAMPLES, Refined, estimated_seconds, fingerprint, frozen, refine_subject
 
 
 @pytest.fixture(scope="module")
@@ -169,8 +170,6 @@ def test_a_frame_that_smoothing_makes_worse_keeps_its_tracking(
 
 
 def test_an_unreadable_frame_is_an_error_of_its_own(avatar: Avatar, wrong: Clip, tmp_path: Path) -> None:
-    from avatar.errors import UserError
-
     class Broken(Clip):
         def frame(self, index: int, size: int | None) -> Any:
             if index == 5:
@@ -218,3 +217,31 @@ def test_the_sheet_shows_held_out_frames(avatar: Avatar, wrong: Clip, result: Re
     assert image.shape == (3 * (SIZE + 16), 5 * SIZE, 3)
     errors = image[16:SIZE].astype(float)
     assert errors[:, 4 * SIZE :].mean() < 0.7 * errors[:, 3 * SIZE : 4 * SIZE].mean()
+
+
+def test_the_estimate_is_the_time_of_a_frame_for_every_frame(
+    avatar: Avatar, wrong: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that a curvature moves by 100 s, a refined frame by 10 s and a measured one by 1 s."""
+    now = [0.0]
+
+    def taking(seconds: float, result: object) -> Callable[..., object]:
+        def work(*_: object) -> object:
+            now[0] += seconds
+            return result
+
+        return work
+
+    monkeypatch.setenv("AVATAR_THREADS", "1")
+    monkeypatch.setattr(refine_module.time, "perf_counter", lambda: now[0])
+    values = len(refine_module.find_freedom(wrong.recording.tracks, range(7), torch.zeros(3)).index)
+    monkeypatch.setattr(refine_module._Work, "_curvatures", taking(100.0, [torch.eye(values)]))
+    monkeypatch.setattr(refine_module._Work, "refine", taking(10.0, None))
+    monkeypatch.setattr(refine_module._Work, "measure", taking(1.0, None))
+    assert estimated_seconds(avatar, cast(Subject, wrong), SIZE, BACKGROUND) == SAMPLES * 100.0 + 10 * 11.0
+
+
+def test_training_frames_without_a_head_are_refused(avatar: Avatar, wrong: Clip, tmp_path: Path) -> None:
+    hidden = tuple(replace(picture, head_mask=torch.zeros(SIZE, SIZE)) for picture in wrong.pictures)
+    with pytest.raises(UserError, match="no head is to be seen in the training frames of drawn"):
+        refined(avatar, replace(wrong, pictures=hidden), tmp_path / "progress")
