@@ -74,7 +74,6 @@ def run(request: Request) -> None:
     config = load_config([*(QUICK if request.quick else ()), "trainer.preview_every=1000000", *request.overrides])
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     rows = measure(source, config, request.out)
-    print(report(rows, config))
     content = {
         "folder": folder.resolve().name,
         "config": config.to_dict(),
@@ -82,7 +81,7 @@ def run(request: Request) -> None:
         "recovered": recovered(rows),
         "rows": [asdict(row) for row in rows],
     }
-    leave(request.out, f"bench_refine_{folder.resolve().name}", content)
+    leave(request.out, f"bench_refine_{folder.resolve().name}", report(rows, config).splitlines(), content)
 
 
 def measure(source: Source, config: Config, out: Path) -> list[Row]:

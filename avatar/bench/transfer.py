@@ -76,19 +76,18 @@ class Row:
 def run(request: Request) -> None:
     scale = QUICK if request.quick else USUAL
     rows = measure(scale, request.out, request.overrides, TRACKINGS if request.full else TRACKINGS[:1])
-    print(
+    lines = [
         f"{'tracking':>12} {'transfer':>12} {'PSNR full':>10} {'PSNR head':>10}   dB, {scale.driver_frames} frames of "
         f"{scale.size} pixels"
-    )
-    for row in rows:
-        print(f"{row.tracking:>12} {row.transfer:>12} {row.full:10.2f} {row.head:10.2f}")
+    ]
+    lines += [f"{row.tracking:>12} {row.transfer:>12} {row.full:10.2f} {row.head:10.2f}" for row in rows]
     content = {
         "scale": asdict(scale),
         "neutral_bias": NEUTRAL_BIAS,
         "overrides": request.overrides,
         "rows": [asdict(row) for row in rows],
     }
-    leave(request.out, "bench_transfer", content)
+    leave(request.out, "bench_transfer", lines, content)
 
 
 def measure(

@@ -13,6 +13,7 @@ from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
+from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
@@ -47,6 +48,7 @@ def train_new(source: Source, overrides: list[str], run: Path) -> int:
     with locked(run):
         refuse_trained(run)
         subject, assets = open_subject(source, split_sizes(config))
+        check_divided(subject.split)
         perceptual = choose_perceptual(config.trainer, print)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, subject.identity, config.model)

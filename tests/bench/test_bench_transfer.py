@@ -24,7 +24,9 @@ def test_quick_run_prints_a_table_and_writes_figures(tmp_path: Path, capsys: pyt
     assert all(row["full"] > row["head"] > 10.0 for row in rows.values()), "the avatar is not where the truth is"
     printed = capsys.readouterr().out
     assert all(f"{row['full']:.2f}" in printed for row in rows.values())
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["bench_transfer.json"], "the scratch folder is gone"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bench_transfer.json", "bench_transfer.md"], (
+        "the scratch folder is gone"
+    )
 
 
 def test_the_bias_is_a_persons_own_and_shape_makes_up_for_most_of_it(tmp_path: Path) -> None:
