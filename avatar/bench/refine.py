@@ -113,11 +113,13 @@ class Trial:
     scratch: Path
 
     def trained(self, recording: Recording, name: str) -> Avatar:
-        """An avatar of the subject's pictures with this tracking."""
+        """An avatar of the subject's pictures with this tracking. Raises KeyboardInterrupt after an interruption."""
         config, subject = self.config, replace(self.subject, recording=recording)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(self.assets, subject.identity, config.model)
-        train(avatar, subject, config, self.scratch / name, choose_perceptual(config.trainer, print))
+        term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
+        if train(avatar, subject, config, self.scratch / name, term) < config.trainer.iterations:
+            raise KeyboardInterrupt
         return avatar.eval()
 
     def refined(self, avatar: Avatar, recording: Recording) -> tuple[Recording, float]:

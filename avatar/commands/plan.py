@@ -9,13 +9,14 @@ from pathlib import Path
 import torch
 
 from avatar.commands.opening import split_sizes
+from avatar.commands.training import new_avatar
 from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
-from avatar.model import Avatar
 from avatar.refine.refine import estimated_seconds
 from avatar.train.cost import measure_cost
+from avatar.train.step import choose_perceptual
 from data_prep.open import open_subject
 
 ROUNDS_FOLDER = "rounds"
@@ -101,8 +102,8 @@ def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: fl
     if minutes is None:
         return asked
     subject, assets = open_subject(source, split_sizes(config), print)
-    torch.manual_seed(config.trainer.seed)
-    avatar = Avatar(assets, subject.identity, config.model)
+    term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))
+    avatar = new_avatar(assets, subject, config, term.name)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
     step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from avatar.commands import OK, training
 from avatar.commands.opening import open_run, source_of
+from avatar.commands.outputs import check_run_folder
 from avatar.commands.plan import ROUNDS_FOLDER, Plan, plan_file, steps_in_time
 from avatar.commands.refining import refine_run
 from avatar.commands.training import resume_run, train_new
@@ -43,7 +44,9 @@ def run_train(arguments: Namespace) -> int:
         return training.run_train(arguments)
     if arguments.resume:
         raise UserError(f"{run} began without --refine: leave it out to resume, or start a new run")
-    return begin_rounds(run, arguments.refine, arguments.minutes, source_of(arguments), overrides)
+    source = source_of(arguments)
+    check_run_folder(run, [source.folder, source.head, source.tracking])
+    return begin_rounds(run, arguments.refine, arguments.minutes, source, overrides)
 
 
 def begin_rounds(run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str]) -> int:
