@@ -97,6 +97,11 @@ def find_frame_files(
     )
 
 
+def find_numbered(folder: Path, complain: Callable[[str], object]) -> dict[int, Path]:
+    """The pictures of a folder by the number at the end of their names; `complain` as in `find_frame_files`."""
+    return _numbered(folder, IMAGE_SUFFIXES, complain)
+
+
 def _find_tracking(folder: Path, given: Path | None, complain: Callable[[str], object]) -> dict[int, Path]:
     if given is None:
         found = _numbered(folder / "checkpoint", (".frame",), complain)

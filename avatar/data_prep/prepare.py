@@ -44,18 +44,19 @@ def prepare(
     format: str | None = None,
     out: Path | str | None = None,
     split: SplitSizes | None = None,
-    fps: float = DEFAULT_FPS,
+    fps: float | None = None,
     say: Callable[[str], object] = print,
 ) -> Path:
     """Prepare a tracked folder and return the prepared subject's folder; nothing is done when it is up to date.
 
-    `out` defaults to a folder in the cache (see `cache_folder`), `format` to what the files look like (see `formats`).
+    `out` defaults to a folder in the cache (see `cache_folder`), `format` to what the files look like (see `formats`),
+    `fps` to the folder's own, else to 25.
     `say` receives one sentence per finding. Raises UserError with the file or frame and what to do when the folder cannot
     be used.
     """
     folder, split = Path(folder).resolve(), split or DEFAULT_SIZES
     source = open_tracked_folder(folder, None if tracking is None else Path(tracking).resolve(), format)
-    files = source.files
+    files, fps = source.files, fps if fps is not None else source.fps or DEFAULT_FPS
     if not (np.isfinite(fps) and fps > 0):
         raise UserError(f"fps must be positive, not {fps}")
     options = {

@@ -24,6 +24,7 @@ class TrackedFolder:
     read: Callable[[HeadAssets, tuple[int, int], Callable[[str], object]], Tracking]
     division: Mapping[int, str | None] = field(default_factory=dict)  # frame number -> "train", "val", "test"
     notes: tuple[str, ...] = ()
+    fps: float | None = None  # where the folder records it
 
     @property
     def is_paired(self) -> bool:
