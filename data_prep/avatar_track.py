@@ -101,7 +101,9 @@ def read_info(folder: Path) -> TrackingInfo:
     if not isinstance(raw, dict) or raw.get("format") != NAME:
         raise UserError(f"{path} is not the listing of a folder that avatar track wrote")
     if raw.get("version") != VERSION:
-        raise UserError(f"{path} has version {raw.get('version')!r}, this program reads {VERSION}; track the video again")
+        raise UserError(
+            f"{path} has version {raw.get('version')!r}, this program reads {VERSION}; track the video again"
+        )
     try:
         intrinsics = tuple(float(v) for v in raw["intrinsics"])
         info = TrackingInfo(

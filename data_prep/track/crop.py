@@ -51,7 +51,7 @@ def choose_view(
         box, wanted = crop, size or max(crop.width, crop.height)
         if box.x + box.width > width or box.y + box.height > height or min(box.width, box.height) < MIN_SIDE:
             raise UserError(
-                f"--crop {','.join(map(str, box))} is not a part of {MIN_SIDE} pixels at least of the video's {width}x{height}"
+                fX a part of {MIN_SIDE} pixels at least of the video's {width}x{height}"
             )
     scale = min(1.0, wanted / max(box.width, box.height))
     return View(box, max(1, round(box.width * scale)), max(1, round(box.height * scale)))

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -46,13 +47,15 @@ class FaceDetector:
     """A context manager; `find` is for the pictures of one clip in their order."""
 
     def __init__(self) -> None:
-        self._vision, self._landmarker = _load()
+        self._mediapipe, self._landmarker = _load()
         self._last: Face | None = None
 
     def __enter__(self) -> FaceDetector:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._landmarker.close()
 
     def find(self, image: UInt8[np.ndarray, "H W 3"]) -> list[Face]:
@@ -89,9 +92,7 @@ class FaceDetector:
     def _in_window(self, image: np.ndarray, window: tuple[int, int, int, int]) -> list[Face]:
         left, top, right, bottom = window
         part = np.ascontiguousarray(image[top:bottom, left:right])
-        found = self._landmarker.detect(
-            self._vision.Image(image_format=self._vision.ImageFormat.SRGB, data=part)
-        )
+        found = self._landmarker.detect(self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=part))
         faces = []
         for points, scores in zip(found.face_landmarks, found.face_blendshapes, strict=True):
             at = np.array([(p.x, p.y, p.z) for p in points[:NUM_POINTS]], np.float32)
@@ -126,21 +127,27 @@ def _steps(length: int, side: int) -> list[int]:
     return [round(k * (length - side) / max(count - 1, 1)) for k in range(count)]
 
 
-def _load() -> tuple[Any, Any]:
+def load_mediapipe() -> tuple[Any, Any, Callable[[Path], Any]]:
+    """The package, its vision tasks, and what makes a task's options of a model file. UserError where it is missing."""
     os.environ.setdefault("GLOG_minloglevel", "2")
-    model = require(FACE_LANDMARKER)
     try:
-        with _quiet():
+        with quiet():
             import mediapipe
             from mediapipe.tasks.python import BaseOptions, vision
     except ImportError as error:
         raise UserError(f"{INSTALL} ({error})") from None
-    options = vision.FaceLandmarkerOptions(
-        base_options=BaseOptions(model_asset_path=str(model)), num_faces=MAX_FACES, output_face_blendshapes=True
+    return mediapipe, vision, lambda file: BaseOptions(model_asset_path=str(file))
+
+
+def _load() -> tuple[Any, Any]:
+    model = require(FACE_LANDMARKER)
+    mediapipe, vision, options = load_mediapipe()
+    settings = vision.FaceLandmarkerOptions(
+        base_options=options(model), num_faces=MAX_FACES, output_face_blendshapes=True
     )
     try:
-        with _quiet():
-            landmarker = vision.FaceLandmarker.create_from_options(options)
+        with quiet():
+            landmarker = vision.FaceLandmarker.create_from_options(settings)
             blank = np.zeros((64, 64, 3), np.uint8)  # the first call has more to say
             landmarker.detect(mediapipe.Image(image_format=mediapipe.ImageFormat.SRGB, data=blank))
     except (RuntimeError, ValueError, OSError) as error:
@@ -149,7 +156,7 @@ def _load() -> tuple[Any, Any]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """MediaPipe's libraries write remarks of their own to the standard error's file, past Python."""
     kept = os.dup(2)
     try:

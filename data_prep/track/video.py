@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from data_prep.track.ffmpeg import Decoder, Shown, describe, executable, first_picture
+from data_prep.track.ffmpeg import Decoder, Shown, describe, first_picture
 from data_prep.track.footage import BEHIND_TRANSPARENT, Box, Span, TimedPicture, View, check_size, stride
 from data_prep.track.tone import HDR_TRANSFERS, tone_filters
 
@@ -123,7 +123,9 @@ def open_video(path: Path) -> Video:
     if container is None:
         raise UserError(_unreadable(path, said))
     if _LISTS & set(container[1].split(",")):
-        raise UserError(f"{path} is a list of other files ({container[1].strip(',')}), not a video; give the video itself")
+        raise UserError(
+            f"{path} is a list of other files ({container[1].strip(',')}), not a video; give the video itself"
+        )
     streams = [(int(n), kind, rest) for n, kind, rest in _STREAM.findall(said)]
     videos = [(n, rest) for n, kind, rest in streams if kind == "Video" and "(attached pic)" not in rest]
     if not videos:
