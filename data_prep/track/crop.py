@@ -51,7 +51,8 @@ def choose_view(
         box, wanted = crop, size or max(crop.width, crop.height)
         if box.x + box.width > width or box.y + box.height > height or min(box.width, box.height) < MIN_SIDE:
             raise UserError(
-                fX a part of {MIN_SIDE} pixels at least of the video's {width}x{height}"
+                f"--crop {','.join(map(str, box))} must lie in the video's {width}x{height} pixels and have {MIN_SIDE} a "
+                "side at least"
             )
     scale = min(1.0, wanted / max(box.width, box.height))
     return View(box, max(1, round(box.width * scale)), max(1, round(box.height * scale)))

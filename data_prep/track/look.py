@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -93,7 +94,7 @@ def _without_pauses(shot: Shot, times: np.ndarray) -> list[Shot]:
     usual = float(np.median(steps)) if len(steps) else 0.0
     breaks = shot.start + 1 + np.flatnonzero(steps > max(_PAUSE, _PAUSES * usual))
     edges = [shot.start, *breaks.tolist(), shot.end]
-    return [Shot(*both) for both in zip(edges[:-1], edges[1:], strict=True)]
+    return [Shot(*both) for both in itertools.pairwise(edges)]
 
 
 def _on_grid(footage: Footage, shot: Shot, times: np.ndarray, faces: list[Face | None], notes: list[str]) -> Look:

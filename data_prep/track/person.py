@@ -93,7 +93,8 @@ def _notes(chosen: Sequence[Face | None], others: Sequence[_Chain], returns: int
     alone = sorted(n for n in pictures if chosen[n] is None)
     if alone:
         notes.append(
-            f"the face changes: {len(alone)} pictures, from number {alone[0]} on, show another person's only and are left out"
+            f"the face changes: {len(alone)} pictures, from number {alone[0]} on, show another person's only and are "
+            "left out"
         )
     if returns:
         notes.append(f"the face is away {returns} times and taken as the same person's when it comes back")

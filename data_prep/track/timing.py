@@ -51,8 +51,8 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
     dropped = int((numbers < 0).sum())
     empty = int(numbers.max() + 1 - (T - dropped))
     note = (
-        f"the frame rate varies ({1e3 * forward.min():.0f} to {1e3 * steps.max():.0f} ms from picture to picture): the clip "
-        f"is taken at {fps:.4g} a second, {dropped} pictures between are left out and {empty} times have none"
+        f"the frame rate varies ({1e3 * forward.min():.0f} to {1e3 * steps.max():.0f} ms from picture to picture): the "
+        f"clip is taken at {fps:.4g} a second, {dropped} pictures between are left out and {empty} times have none"
     )
     return Timing(fps, numbers, (note,))
 
