@@ -23,14 +23,14 @@ from typing import Any
 
 import numpy as np
 
-from avatar.checkpoint import write_atomically
-from avatar.data_prep.frame_files import FrameFiles, KindNames, find_numbered
-from avatar.data_prep.safe_pickle import load_npz
-from avatar.data_prep.tracked_folder import TrackedFolder
-from avatar.data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
-from avatar.data_prep.transforms import read_json
 from avatar.errors import UserError, refuse
+from avatar.files.atomic import write_atomically
+from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
+from data_prep.frame_files import FrameFiles, KindNames, find_numbered
+from data_prep.tracked_folder import TrackedFolder
+from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.transforms import read_json
 
 NAME = "avatar-track"
 VERSION = 1
