@@ -80,8 +80,8 @@ def require(file: ThirdPartyFile) -> Path:
     path = find(file)
     if path is None:
         raise UserError(
-            f"{file.name} ({file.purpose}; {file.licence}) is missing: run avatar models --download, or fetch {file.url} and "
-            f"put it into {models_folder()} or the folder that ${FOLDER_VARIABLE} names"
+            f"{file.name} ({file.purpose}; {file.licence}) is missing: run avatar models --download, or fetch "
+            f"{file.url} and put it into {models_folder()} or the folder that ${FOLDER_VARIABLE} names"
         )
     check_sha256(file, sha256_of(path), str(path))
     return path

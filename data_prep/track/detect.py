@@ -97,7 +97,9 @@ class FaceDetector:
         for points, scores in zip(found.face_landmarks, found.face_blendshapes, strict=True):
             at = np.array([(p.x, p.y, p.z) for p in points[:NUM_POINTS]], np.float32)
             # z is given in widths of the picture, as x is.
-            at = at * np.float32([right - left, bottom - top, right - left]) + np.float32([left, top, 0])
+            at = at * np.array([right - left, bottom - top, right - left], np.float32) + np.array(
+                [left, top, 0], np.float32
+            )
             if at.shape == (NUM_POINTS, 3) and np.isfinite(at).all():
                 faces.append(Face(at, np.array([s.score for s in scores], np.float32)))
         return sorted(faces, key=lambda face: -face.height)

@@ -160,7 +160,7 @@ class Decoder:
         """The next picture; None at the end, also when the last one is incomplete."""
         assert process.stdout is not None
         pixels = np.empty(self.shape, np.uint8)
-        free = memoryview(pixels).cast("B")
+        free = pixels.data.cast("B")
         while len(free):
             if not select.select([process.stdout], [], [], STALL_SECONDS)[0]:
                 raise UserError(

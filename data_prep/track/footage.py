@@ -56,13 +56,29 @@ class TimedPicture(NamedTuple):
 class Footage(Protocol):
     """A source of pictures that can be read several times, each time the same ones."""
 
-    path: Path
-    width: int
-    height: int
-    rate: float | None  # pictures a second, as the file says, before `stride`
-    duration: float | None  # seconds, as the file says
-    equivalent_focal: float | None  # millimetres for film of 36x24 mm, from the metadata
-    notes: tuple[str, ...]
+    @property
+    def path(self) -> Path: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def rate(self) -> float | None:
+        """Pictures a second, as the file says, before `stride`."""
+        ...
+
+    @property
+    def duration(self) -> float | None:
+        """Seconds, as the file says."""
+        ...
+
+    @property
+    def equivalent_focal(self) -> float | None:
+        """Millimetres for film of 36x24 mm, from the metadata."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]: ...
 
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         """The pictures in the order of their times; `complain` hears at the end what was wrong with them."""

@@ -32,7 +32,8 @@ class Look:
 
     landmarks: Landmarks  # T frames, in pixels of the upright source pictures
     pictures: np.ndarray  # int64 [T], which of the pictures that were read; -1 where the grid has none
-    span: Span  # that holds the shot's pictures
+    read: int  # how many pictures were read
+    is_whole: bool  # whether these were all between --start and --end
     notes: list[str]
 
 
@@ -41,10 +42,10 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
     check_span(span, footage.duration)
     notes: list[str] = []
     view = whole(footage.width, footage.height, LOOKED_AT)
-    scale = np.float32([footage.width / view.width, footage.height / view.height, footage.width / view.width])
+    scale = np.array([footage.width / view.width, footage.height / view.height, footage.width / view.width], np.float32)
     times: list[float] = []
     found: list[list[Face]] = []
-    brightest = 0.0
+    brightest, is_whole = 0.0, True
     cuts = CutFinder()
     expected = None
     if footage.duration is not None and footage.rate:
@@ -54,6 +55,7 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
         for picture in progress(footage.read(view, span, notes.append), expected, "looking for the face"):
             if len(times) == MAX_PICTURES:
                 notes.append(_too_long(footage, times[0], picture.time))
+                is_whole = False
                 break
             times.append(picture.time)
             brightest = max(brightest, float(picture.image[::4, ::4].mean()))
@@ -73,7 +75,7 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
     shot = _longest_shot(cuts.shots(), np.array(times), found, notes)
     faces, about = follow_one(found[shot.start : shot.end])
     notes += about
-    return _on_grid(footage, shot, np.array(times), faces, notes)
+    return _on_grid(footage, shot, np.array(times), faces, is_whole, notes)
 
 
 def _longest_shot(cut: list[Shot], times: np.ndarray, found: list[list[Face]], notes: list[str]) -> Shot:
@@ -97,7 +99,9 @@ def _without_pauses(shot: Shot, times: np.ndarray) -> list[Shot]:
     return [Shot(*both) for both in itertools.pairwise(edges)]
 
 
-def _on_grid(footage: Footage, shot: Shot, times: np.ndarray, faces: list[Face | None], notes: list[str]) -> Look:
+def _on_grid(
+    footage: Footage, shot: Shot, times: np.ndarray, faces: list[Face | None], is_whole: bool, notes: list[str]
+) -> Look:
     own = times[shot.start : shot.end]
     stated = None if footage.rate is None else footage.rate / stride(footage.rate)
     timing = regular_timing(own, stated)
@@ -118,7 +122,7 @@ def _on_grid(footage: Footage, shot: Shot, times: np.ndarray, faces: list[Face |
             f"{MIN_PICTURES} at least are needed: it must be seen from the front, lit, and be no speck"
         )
     size = footage.width, footage.height
-    return Look(Landmarks(points, scores, detected, size, timing.fps), pictures, Span(float(own[0])), notes)
+    return Look(Landmarks(points, scores, detected, size, timing.fps), pictures, len(times), is_whole, notes)
 
 
 def _too_long(footage: Footage, first: float, last: float) -> str:
@@ -135,8 +139,9 @@ def _because(notes: list[str]) -> str:
 
 def to_json(look: Look) -> dict[str, Any]:
     """All but the landmarks."""
-    return {"pictures": look.pictures.tolist(), "span": list(look.span), "notes": look.notes}
+    return {"pictures": look.pictures.tolist(), "read": look.read, "is_whole": look.is_whole, "notes": look.notes}
 
 
 def from_json(raw: dict[str, Any], landmarks: Landmarks) -> Look:
-    return Look(landmarks, np.array(raw["pictures"], np.int64), Span(*raw["span"]), list(raw["notes"]))
+    pictures = np.array(raw["pictures"], np.int64)
+    return Look(landmarks, pictures, raw["read"], raw["is_whole"], list(raw["notes"]))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from avatar.errors import UserError
+from data_prep.projection import silhouette
 
 SIDE = 256  # pixels of the picture that is divided; the division is enlarged
 # Heights above the neck ring; 1 is the middle of the head.
@@ -63,8 +64,8 @@ def head_mask(
 ) -> HeadMask:
     """Head and neck of the person in `matte`; `screen` are the posed vertices in pixels of the image (centres at +0.5)."""
     height, width = matte.shape
-    points = screen[:, :2] * np.array([SIDE / width, SIDE / height])
-    body = filled(points, faces, SIDE, SIDE)
+    small_screen = screen * np.array([SIDE / width, SIDE / height, 1.0])
+    points, body = small_screen[:, :2], silhouette(small_screen, faces, SIDE, SIDE)
     inside = cv2.erode(body, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_MARGIN_IN, _MARGIN_IN))) > 0
     outside = cv2.dilate(body, np.ones((_MARGIN_OUT, _MARGIN_OUT), np.uint8)) == 0
     level = _level(points, ring)
@@ -92,17 +93,6 @@ def mouth_mask(points: Float32[np.ndarray, "478 3"], width: int, height: int) ->
     return cv2.fillPoly(mask, [corners], 255, shift=4)
 
 
-def filled(
-    points: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
-) -> UInt8[np.ndarray, "H W"]:
-    """1 where a triangle covers the pixel; points at infinity and beyond draw nothing of use and harm nothing."""
-    mask = np.zeros((height, width), np.uint8)
-    corners = np.rint((np.clip(np.nan_to_num(points), -(2**12), 2**12) - 0.5) * 16).astype(np.int32)
-    for triangle in corners[faces]:
-        cv2.fillConvexPoly(mask, triangle, 1, shift=4)
-    return mask
-
-
 def _level(points: np.ndarray, ring: np.ndarray) -> Float[np.ndarray, "S S"]:
     """Height of every pixel's centre above the ring along the head's axis; 1 is the middle of the head."""
     base = points[ring].mean(0)
@@ -123,9 +113,8 @@ def _divide(image: np.ndarray, labels: np.ndarray, level: np.ndarray) -> None:
         return
     cv2.setRNGSeed(0)  # its colour models start from random means
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(
-        np.ascontiguousarray(image[rows[0] : rows[-1] + 1]), part, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK
-    )
+    cut = np.ascontiguousarray(image[rows[0] : rows[-1] + 1])
+    cv2.grabCut(cut, part, (0, 0, 0, 0), *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
     labels[rows[0] : rows[-1] + 1] = part
 
 
