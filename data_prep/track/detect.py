@@ -58,6 +58,11 @@ class FaceDetector:
     ) -> None:
         self._landmarker.close()
 
+    def largest(self, image: UInt8[np.ndarray, "H W 3"]) -> Face | None:
+        """The largest face of a picture that belongs to no clip."""
+        faces = self._in_window(image, (0, 0, image.shape[1], image.shape[0]))
+        return faces[0] if faces else None
+
     def find(self, image: UInt8[np.ndarray, "H W 3"]) -> list[Face]:
         """The faces of a picture, the largest first; a small one is looked for around its last place and in parts."""
         height, width = image.shape[:2]
@@ -95,11 +100,10 @@ class FaceDetector:
         found = self._landmarker.detect(self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=part))
         faces = []
         for points, scores in zip(found.face_landmarks, found.face_blendshapes, strict=True):
-            at = np.array([(p.x, p.y, p.z) for p in points[:NUM_POINTS]], np.float32)
+            shares = np.array([(p.x, p.y, p.z) for p in points[:NUM_POINTS]], np.float32)
             # z is given in widths of the picture, as x is.
-            at = at * np.array([right - left, bottom - top, right - left], np.float32) + np.array(
-                [left, top, 0], np.float32
-            )
+            unit, corner = (right - left, bottom - top, right - left), (left, top, 0)
+            at = shares * np.array(unit, np.float32) + np.array(corner, np.float32)
             if at.shape == (NUM_POINTS, 3) and np.isfinite(at).all():
                 faces.append(Face(at, np.array([s.score for s in scores], np.float32)))
         return sorted(faces, key=lambda face: -face.height)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from avatar.errors import UserError
 from data_prep.projection import silhouette
+from data_prep.track.landmark_groups import OUTER_LIPS
 
 SIDE = 256  # pixels of the picture that is divided; the division is enlarged
 # Heights above the neck ring; 1 is the middle of the head.
@@ -26,10 +27,6 @@ _DIVIDED = 1.0  # below: the rest needs no division
 _MARGIN_IN, _MARGIN_OUT = 7, 5  # pixels of SIDE by which the mesh may be wrong
 _ITERATIONS = 3
 _NOWHERE = (255, 0, 255)  # a colour that no person has, in the place of the background
-OUTER_LIPS = (
-    61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185,
-)  # fmt: skip
-"""Landmarks around the lips, in order."""
 
 
 class HeadMask(NamedTuple):
