@@ -11,18 +11,22 @@ from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
+from data_prep import avatar_track
 from data_prep.prepare import prepare
 
 HEAD_VARIABLE = "AVATAR_HEAD"
 
 
 def find_head(folder: Path, given: Path | None = None) -> Path:
-    """The head model of a subject: the one given, else FOLDER/head_model, else $AVATAR_HEAD; UserError otherwise."""
+    """The head model of a subject: the one given, else FOLDER/head_model, else the one that `avatar track` used, else
+    $AVATAR_HEAD; UserError otherwise."""
     check_folder(folder)
     if given is not None:
         return given
     if (folder / "head_model").is_dir():
         return folder / "head_model"
+    if avatar_track.recognise(folder) and (tracked := Path(avatar_track.read_info(folder).head_path)).exists():
+        return tracked
     if named := os.environ.get(HEAD_VARIABLE):
         return Path(named)
     raise UserError(

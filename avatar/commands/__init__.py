@@ -12,6 +12,7 @@ MODULES = {
     "eval": "measuring",
     "report": "measuring",
     "compare": "measuring",
+    "track": "tracking",
     "reenact": "driving",
     "drive-file": "driving",
     "export": "exporting",

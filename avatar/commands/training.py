@@ -11,6 +11,7 @@ import torch
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
+from avatar.commands.tracking import head_for_video, is_video, tracked_once
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
@@ -30,16 +31,21 @@ def run_train(arguments: Namespace) -> int:
     run = arguments.out or default_run(arguments.folder)
     overrides = config_overrides(arguments)
     if arguments.resume:
+        if arguments.folder is not None and is_video(arguments.folder):
+            arguments.folder = None  # the run knows where its tracking is
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder)
     load_config(overrides)  # a mistake in it before one in the folder
+    if is_video(arguments.folder):
+        head = head_for_video(arguments.folder, arguments.head)
+        arguments.head, arguments.folder = head, tracked_once(arguments.folder, head)
     return train_new(source_of(arguments), overrides, run)
 
 
 def default_run(folder: Path | None) -> Path:
     if folder is None:
         raise UserError("say which run to go on with: avatar train --resume --out RUN")
-    return Path("runs") / folder.resolve().name
+    return Path("runs") / (folder.resolve().stem if folder.is_file() else folder.resolve().name)
 
 
 def train_new(source: Source, overrides: list[str], run: Path) -> int:

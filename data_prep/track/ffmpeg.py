@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import re
-import select
 import subprocess
 import threading
 from collections.abc import Iterator, Sequence
@@ -140,7 +139,7 @@ class Decoder:
         listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
         listener.start()
         try:
-            while (pixels := self._read(process)) is not None:
+            while (pixels := self._within_time(process)) is not None:
                 try:
                     shown = self._noted.get(timeout=STALL_SECONDS)
                 except queue.Empty:
@@ -156,20 +155,25 @@ class Decoder:
                 if pipe is not None:
                     pipe.close()
 
-    def _read(self, process: subprocess.Popen[bytes]) -> np.ndarray | None:
-        """The next picture; None at the end, also when the last one is incomplete."""
-        assert process.stdout is not None
-        pixels = np.empty(self.shape, np.uint8)
-        free = pixels.data.cast("B")
-        while len(free):
-            if not select.select([process.stdout], [], [], STALL_SECONDS)[0]:
-                raise UserError(
-                    f"{self.path}: decoding does not get on (nothing for {STALL_SECONDS:.0f} s); convert it to H.264 first"
-                )
-            count = process.stdout.readinto(free)  # type: ignore[attr-defined]  # unbuffered: one read of the pipe
-            if not count:
-                return None
-            free = free[count:]
+    def _within_time(self, process: subprocess.Popen[bytes]) -> np.ndarray | None:
+        """`_read`, with a process that says nothing for too long ended. Raises UserError then."""
+        is_late = threading.Event()
+
+        def end() -> None:
+            is_late.set()
+            process.kill()
+
+        watchdog = threading.Timer(STALL_SECONDS, end)
+        watchdog.daemon = True
+        watchdog.start()
+        try:
+            pixels = _read(process, self.shape)
+        finally:
+            watchdog.cancel()
+        if pixels is None and is_late.is_set():
+            raise UserError(
+                f"{self.path}: decoding does not get on (nothing for {STALL_SECONDS:.0f} s); convert it to H.264 first"
+            )
         return pixels
 
     def _listen(self, process: subprocess.Popen[bytes]) -> None:
@@ -192,3 +196,16 @@ class Decoder:
             self.error_count += 1
             if len(self.errors) < _KEPT_ERRORS:
                 self.errors.append(said[2].strip())
+
+
+def _read(process: subprocess.Popen[bytes], shape: tuple[int, int, int]) -> np.ndarray | None:
+    """The next picture; None at the end, also when the last one is incomplete."""
+    assert process.stdout is not None
+    pixels = np.empty(shape, np.uint8)
+    free = pixels.data.cast("B")
+    while len(free):
+        count = process.stdout.readinto(free)  # type: ignore[attr-defined]  # unbuffered: one read of the pipe
+        if not count:
+            return None
+        free = free[count:]
+    return pixels

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -78,7 +77,7 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Foca
         Figure("frames with a face", 100 * seen, "%", 99, 90, "light the face, and keep it in the picture", True),
         Figure("landmark error", shots.pop("all"), "% eyes", 1.0, 2.0, "is the head model's landmark embedding right?"),
         *(Figure(f"  of the {name}", value, "% eyes", 1.0, 2.0) for name, value in shots.items()),
-        Figure("jitter, against the landmarks' own", own["jitter"], "x", 0.6, 1.0, "a steadier camera and more light"),
+        Figure("jitter, against the landmarks' own", own["jitter"], "x", 1.0, 1.2, "a steadier camera and more light"),
         Figure(
             "mesh above the neck on the matte", 100 * float(np.mean(overlaps)), "%", 98, 95,
             "look at overlay/: is the matte whole, and the head in its place?", True,

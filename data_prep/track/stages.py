@@ -8,7 +8,6 @@ not made again.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import shutil
@@ -17,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from avatar.errors import UserError
+from avatar.runs.lock import LOCK_FILE, locked
 
 RECORD = ".stage.json"
 _MAX_RECORD = 2**24
-_LOCK = ".lock"
 
 Made = tuple[dict[str, Any], str]  # what a stage found out, and the hash of what it was made from
 
@@ -62,7 +61,7 @@ class Stages:
                 shutil.rmtree(self.folder / name, ignore_errors=True)
             for record in self.folder.glob(f"*/{RECORD}"):
                 record.unlink()
-            (self.folder / _LOCK).unlink(missing_ok=True)
+            (self.folder / LOCK_FILE).unlink(missing_ok=True)
             self.folder.rename(target)
         except OSError as error:
             raise UserError(
@@ -74,18 +73,7 @@ class Stages:
 def growing(target: Path) -> Iterator[Stages]:
     """The stages of `target`, for one process at a time. Raises UserError where nothing can be written."""
     folder = target.with_name(f".{target.name}.partial")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / _LOCK).open("wb")
-    except OSError as error:
-        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another --out") from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise UserError(
-                f"{target} is being made by another process; wait for it, or choose another --out"
-            ) from None
+    with locked(folder):
         yield Stages(folder)
 
 
