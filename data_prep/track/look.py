@@ -22,6 +22,7 @@ MAX_PICTURES = 3600  # two minutes at 30 a second
 MIN_PICTURES = 10
 _PAUSE = 1.0  # seconds without a picture that count as a cut, if they are also several times the usual distance
 _PAUSES = 5.0
+_SLOW = 8.0  # pictures a second
 _DARK = 12.0  # grey levels: below, a picture is called black
 Progress = Callable[[Iterator[TimedPicture], int | None, str], Iterator[TimedPicture]]
 
@@ -64,8 +65,8 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
     if len(times) < MIN_PICTURES:
         where = "" if span == Span() else " between --start and --end"
         raise UserError(
-            f"{footage.path} has {len(times)} pictures{where}{_because(notes)}; {MIN_PICTURES} at least are needed, and "
-            "some hundred to learn a face from"
+            f"{footage.path} has {len(times)} picture{'' if len(times) == 1 else 's'}{where}{_because(notes)}; "
+            f"{MIN_PICTURES} at least are needed, and some hundred to learn a face from"
         )
     if not any(found):
         why = "they are black" if brightest < _DARK else "it must be seen from the front, lit, and be no speck"
@@ -106,6 +107,10 @@ def _on_grid(
     stated = None if footage.rate is None else footage.rate / stride(footage.rate)
     timing = regular_timing(own, stated)
     notes += timing.notes
+    if timing.fps < _SLOW:
+        notes.append(
+            f"at {timing.fps:.3g} pictures a second neighbours are too unlike for the tracking to be smoothed over time"
+        )
     T = int(timing.numbers.max()) + 1
     points, scores = np.zeros((T, NUM_POINTS, 3), np.float32), np.zeros((T, len(BLENDSHAPES)), np.float32)
     pictures, detected = np.full(T, -1, np.int64), np.zeros(T, bool)

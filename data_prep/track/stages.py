@@ -74,7 +74,14 @@ def growing(target: Path) -> Iterator[Stages]:
     """The stages of `target`, for one process at a time. Raises UserError where nothing can be written."""
     folder = target.with_name(f".{target.name}.partial")
     with locked(folder):
-        yield Stages(folder)
+        try:
+            yield Stages(folder)
+        except BaseException:
+            for unfinished in folder.glob("*.partial"):
+                shutil.rmtree(unfinished, ignore_errors=True)
+            if next(folder.glob(f"*/{RECORD}"), None) is None:  # there is nothing to go on from
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
 
 
 def hash_of(values: Any) -> str:

@@ -22,7 +22,8 @@ _RATE = re.compile(r", ([\d.]+)(k?) (fps|tbr)")
 _DURATION = re.compile(r"Duration: (\d+):(\d\d):(\d\d\.\d+)")
 _FOCAL = re.compile(r"focal_?length\.?(?:_in_)?_?35_?mm\w*(?:\.?\w+)*\s*: ([\d.]+)", re.IGNORECASE)
 _TRANSPARENT = re.compile(r"rgba|bgra|argb|abgr|yuva|gbrap|ya8|ya16|pal8")
-_LISTS = {"concat", "hls", "dash", "sdp", "rtsp", "imf", "mpjpeg"}  # demuxers that open other files
+_LISTS = {"concat", "hls", "dash", "sdp", "rtsp", "imf"}  # demuxers that open other files
+_TEXT = {"tty", "srt", "webvtt", "ass", "lrc", "microdvd"}  # that take any text
 _MAX_LISTED_ERRORS = 3
 
 
@@ -82,7 +83,7 @@ class Video:
     def _report(self, decoder: Decoder, last: float, span: Span, complain: Callable[[str], object]) -> None:
         if decoder.error_count:
             shown = "; ".join(dict.fromkeys(decoder.errors[:_MAX_LISTED_ERRORS]))
-            complain(f"the video is damaged: ffmpeg met {decoder.error_count} errors ({shown})")
+            complain(f"the video is damaged: ffmpeg complains {decoder.error_count} times ({shown})")
         wanted = min(x for x in (span.end, self.duration, float("inf")) if x is not None)
         if self.duration is not None and wanted - last > max(1.0, 0.02 * wanted) and last >= 0:
             complain(f"the video says that it is {self.duration:.1f} s long, but its pictures end after {last:.1f} s")
@@ -126,6 +127,8 @@ def open_video(path: Path) -> Video:
         raise UserError(
             f"{path} is a list of other files ({container[1].strip(',')}), not a video; give the video itself"
         )
+    if _TEXT & set(container[1].split(",")):
+        raise UserError(f"{path} is a text, not a video; give a video of a person")
     streams = [(int(n), kind, rest) for n, kind, rest in _STREAM.findall(said)]
     videos = [(n, rest) for n, kind, rest in streams if kind == "Video" and "(attached pic)" not in rest]
     if not videos:
