@@ -25,6 +25,7 @@ _TRANSPARENT = re.compile(r"rgba|bgra|argb|abgr|yuva|gbrap|ya8|ya16|pal8")
 _LISTS = {"concat", "hls", "dash", "sdp", "rtsp", "imf"}  # demuxers that open other files
 _TEXT = {"tty", "srt", "webvtt", "ass", "lrc", "microdvd"}  # that take any text
 _MAX_LISTED_ERRORS = 3
+_BESIDE_THE_POINT = ("Error opening input file", "Input #", "ffmpeg version", "Consider increasing")
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,8 @@ def open_video(path: Path) -> Video:
         raise UserError(f"{path} is a text, not a video; give a video of a person")
     streams = [(int(n), kind, rest) for n, kind, rest in _STREAM.findall(said)]
     videos = [(n, rest) for n, kind, rest in streams if kind == "Video" and "(attached pic)" not in rest]
+    if not videos and _is_cut_short(path, said):
+        raise UserError(_unreadable(path, said))
     if not videos:
         held = sorted({kind.lower() for _, kind, _ in streams}) or ["nothing"]
         cover = " and a cover picture" if any("(attached pic)" in rest for _, _, rest in streams) else ""
@@ -176,9 +179,7 @@ def _check_file(path: Path) -> None:
 
 
 def _unreadable(path: Path, said: str) -> str:
-    with path.open("rb") as file:
-        head = file.read(64)
-    if "moov atom not found" in said and head[4:8] in (b"ftyp", b"mdat", b"wide", b"free"):
+    if _is_cut_short(path, said):
         return (
             f"{path} is cut short: the index at its end is missing, as after an interrupted copy or a recording that was "
             "not finished; copy or export it again"
@@ -186,10 +187,18 @@ def _unreadable(path: Path, said: str) -> str:
     return f"{path} is not a video that ffmpeg can read ({_reason(said)}); convert it to .mp4 (H.264) first"
 
 
+def _is_cut_short(path: Path, said: str) -> bool:
+    """Whether it is a file of MP4's kind whose index is missing, wholly or in part."""
+    with path.open("rb") as file:
+        head = file.read(64)
+    is_of_the_kind = head[4:8] in (b"ftyp", b"mdat", b"wide", b"free")
+    return is_of_the_kind and ("moov atom not found" in said or "Audio:" not in said and "Video:" not in said)
+
+
 def _reason(said: str) -> str:
     lines = [line.strip() for line in said.splitlines() if line.strip() and not line.startswith("  ")]
     words = [re.sub(r"^(\[[^\]]*\] )+", "", line) for line in lines if "At least one output" not in line]
-    words = [word for word in words if not word.startswith(("Error opening input file", "Input #", "ffmpeg version"))]
+    words = [word for word in words if not word.startswith(_BESIDE_THE_POINT)]
     return words[-1].rpartition(": ")[2].rstrip(".")[:200] if words else "it says nothing of why"
 
 
