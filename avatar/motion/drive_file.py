@@ -41,11 +41,12 @@ KEYS = ("expression", "jaw", "eyes", "eyelids", "fps", *CAMERA_KEYS, "shape", "n
 LARGEST = 1e4  # of any coefficient or length: beyond it a file is damaged, and arithmetic would overflow
 
 
-def read_drive(path: Path, assets: HeadAssets, width: int, say: Callable[[str], None] = print) -> Drive:
+def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[str], None] = print) -> Drive:
     """A drive file for avatars of the head model `assets`; cameras are resized to `width` pixels.
 
     Raises UserError with the file and what is wrong with it.
     """
+    path = Path(path)
     is_csv = path.suffix.lower() == ".csv"
     arrays = read_drive_csv(path, assets.num_expressions, assets.names, say) if is_csv else load_npz(path)
     unknown = sorted(set(arrays) - set(KEYS))
