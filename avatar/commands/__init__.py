@@ -22,6 +22,7 @@ MODULES = {
     "demo": "demonstrating",
     "bench": "benchmarking",
     "doctor": "diagnosing",
+    "models": "third_party",
 }
 
 

@@ -168,6 +168,8 @@ def build_parser() -> argparse.ArgumentParser:
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
     extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")
 
+    models = commands.add_parser("models", help="list the files of others that the program can use, and where they are")
+    models.add_argument("--download", action="store_true", help="get what is missing from its publishers")
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser
 

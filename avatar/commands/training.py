@@ -16,11 +16,11 @@ from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.lock import locked
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
-from avatar.runs.lock import locked
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train

@@ -21,7 +21,7 @@ from avatar.files.third_party import FACE_LANDMARKER, require
 from data_prep.track.landmarks import NUM_POINTS
 
 MAX_FACES = 4
-INSTALL = "tracking needs MediaPipe: pip install 'avatar[track]'"
+INSTALL = "tracking needs MediaPipe: pip install 'hyperavatar[track]'"
 _SMALL = 0.15  # of the longer side: smaller faces are overlooked in the whole picture (0.12 was found, 0.10 was not)
 _WINDOW = 4.0  # heights of the face, around where it was
 _FLAT = 3.0  # standard deviation of grey levels; a picture without contrast holds no face

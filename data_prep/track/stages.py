@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.errors import UserError
-from avatar.runs.lock import LOCK_FILE, locked
+from avatar.files.lock import LOCK_FILE, locked
 
 RECORD = ".stage.json"
 _MAX_RECORD = 2**24

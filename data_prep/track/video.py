@@ -192,7 +192,7 @@ def _is_cut_short(path: Path, said: str) -> bool:
     with path.open("rb") as file:
         head = file.read(64)
     is_of_the_kind = head[4:8] in (b"ftyp", b"mdat", b"wide", b"free")
-    return is_of_the_kind and ("moov atom not found" in said or "Audio:" not in said and "Video:" not in said)
+    return is_of_the_kind and ("moov atom not found" in said or ("Audio:" not in said and "Video:" not in said))
 
 
 def _reason(said: str) -> str:
