@@ -38,11 +38,14 @@ def run_models(arguments: Namespace, say: Callable[[str], object] = print) -> in
 def describe(file: ThirdPartyFile, say: Callable[[str], object]) -> bool:
     """Say where a file is, or which one to put where; False where it is needed and missing, or damaged."""
     path = find(file)
-    say(f"\n{file.name}: {file.purpose}; {file.megabytes:g} MB, {file.licence}")
+    say(
+        f"\n{file.name}: {file.purpose}; {file.megabytes:g} MB, {file.licence}"
+        + ("; optional" if file.is_optional else "")
+    )
     if path is None:
         say(f"  missing: put {file.url} into {models_folder()}")
         say(f"  SHA-256 {file.sha256}")
-        return "optional" in file.purpose
+        return file.is_optional
     try:
         check_sha256(file, sha256_of(path), str(path))
     except UserError as error:
@@ -78,8 +81,6 @@ def fetch_missing(say: Callable[[str], object]) -> None:
         try:
             load_lpips(net)
         except MissingWeights:
-            backbone, heads = LPIPS_FILES[net]
-            say(
-                f"fetching {backbone.name} ({backbone.megabytes:g} MB, {backbone.licence}) and {heads.name} ({heads.licence})"
-            )
+            for file in LPIPS_FILES[net]:
+                say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download_lpips(net, lpips_folder())

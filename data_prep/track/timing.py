@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 
 DEFAULT_FPS = 25.0
 COMMON_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 15.0, 12.5, 12.0, 10.0, 20.0, 5.0, 1.0)
-_SNAP = 0.005  # relative: what time stamps in whole milliseconds do to a rate
+_SNAP = 0.005  # relative: what time stamps in whole milliseconds do to a regular rate
+_SNAP_VARIABLE = 0.02
 _REGULAR = (0.5, 1.5)  # times the median distance, within which pictures are taken one by one
 
 
@@ -40,7 +41,7 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
     if steps.min() >= low and steps.max() <= high:
         return Timing(_common(float((T - 1) / (times[-1] - times[0]))), np.arange(T), ())
     usual = forward[(forward > 0.8 * median) & (forward < 1.2 * median)]
-    fps = _common(float(1.0 / usual.mean()))
+    fps = _common(float(1.0 / usual.mean()), _SNAP_VARIABLE)
     places = np.maximum.accumulate(times - times[0]) * fps  # a time that runs backwards stays where it was
     numbers = np.rint(places).astype(np.int64)
     off = np.abs(places - numbers)
@@ -57,7 +58,7 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
     return Timing(fps, numbers, (note,))
 
 
-def _common(fps: float) -> float:
+def _common(fps: float, tolerance: float = _SNAP) -> float:
     """The rate itself, or the one of the usual rates that it is up to rounding."""
     nearest = min(COMMON_RATES, key=lambda rate: abs(rate - fps))
-    return nearest if abs(nearest - fps) < _SNAP * fps else fps
+    return nearest if abs(nearest - fps) < tolerance * fps else fps
