@@ -59,7 +59,9 @@ def test_the_square_around_the_head() -> None:
 
 
 def test_the_square_stays_in_the_picture() -> None:
-    assert head_square(1920, 1080, face(100, 100, 300)) == Box(0, 0, *(head_square(1920, 1080, face(960, 540, 300))[2:]))
+    assert head_square(1920, 1080, face(100, 100, 300)) == Box(
+        0, 0, *(head_square(1920, 1080, face(960, 540, 300))[2:])
+    )
     for width, height in ((512, 512), (720, 1280), (511, 333)):
         box = head_square(width, height, face(width / 2, height / 2, 0.7 * min(width, height)))
         assert box.width == min(width, height) and box.x + box.width <= width and box.y + box.height <= height
@@ -84,7 +86,11 @@ def test_views() -> None:
 @pytest.mark.parametrize(
     ("crop", "size", "sentence"),
     [
-        (Box(1900, 0, 100, 100), None, "--crop 1900,0,100,100 must lie in the video's 1920x1080 pixels and have 64 a side"),
+        (
+            Box(1900, 0, 100, 100),
+            None,
+            "--crop 1900,0,100,100 must lie in the video's 1920x1080 pixels and have 64 a side",
+        ),
         (Box(0, 0, 100, 30), None, "must lie in the video's 1920x1080 pixels"),
         ("auto", 10, "--size must be from 64 to 4096 pixels, not 10"),
     ],
@@ -145,6 +151,16 @@ def test_parts_of_the_video() -> None:
 
 
 def test_rates_that_are_thinned() -> None:
-    assert [stride(rate) for rate in (None, 1.0, 25.0, 30.0, 31.9, 50.0, 60.0, 120.0, 240.0)] == [1, 1, 1, 1, 1, 2, 2, 4, 8]
+    assert [stride(rate) for rate in (None, 1.0, 25.0, 30.0, 31.9, 50.0, 60.0, 120.0, 240.0)] == [
+        1,
+        1,
+        1,
+        1,
+        1,
+        2,
+        2,
+        4,
+        8,
+    ]
     view = whole(4000, 3000, 1920)
     assert (view.width, view.height) == (1920, 1440) and whole(640, 480, 1920).width == 640

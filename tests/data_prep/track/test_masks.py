@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -17,6 +19,11 @@ from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 SIZE = 256
 
 
+@functools.cache
+def renderer_of(seed: int) -> Renderer:
+    return Renderer(sample_identity(seed))
+
+
 def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
@@ -25,7 +32,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("shift", [0, 6])
 def test_the_head_without_its_clothes(seed: int, shift: int) -> None:
     """Also where the mesh lies 6 of 256 pixels aside, as fits do."""
-    renderer = Renderer(sample_identity(seed))
+    renderer = renderer_of(seed)
     performance = perform(seed, 40, "turn")
     model = renderer.performer.model
     faces, template = model.faces.numpy(), model.assets.template.numpy()
@@ -43,8 +50,8 @@ def test_the_head_without_its_clothes(seed: int, shift: int) -> None:
         assert head_mask(picture.image, picture.alpha, screen + np.array([2000.0, 0, 0]), faces, ring).overlap == 0.0
 
 
-def test_masks_repeat(tmp_path) -> None:
-    renderer = Renderer(sample_identity(1))
+def test_masks_repeat() -> None:
+    renderer = renderer_of(1)
     performance = perform(1, 2, "speech")
     params, camera = frame_params(performance, 1), frame_camera(performance, 1, SIZE)
     picture = renderer.render(params, camera)
@@ -54,7 +61,9 @@ def test_masks_repeat(tmp_path) -> None:
     ring = neck_ring(model.assets.template.numpy(), model.faces.numpy())
     first = head_mask(picture.image, picture.alpha, screen, model.faces.numpy(), ring).mask
     cv2.randu(np.zeros((9, 9), np.uint8), 0, 255)  # others use OpenCV's random numbers
-    np.testing.assert_array_equal(first, head_mask(picture.image, picture.alpha, screen, model.faces.numpy(), ring).mask)
+    np.testing.assert_array_equal(
+        first, head_mask(picture.image, picture.alpha, screen, model.faces.numpy(), ring).mask
+    )
 
 
 def test_the_ring_is_the_lowest_open_edge() -> None:

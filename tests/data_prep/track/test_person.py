@@ -31,9 +31,7 @@ def test_another_person_never_stands_in() -> None:
     found = [[face(300)]] * 20 + [[]] * 5 + [[face(900, 100)]] * 8
     chosen, notes = follow_one(found)
     assert places(chosen) == [300] * 20 + [None] * 13
-    assert notes == [
-        "the face changes: 8 pictures, from number 25 on, show another person's only and are left out"
-    ]
+    assert notes == ["the face changes: 8 pictures, from number 25 on, show another person's only and are left out"]
 
 
 def test_a_face_that_was_away_is_the_same_at_its_place() -> None:

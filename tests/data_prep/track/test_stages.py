@@ -42,10 +42,10 @@ def test_an_interruption_keeps_whole_stages_only(tmp_path: Path, interruption: B
         (folder / "half").write_text("half")
         raise interruption
 
-    with pytest.raises(type(interruption) if isinstance(interruption, Exception) else KeyboardInterrupt):
-        with growing(tmp_path / "out") as stages:
-            stages.run("one", {}, lambda folder: {})
-            stages.run("two", {}, interrupted)
+    kind = UserError if isinstance(interruption, UserError) else KeyboardInterrupt
+    with pytest.raises(kind), growing(tmp_path / "out") as stages:
+        stages.run("one", {}, lambda folder: {})
+        stages.run("two", {}, interrupted)
     assert [p.name for p in tmp_path.iterdir()] == [".out.partial"]
     assert [p.name for p in (tmp_path / ".out.partial").iterdir()] == ["one"]
     with growing(tmp_path / "out") as stages:
@@ -71,9 +71,9 @@ def test_a_damaged_record_is_made_again(tmp_path: Path) -> None:
 
 
 def test_one_process_at_a_time(tmp_path: Path) -> None:
-    with growing(tmp_path / "out"):
-        with pytest.raises(UserError, match="is being written by process"), growing(tmp_path / "out"):
-            pass
+    refused = pytest.raises(UserError, match="is being written by process")
+    with growing(tmp_path / "out"), refused, growing(tmp_path / "out"):
+        pass
 
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
