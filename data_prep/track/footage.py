@@ -17,6 +17,7 @@ MAX_SIDE = 8192  # pixels of a source picture
 MIN_SIDE = 64
 MAX_RATE = 32.0  # pictures a second that are used: more hardly differ from their neighbours and cost as much
 BEHIND_TRANSPARENT = 127  # grey level
+LAID_OVER_GREY = "the pictures are transparent in parts: they are laid over grey"
 
 
 class Box(NamedTuple):
@@ -116,3 +117,13 @@ def check_span(span: Span, duration: float | None) -> None:
         raise UserError(f"--end must be a time in seconds after --start ({start:g}), not {end}")
     if duration is not None and start >= duration:
         raise UserError(f"--start {start:g} is behind the end of the video, which is {duration:.2f} s long")
+
+
+def opaque(pixels: UInt8[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture with transparency over grey."""
+    alpha = pixels[..., 3:]
+    if alpha.min() == 255:
+        return np.ascontiguousarray(pixels[..., :3])
+    weight = alpha.astype(np.uint16)
+    over = pixels[..., :3] * weight + BEHIND_TRANSPARENT * (255 - weight) + 127
+    return (over // 255).astype(np.uint8)

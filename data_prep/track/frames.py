@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import overload
+from typing import TypeVar, overload
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from data_prep.track.look import Look
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
 _AHEAD = 4  # frames that wait for a worker
+Made = TypeVar("Made")
 Progress = Callable[[Iterable[int], int, str], Iterable[int]]
 
 
@@ -129,17 +130,27 @@ def write_masks(
     def one(number: int) -> None:
         write_image(mask_file(folder, number), make(number), [])
 
+    for _ in ahead(numbers, one, progress, title, workers):
+        pass
+
+
+def ahead(
+    numbers: Sequence[int], make: Callable[[int], Made], progress: Progress, title: str, workers: int = WORKERS
+) -> Iterator[tuple[int, Made]]:
+    """Each frame number with what `make` gives for it, in order; made by some threads, a few frames ahead."""
     with ThreadPoolExecutor(workers) as pool:
-        pending: deque[Future[None]] = deque()
+        pending: deque[tuple[int, Future[Made]]] = deque()
         try:
             for number in progress(numbers, len(numbers), title):
-                pending.append(pool.submit(one, number))
+                pending.append((number, pool.submit(make, number)))
                 if len(pending) > _AHEAD:
-                    pending.popleft().result()
+                    first, future = pending.popleft()
+                    yield first, future.result()
             while pending:
-                pending.popleft().result()
+                first, future = pending.popleft()
+                yield first, future.result()
         finally:
-            for future in pending:
+            for _, future in pending:
                 future.cancel()
 
 

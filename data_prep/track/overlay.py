@@ -13,7 +13,7 @@ from avatar.files.video import video_writer
 from avatar.head.model import HeadModel
 from data_prep.check.fit import MeshProjector
 from data_prep.check.overlay import MASK, MOUTH, draw_mesh, outline
-from data_prep.track.frames import JPEG, Progress, write_image
+from data_prep.track.frames import JPEG, Progress, ahead, write_image
 from data_prep.tracking import FrameTrack
 
 OVERLAY_VIDEO, OVERLAY_SHEET = "overlay.mp4", "overlay.jpg"
@@ -43,13 +43,17 @@ def write_overlay(
     numbers = list(tracks)
     shown = {numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, min(_SHOWN, len(numbers)))}
     pictures: list[np.ndarray] = []
+
+    def draw(number: int) -> np.ndarray:
+        parts = read(number)
+        canvas = cv2.resize(parts.image, (width, height), interpolation=cv2.INTER_AREA)
+        canvas = draw_mesh(canvas, project(tracks[number], width, height))
+        for colour, mask in ((MASK, parts.head), (MOUTH, parts.mouth)):
+            outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
+        return canvas
+
     with video_writer(folder / OVERLAY_VIDEO, fps) as add:
-        for number in progress(numbers, len(numbers), "drawing the overlay"):
-            parts = read(number)
-            canvas = cv2.resize(parts.image, (width, height), interpolation=cv2.INTER_AREA)
-            canvas = draw_mesh(canvas, project(tracks[number], width, height))
-            for colour, mask in ((MASK, parts.head), (MOUTH, parts.mouth)):
-                outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
+        for number, canvas in ahead(numbers, draw, progress, "drawing the overlay"):
             add(canvas)
             if number in shown:
                 pictures.append(canvas)

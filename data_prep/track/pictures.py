@@ -13,9 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, read_image
+from avatar.data.images import IMAGE_SUFFIXES, has_transparency, read_bytes, read_image
 from avatar.errors import UserError
-from data_prep.track.footage import Footage, Span, TimedPicture, View, check_size
+from data_prep.track.footage import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque
 from data_prep.track.timing import DEFAULT_FPS
 from data_prep.track.video import open_video
 
@@ -39,17 +39,21 @@ class PictureFolder:
 
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         """Raises UserError for pictures of another size and for files that cannot be decoded."""
+        was_transparent = False
         for n, file in enumerate(self.files):
             time = n / DEFAULT_FPS
             if time < span.start - 1e-6 or (span.end is not None and time >= span.end):
                 continue
-            image = read_image(file)
+            image, is_transparent = _read(file)
+            was_transparent |= is_transparent
             if image.shape[:2] != (self.height, self.width):
                 raise UserError(
                     f"{file} is {image.shape[1]}x{image.shape[0]} pixels but {self.files[0].name} is "
                     f"{self.width}x{self.height}; give pictures of one size"
                 )
             yield TimedPicture(time, resampled(image, view))
+        if was_transparent:
+            complain(LAID_OVER_GREY)
 
     def content_hash(self) -> str:
         if not self._hash:
@@ -61,6 +65,18 @@ class PictureFolder:
                     raise UserError(f"{file} cannot be read ({error.strerror})") from None
             self._hash.append(digest.hexdigest())
         return self._hash[0]
+
+
+def _read(file: Path) -> tuple[np.ndarray, bool]:
+    """A picture, and whether it has transparent parts, which are laid over grey."""
+    image = read_image(file)
+    data = read_bytes(file)
+    if not has_transparency(data):
+        return image, False
+    four = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if four is None or four.ndim != 3 or four.shape[2] != 4 or four.dtype != np.uint8 or four[..., 3].min() == 255:
+        return image, False
+    return opaque(np.dstack((image, four[..., 3]))), True
 
 
 def resampled(image: np.ndarray, view: View) -> np.ndarray:

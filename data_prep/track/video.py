@@ -8,11 +8,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from avatar.errors import UserError
 from data_prep.track.ffmpeg import Decoder, Shown, describe, first_picture
-from data_prep.track.footage import BEHIND_TRANSPARENT, Box, Span, TimedPicture, View, check_size, stride
+from data_prep.track.footage import LAID_OVER_GREY, Box, Span, TimedPicture, View, check_size, opaque, stride
 from data_prep.track.tone import HDR_TRANSFERS, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
@@ -75,11 +73,11 @@ class Video:
             if n % every or time < span.start - 1e-6:
                 continue
             was_transparent |= is_transparent and pixels[..., 3].min() < 255
-            yield TimedPicture(time, _opaque(pixels) if is_transparent else pixels)
+            yield TimedPicture(time, opaque(pixels) if is_transparent else pixels)
         else:
             self._report(decoder, last, span, complain)
         if was_transparent:
-            complain("the pictures are transparent in parts: they are laid over grey")
+            complain(LAID_OVER_GREY)
 
     def _report(self, decoder: Decoder, last: float, span: Span, complain: Callable[[str], object]) -> None:
         if decoder.error_count:
@@ -252,12 +250,3 @@ def _notes(
 
 def _ordinal(n: int) -> str:
     return {2: "second", 3: "third"}.get(n, f"{n}th")
-
-
-def _opaque(pixels: np.ndarray) -> np.ndarray:
-    alpha = pixels[..., 3:]
-    if alpha.min() == 255:
-        return np.ascontiguousarray(pixels[..., :3])
-    weight = alpha.astype(np.uint16)
-    over = pixels[..., :3] * weight + BEHIND_TRANSPARENT * (255 - weight) + 127
-    return (over // 255).astype(np.uint8)

@@ -6,6 +6,7 @@ import threading
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from videos import LOSSLESS, X264, centre_of, encode, ffmpeg, spot
@@ -271,6 +272,17 @@ def test_names_that_mean_something_to_ffmpeg(tmp_path: Path, monkeypatch: pytest
     for name in ("-i.mp4", "a%03d.mp4", "pipe:0.mp4", "concat:a|b.mp4"):
         encode(tmp_path / "plain.mp4", counting(3)).rename(tmp_path / name)
         assert len(read(Path(name))[0]) == 3
+
+
+def test_transparent_pictures_lie_over_grey(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    image = np.full((64, 64, 4), (200, 40, 40, 255), np.uint8)
+    image[:32, :, 3] = 0
+    cv2.imwrite(str(folder / "0.png"), cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))
+    pictures, said = read(folder)
+    assert said == ["the pictures are transparent in parts: they are laid over grey"]
+    assert (pictures[0].image[:32] == 127).all() and (pictures[0].image[32:] == (200, 40, 40)).all()
 
 
 def test_a_folder_of_pictures(tmp_path: Path) -> None:
