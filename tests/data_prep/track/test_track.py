@@ -23,6 +23,7 @@ from data_prep.track.footage import Box
 from data_prep.track.landmarks import load_landmarks
 from data_prep.track.track import Choices, track
 
+pytestmark = [pytest.mark.usefixtures("tracking_models"), pytest.mark.slow]
 FRAMES, SIZE, SEED = 30, 256, 1
 
 
