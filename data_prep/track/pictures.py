@@ -20,6 +20,7 @@ from data_prep.track.timing import DEFAULT_FPS
 from data_prep.track.video import open_video
 
 _MAX_PICTURES = 100_000
+_TRACKED = {"imgs", "images", "image", "frames", "checkpoint", "flame_param"}  # what tracked folders hold
 _EXIF, _FOCAL_IN_35MM_FILM = 0x8769, 0xA405  # EXIF 2.3, tags of the sub-directory and of the value
 
 
@@ -95,8 +96,12 @@ def open_footage(path: Path) -> Footage:
 
 
 def is_footage(path: Path) -> bool:
-    """Whether the path looks like something to be tracked rather than like a tracked folder."""
-    return path.is_file() or (path.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir()))
+    """Whether the path is something to be tracked: a file, or a folder of pictures that is nobody's tracked folder."""
+    if not path.is_dir():
+        return path.is_file()
+    names = [entry.name.lower() for entry in path.iterdir()]
+    is_tracked = any(name in _TRACKED or name.endswith(".json") for name in names)
+    return not is_tracked and any(Path(name).suffix in IMAGE_SUFFIXES for name in names)
 
 
 def open_pictures(folder: Path) -> PictureFolder:

@@ -11,7 +11,8 @@ overlay  the tracked mesh over the frames, for the eye
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -77,7 +78,7 @@ def track(
             say(f"{out} holds this tracking already")
             return known
         raise UserError(f"{out} exists and is not this tracking: choose another --out, or remove it first")
-    with growing(out) as stages:
+    with growing(out) as stages, _interruptible(out, say):
         work = Work(stages, footage, choices, head, progress)
         look = work.look(seen)
         for note in look.notes:
@@ -129,6 +130,15 @@ def _matte_network() -> str:
 def _left_out(look: Look) -> dict[int, str]:
     lost = np.flatnonzero(~look.landmarks.detected).tolist()
     return {n: "no face was found" if look.pictures[n] >= 0 else "the video has no picture at this time" for n in lost}
+
+
+@contextmanager
+def _interruptible(out: Path, say: Callable[[str], object]) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"interrupted: the same command goes on after the last stage that was complete (beside {out})")
+        raise
 
 
 def _rate_and_length(footage: Footage) -> str:

@@ -18,9 +18,11 @@ from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.avatar_track import read_info
 from data_prep.check.folder import check_tracked_folder
+from data_prep.open import find_head
 from data_prep.track import work
 from data_prep.track.footage import Box
 from data_prep.track.landmarks import load_landmarks
+from data_prep.track.pictures import is_footage
 from data_prep.track.track import Choices, track
 
 pytestmark = [pytest.mark.usefixtures("tracking_models"), pytest.mark.slow]
@@ -95,7 +97,12 @@ def test_it_is_done_once(tracked: Path, video: Path, demo_head_model: Path, caps
 
 
 def test_an_interrupted_run_goes_on(
-    tracked: Path, video: Path, demo_head_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tracked: Path,
+    video: Path,
+    demo_head_model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
@@ -107,6 +114,7 @@ def test_an_interrupted_run_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(work, "head_mask", interrupted)
         assert main(command) == 130
+    assert "interrupted: the same command goes on after the last stage" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == [".me.partial"]
     with monkeypatch.context() as patch:
         for stage in ("look_at", "write_frames", "open_matter", "fit_tracks"):
@@ -137,6 +145,18 @@ def test_the_crop_moves_the_camera_with_it(tracked: Path, video: Path, demo_head
         lambda s: None,
     )
     assert small.intrinsics == pytest.approx([value / 2 for value in info.intrinsics])
+
+
+def test_what_is_to_be_tracked(tracked: Path, video: Path, tmp_path: Path) -> None:
+    assert (
+        is_footage(video) and not is_footage(tracked) and not is_footage(tmp_path) and not is_footage(tmp_path / "no")
+    )
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((8, 8, 3), np.uint8))
+    assert is_footage(tmp_path)
+    (tmp_path / "imgs").mkdir()
+    assert not is_footage(tmp_path)
+    with pytest.raises(UserError, match="me.mp4 is a file; if it is a video, avatar track makes a tracked folder"):
+        find_head(video)
 
 
 def test_own_mattes_win(video: Path, demo_head_model: Path, tmp_path: Path) -> None:
