@@ -168,8 +168,9 @@ def _tracks(
     for row, number in enumerate(arrays["number"].tolist()):
         try:
             values = {name: vector(arrays[name][row], name) for name in ARRAYS}
+            values["R"] = nearest_rotation(values["R"].reshape(3, 3), "R")
             frames[number] = FrameTrack(
-                **values | {"R": nearest_rotation(values["R"].reshape(3, 3), "R")},
+                **values,  # type: ignore[arg-type]  # the names of ARRAYS
                 shape=vector(arrays["shape"], "shape"),
                 intrinsics=np.array(info.intrinsics),
                 size=(info.width, info.height),

@@ -14,7 +14,7 @@ from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from avatar.head.expression_names import load_expression_names
 from data_prep.track.camera import Pinhole
 from data_prep.track.detect import FaceDetector
-from data_prep.track.embedding import LandmarkEmbedding, official_embedding
+from data_prep.track.embedding import LandmarkEmbedding, iris_embedding, official_embedding
 from data_prep.track.fit_result import Clip, Fit
 from data_prep.track.landmark_fit import fit_landmarks
 from data_prep.track.motion import gaze_rotations, rotations
@@ -59,7 +59,9 @@ def fit_tracks(
         for row, number in enumerate(found.frames.tolist())
     }
     fit = Fit(tracks, {})
-    return replace(fit, figures=landmark_figures(head, fit, clip.landmarks, embedding))
+    return replace(
+        fit, figures=landmark_figures(head, fit, clip.landmarks, embedding.with_others(iris_embedding(head)))
+    )
 
 
 def _rendered(head: HeadAssets) -> LandmarkEmbedding:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ _PAUSE = 1.0  # seconds without a picture that count as a cut, if they are also 
 _PAUSES = 5.0
 _SLOW = 8.0  # pictures a second
 _DARK = 12.0  # grey levels: below, a picture is called black
-Progress = Callable[[Iterator[TimedPicture], int | None, str], Iterator[TimedPicture]]
+Progress = Callable[[Iterable[TimedPicture], int | None, str], Iterable[TimedPicture]]
 
 
 @dataclass(frozen=True)
