@@ -18,11 +18,15 @@ from data_prep.track.motion import gaze_rotations, rotations
 SIZE = 384  # pixels, the whole picture
 EYE_DISTANCE = 78.0  # pixels between the eyes' centres of a head seen from in front
 CAMERA_DISTANCE = 14.0  # in distances between the eyes: 0.9 m
-POSE_SPREAD = np.radians([9.0, 16.0, 5.0])  # pitch, yaw, roll
+POSE_SPREAD = np.radians([5.0, 9.0, 4.0])  # pitch, yaw, roll
 POSE_LIMIT = np.radians([20.0, 34.0, 12.0])
 _SKIN = np.array([[0.87, 0.68, 0.58], [0.80, 0.58, 0.47], [0.66, 0.46, 0.36], [0.48, 0.32, 0.24]])  # sRGB
 _IRIS_ANGLE, _PUPIL_ANGLE = np.radians(28.0), np.radians(12.0)  # from the eye's axis
-_BROW_UP, _BROW_HALF_HEIGHT, _BROW_REACH = 0.31, 0.035, 0.34  # in distances between the eyes, from the eye's centre
+# In distances between the eyes, from the eye's centre: as FLAME's embedding has them.
+_BROW_UP, _BROW_BEND, _BROW_HALF_HEIGHT, _BROW_REACH = 0.31, 0.4, 0.04, 0.34
+_HAIR = np.array([[0.10, 0.08, 0.07], [0.22, 0.15, 0.10], [0.45, 0.32, 0.20], [0.55, 0.53, 0.50]])  # sRGB
+_SKY_DIRECTIONS, _SKY_SIZE = 96, 320
+_INSIDE = np.array([0.16, 0.07, 0.06])
 _FLIP = np.diag([1.0, -1.0, -1.0])  # head axes (y up, z forward) in front of an OpenCV camera
 
 
@@ -61,10 +65,12 @@ def render_tinted_heads(assets: HeadAssets, count: int, seed: int = 0) -> Iterat
         pitch, yaw, roll = np.clip(rng.normal(0.0, 1.0, 3) * POSE_SPREAD, -POSE_LIMIT, POSE_LIMIT)
         turn = rotations(torch.tensor([[0.0, yaw, 0.0], [pitch, 0.0, 0.0], [0.0, 0.0, roll]], dtype=torch.float64))
         vertices = head.vertices(params).numpy().astype(np.float64)
-        screen = _project(assets, vertices, (turn[0] @ turn[1] @ turn[2]).numpy())
+        turn = (turn[0] @ turn[1] @ turn[2]).numpy()
+        screen = _project(assets, vertices, turn)
         raster = rasterize_mesh(screen, faces, SIZE, SIZE)
+        with_hair = _project(assets, _raised(vertices, faces, paint.hair * rng.uniform(0.05, 0.3) * paint.unit), turn)
         colours = paint(rng)
-        yield TintedHead(_shade(raster, screen, faces, colours, rng), screen, visible_vertices(raster.depth, screen))
+        yield TintedHead(_shade(with_hair, faces, colours, paint.sky, rng), screen, visible_vertices(raster.depth, screen))
 
 
 def visible_vertices(depth: np.ndarray, screen: np.ndarray, tolerance: float = 3e-3) -> np.ndarray:
@@ -87,59 +93,113 @@ def _project(assets: HeadAssets, vertices: np.ndarray, turn: np.ndarray) -> np.n
 
 
 class _Paint:
-    """Colours of the vertices: skin, brows, lips, eyes."""
+    """Colours of the vertices: skin, hair, brows, lips, eyes."""
 
     def __init__(self, assets: HeadAssets) -> None:
         template, weights = assets.template.numpy(), assets.weights.numpy()
         centres = (assets.joint_regressor @ assets.template).numpy()[[LEFT_EYE, RIGHT_EYE]]
-        unit = np.linalg.norm(centres[0] - centres[1])
+        self.unit = float(np.linalg.norm(centres[0] - centres[1]))
         V = len(template)
         self.lips = np.zeros(V, bool)
         if "lips" in assets.regions:
             self.lips[assets.regions["lips"].numpy()] = True
+        self.sky = _open_sky(template.astype(np.float64), assets.faces.numpy(), self.unit)
+        self.hair = _hair((template - centres.mean(0)) / self.unit)
         self.brows, self.eyes, self.iris, self.pupil = np.zeros(V), np.zeros(V, bool), np.zeros(V, bool), np.zeros(V, bool)
         for joint, centre in zip((LEFT_EYE, RIGHT_EYE), centres, strict=True):
-            offset = template - centre
+            offset = (template - centre) / self.unit
             ball = weights[:, joint] > 0.5
             angle = np.arctan2(np.hypot(offset[:, 0], offset[:, 1]), offset[:, 2])
             self.eyes |= ball
             self.iris |= ball & (angle < _IRIS_ANGLE)
             self.pupil |= ball & (angle < _PUPIL_ANGLE)
-            across, up = np.abs(offset[:, 0]) / unit, offset[:, 1] / unit
-            arch = _BROW_UP - 0.25 * across**2
-            brow = np.exp(-(((up - arch) / _BROW_HALF_HEIGHT) ** 2)) * (across < _BROW_REACH)
-            self.brows = np.maximum(self.brows, np.where(offset[:, 2] > -0.2 * unit, brow, 0.0))
+            arch = _BROW_UP - _BROW_BEND * offset[:, 0] ** 2
+            brow = np.exp(-(((offset[:, 1] - arch) / _BROW_HALF_HEIGHT) ** 2)) * (np.abs(offset[:, 0]) < _BROW_REACH)
+            self.brows = np.maximum(self.brows, np.where(offset[:, 2] > -0.2, brow, 0.0))
 
     def __call__(self, rng: np.random.Generator) -> np.ndarray:
-        """float64 [V, 3]; another skin, other lips, brows and eyes each time."""
+        """float64 [V, 3]; another skin, other hair, lips, brows and eyes each time."""
         tone = rng.uniform(0, len(_SKIN) - 1)
         below = min(int(tone), len(_SKIN) - 2)
         skin = (_SKIN[below] + (tone - below) * (_SKIN[below + 1] - _SKIN[below])) * rng.uniform(0.9, 1.1, 3)
+        hair = _HAIR[rng.integers(len(_HAIR))]
         colours = np.tile(skin, (len(self.lips), 1))
         colours[self.lips] = skin * np.array([0.92, 0.62, 0.62]) * rng.uniform(0.85, 1.0)
-        colours += (self.brows * rng.uniform(0.4, 0.8))[:, None] * (np.array([0.16, 0.11, 0.08]) - colours)
+        colours += self.hair[:, None] * (hair - colours)
+        colours += (self.brows * rng.uniform(0.5, 0.9))[:, None] * (0.8 * hair - colours)
         colours[self.eyes] = 0.93
         colours[self.iris] = np.array([[0.30, 0.19, 0.10], [0.25, 0.36, 0.48], [0.24, 0.32, 0.20]])[rng.integers(3)]
         colours[self.pupil] = 0.04
         return colours
 
 
-def _shade(raster, screen: np.ndarray, faces: np.ndarray, colours: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Diffuse light from above and one side, over a plain background."""
-    corners = screen[faces]
-    # In the picture's own space x : y : z have nearly one scale; good enough for the light.
-    scale = np.array([1.0, 1.0, EYE_DISTANCE * CAMERA_DISTANCE / np.median(screen[:, 2])])
-    a, b = (corners[:, 1] - corners[:, 0]) * scale, (corners[:, 2] - corners[:, 0]) * scale
-    normals = np.cross(a, b)
-    of_vertices = np.zeros_like(screen)
+def _open_sky(points: np.ndarray, faces: np.ndarray, unit: float) -> np.ndarray:
+    """How much of the light from all sides arrives at each vertex [V]: 1 on open ground, dark in nostrils and folds."""
+    normals = _vertex_normals(points, faces)
+    span = 2.2 * np.ptp(points, axis=0).max() / 2
+    arrived, possible = np.zeros(len(points)), np.full(len(points), 1e-9)
+    golden = np.pi * (3.0 - np.sqrt(5.0))
+    for k in range(_SKY_DIRECTIONS):
+        z = 1.0 - (2 * k + 1) / _SKY_DIRECTIONS
+        r = np.sqrt(1.0 - z * z)
+        towards = np.array([r * np.cos(golden * k), r * np.sin(golden * k), z])
+        side = np.cross(towards, [0.3, 1.0, 0.2])
+        side /= np.linalg.norm(side)
+        view = np.stack((side, np.cross(towards, side), -towards))  # rows: right, down, away
+        p = (points - points.mean(0)) @ view.T
+        screen = np.stack(((p[:, 0] / span + 0.5) * _SKY_SIZE, (p[:, 1] / span + 0.5) * _SKY_SIZE, p[:, 2] + 1.0), -1)
+        depth = rasterize_mesh(screen, faces, _SKY_SIZE, _SKY_SIZE).depth
+        cosine = np.clip(normals @ towards, 0.0, None)
+        possible += cosine
+        arrived += cosine * visible_vertices(depth, screen, 0.02 * unit)
+    return arrived / possible
+
+
+def _hair(p: np.ndarray) -> np.ndarray:
+    """How far [V] a vertex is under hair, 0 to 1; `p` is relative to the middle between the eyes, in their distance.
+
+    Above a line that runs from the hairline in front, over the temples and above the ears, down to the nape.
+    """
+    front, back = 1.0, -0.9  # heights of the hairline
+    along = np.clip((0.25 - p[:, 2]) / 2.2, 0.0, 1.0)  # from the forehead to the back of the head
+    line = front + (back - front) * along**1.5
+    return np.clip((p[:, 1] - line) / 0.12 + 0.5, 0.0, 1.0)
+
+
+def _raised(vertices: np.ndarray, faces: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Vertices moved along their normals, metres."""
+    return vertices + height[:, None] * _vertex_normals(vertices, faces)
+
+
+def _vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corners = points[faces]
+    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(points)
     for k in range(3):
-        np.add.at(of_vertices, faces[:, k], normals)
-    of_vertices /= np.maximum(np.linalg.norm(of_vertices, axis=1, keepdims=True), 1e-12)
+        np.add.at(normals, faces[:, k], of_faces)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _shade(
+    screen: np.ndarray, faces: np.ndarray, colours: np.ndarray, sky: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Light from all sides, a lamp above and to one side and its reflection on the skin; what is seen from inside is dark."""
+    raster = rasterize_mesh(screen, faces, SIZE, SIZE)
+    # With depth in the scale of the pixels, the picture's own space is near enough to a Euclidean one for the light.
+    in_pixels = screen * np.array([1.0, 1.0, EYE_DISTANCE * CAMERA_DISTANCE / np.median(screen[:, 2])])
+    normals = _vertex_normals(in_pixels, faces)
     light = np.array([rng.uniform(-0.7, 0.7), -0.5, -1.0])  # towards the light; y points down, z away
-    lit = np.clip(of_vertices @ (light / np.linalg.norm(light)), 0.0, 1.0)
-    shaded = colours * (0.45 + 0.6 * lit)[:, None]
+    light /= np.linalg.norm(light)
+    lit = np.clip(normals @ light, 0.0, 1.0) * sky
+    halfway = (light + np.array([0.0, 0.0, -1.0])) / np.linalg.norm(light + np.array([0.0, 0.0, -1.0]))
+    gloss = rng.uniform(0.0, 0.25) * np.clip(normals @ halfway, 0.0, 1.0) ** 20 * sky
+    shaded = colours * (0.5 * sky + 0.55 * lit)[:, None] + gloss[:, None]
     image = np.tile(rng.uniform(0.2, 0.8, 3), (SIZE, SIZE, 1))
     covered = raster.face_id >= 0
     at = faces[raster.face_id[covered]]
-    image[covered] = np.einsum("nk,nkc->nc", raster.barycentric[covered], shaded[at])
+    seen = np.einsum("nk,nkc->nc", raster.barycentric[covered], shaded[at])
+    a, b = screen[at[:, 1], :2] - screen[at[:, 0], :2], screen[at[:, 2], :2] - screen[at[:, 0], :2]
+    inside_out = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0  # outside, corners run counter-clockwise; y points down
+    seen[inside_out] = _INSIDE
+    image[covered] = seen
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
