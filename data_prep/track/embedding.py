@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.checkpoint import write_atomically
-from avatar.data_prep.safe_pickle import load_npz
+from avatar.files.atomic import write_atomically
+from avatar.files.pickles import load_npz
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE

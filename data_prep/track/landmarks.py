@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from avatar.checkpoint import write_atomically
-from avatar.data_prep.safe_pickle import load_npz
+from avatar.files.atomic import write_atomically
+from avatar.files.pickles import load_npz
 from avatar.errors import UserError
 
 NUM_POINTS = 478  # 468 of the face mesh, then five of each iris

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from avatar.data_prep.prepare import cache_folder
+from data_prep.prepare import cache_folder
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
