@@ -77,6 +77,7 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Foca
         Figure("frames with a face", 100 * seen, "%", 99, 90, "light the face, and keep it in the picture", True),
         Figure("landmark error", shots.pop("all"), "% eyes", 1.0, 2.0, "is the head model's landmark embedding right?"),
         *(Figure(f"  of the {name}", value, "% eyes", 1.0, 2.0) for name, value in shots.items()),
+        Figure("  the same in all frames, besides", own["constant"], "% eyes"),
         Figure("jitter, against the landmarks' own", own["jitter"], "x", 1.0, 1.2, "a steadier camera and more light"),
         Figure(
             "mesh above the neck on the matte", 100 * float(np.mean(overlaps)), "%", 98, 95,
@@ -112,14 +113,17 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
     """Errors of the landmarks of every group, jitter and the worst frames, as JSON.
 
     Errors are mean distances between the embedded and the detected landmarks, in per cent of the distance between the
-    irises in the picture (its 90th percentile over the clip, since turned heads show it shorter).
+    irises in the picture (its 90th percentile over the clip, since turned heads show it shorter). What is the same in all
+    frames is told apart: it is where the embedding lies on this face, and not an error of the tracking.
     """
     rows = list(fit.tracks)
     placed = _placed(head, fit, embedding)
     observed = landmarks.points[rows][:, embedding.landmarks, :2]
     eyes = np.linalg.norm(landmarks.points[rows][:, LEFT_IRIS, :2] - landmarks.points[rows][:, RIGHT_IRIS, :2], axis=1)
     unit = float(np.percentile(eyes, 90)) / 100.0
-    error = np.linalg.norm(placed - observed, axis=2) / unit  # [T, L]
+    residual = (placed - observed) / unit
+    constant = residual.mean(0)
+    error = np.linalg.norm(residual - constant, axis=2)  # [T, L]
     groups = {name: np.isin(embedding.landmarks, members) for name, members in GROUPS.items()}
     features = np.any(list(groups.values()), axis=0)
     per_frame = error[:, features].mean(1)
@@ -128,6 +132,7 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
     worst = [rows[i] for i in np.argsort(-per_frame)[:_WORST]]
     return {
         "errors": errors,
+        "constant": float(np.linalg.norm(constant[features], axis=1).mean()),
         "jitter": _jitter(placed[:, features]) / max(_jitter(observed[:, features]), 1e-9),
         "worst_frames": sorted(worst),
         "identity": float(np.abs(next(iter(fit.tracks.values())).shape).max()),
