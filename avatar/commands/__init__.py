@@ -21,6 +21,7 @@ MODULES = {
     "demo-data": "demonstrating",
     "demo": "demonstrating",
     "bench": "benchmarking",
+    "sweep": "sweeping",
     "doctor": "diagnosing",
     "models": "third_party",
 }
