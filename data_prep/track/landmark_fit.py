@@ -23,14 +23,14 @@ from data_prep.track.embedding import LandmarkEmbedding, as_points, iris_embeddi
 from data_prep.track.expression_kind import is_statistical, used_expressions
 from data_prep.track.landmark_term import LandmarkTerm
 from data_prep.track.landmarks import Landmarks
-from data_prep.track.levenberg import SharedPrior, minimise
+from data_prep.track.levenberg import IdentityPrior, minimise
 from data_prep.track.motion import Columns, Motion, at_rest
 from data_prep.track.priors import Priors, make_priors
 from data_prep.track.smoothness import make_smoothness
 from data_prep.track.start import start_poses
 from data_prep.track.surface import SurfacePoints
 
-POINT_SHARE = 0.008  # of the distance between the eyes: the landmarks' standard deviation
+POINT_SHARE = 0.02  # of the distance between the eyes: the landmarks' standard deviation
 ROBUST, ROBUST_PAIRS = 4.0, 3.0  # scale of the loss, in those deviations
 FEATURE_WEIGHTS = {groups.LIPS: 1.3, groups.LIDS: 1.3, groups.BROWS: 0.6, groups.NOSE: 1.0}
 OTHER_WEIGHT = 0.12  # of landmarks between the features
@@ -38,12 +38,7 @@ OTHER_DISTANCE = 0.16  # in distances between the eyes: nearer than that to lips
 IRIS_WEIGHT = 4.0
 PAIR_WEIGHT = 2.0
 IDENTITIES = 100  # coefficients that are fitted; the others add less than landmarks can tell
-IDENTITY_WEIGHT = 1.0
-CLIP_WORTH = 1.0
-OFFSET_WORTH = 120.0
-# Standard deviations of a person's landmarks about the embedding, in distances between the eyes.
-BIASES = {groups.LIPS: 0.015, groups.LIDS: 0.015, groups.BROWS: 0.03, groups.NOSE: 0.015, (groups.LEFT_IRIS, groups.RIGHT_IRIS): 0.015}
-OTHER_BIAS = 0.03
+CLIP_WORTH = 1.0  # the clip tells as much about the identity as this many independent frames
 KEY_FRAMES = 120
 IDENTITY_ITERATIONS, MOTION_ITERATIONS = 15, 12
 
@@ -51,7 +46,6 @@ IDENTITY_ITERATIONS, MOTION_ITERATIONS = 15, 12
 @dataclass(frozen=True)
 class LandmarkFit:
     identity: Float[Tensor, " I"]
-    shared: Float[Tensor, " G"]
     motion: Motion  # of the frames in `frames`
     frames: Int[Tensor, " T"]  # numbers of the frames with a face
     expressions: Int[Tensor, " E"]  # the head model's coefficients that `motion` holds
@@ -71,7 +65,7 @@ def fit_landmarks(
     )
     expressions, statistical = used_expressions(assets), is_statistical(assets)
     identities = min(IDENTITIES, _last_used(assets.shape_dirs) + 1)
-    term, term_bias = make_landmark_term(assets, embedding, seen, camera, identities, expressions)
+    term = make_landmark_term(assets, embedding, seen, camera, identities, expressions)
     R, t = _start(assets, embedding, seen, camera)
     term = _with_unit(term, assets, camera, t)
     priors = make_priors(seen, names, expressions, statistical)
@@ -83,19 +77,18 @@ def fit_landmarks(
     motion = at_rest(R, t, len(expressions)).moved(
         torch.cat((torch.zeros(len(R), 6, dtype=torch.float64), _plausible(priors)), dim=1)
     )
-    shared = torch.zeros(identities + 3 * term.points.num_points, dtype=torch.float64)
-    precision = torch.cat((torch.full((identities,), IDENTITY_WEIGHT, dtype=torch.float64), term_bias.repeat_interleave(3).pow(-2)))
+    identity = torch.zeros(identities, dtype=torch.float64)
     key = torch.from_numpy(np.unique(np.linspace(0, len(frames) - 1, min(KEY_FRAMES, len(frames))).round().astype(int)))
     first = minimise(
-        (term.take(key), priors.take(key), SharedPrior(precision * torch.where(torch.arange(len(precision)) < identities, len(key) / CLIP_WORTH, len(key) / OFFSET_WORTH))),
-        shared, motion[key], columns, IDENTITY_ITERATIONS, with_shared=True, coupled=False,
+        (term.take(key), priors.take(key), IdentityPrior(len(key) / CLIP_WORTH)),
+        identity, motion[key], columns, IDENTITY_ITERATIONS, with_identity=True, coupled=False,
     )  # fmt: skip
-    shared = first.shared
+    identity = first.identity
     second = minimise(
-        (term, priors, smoothness), shared, motion, columns, MOTION_ITERATIONS, with_shared=False, coupled=True
+        (term, priors, smoothness), identity, motion, columns, MOTION_ITERATIONS, with_identity=False, coupled=True
     )
     return LandmarkFit(
-        shared[:identities], shared, second.motion, torch.from_numpy(frames), expressions, columns, term, priors, smoothness,
+        identity, second.motion, torch.from_numpy(frames), expressions, columns, term, priors, smoothness,
         (first.costs, second.costs),
     )  # fmt: skip
 
@@ -107,7 +100,7 @@ def make_landmark_term(
     camera: Pinhole,
     identities: int,
     expressions: Int[Tensor, " E"],
-) -> tuple[LandmarkTerm, Float[Tensor, " L"]]:
+) -> LandmarkTerm:
     """The term of the frames of `seen`; its unit is one pixel as yet."""
     embedding = embedding.with_others(iris_embedding(assets))
     weight = _landmark_weights(assets, embedding)
@@ -124,10 +117,6 @@ def make_landmark_term(
         if a in row and b in row
     ]
     T = len(seen)
-    bias = np.full(len(embedding), OTHER_BIAS)
-    for group, share in BIASES.items():
-        bias[np.isin(embedding.landmarks, group)] = share
-    bias = torch.from_numpy(bias * eye_distance(assets))
     return LandmarkTerm(
         points=SurfacePoints(assets, *as_points(embedding), identities, expressions),
         camera=camera,
@@ -138,7 +127,7 @@ def make_landmark_term(
         pair_weights=torch.full((T, len(pairs)), PAIR_WEIGHT, dtype=torch.float64),
         scale=ROBUST,
         pair_scale=ROBUST_PAIRS,
-    ), bias
+    )
 
 
 def _landmark_weights(assets: HeadAssets, embedding: LandmarkEmbedding) -> np.ndarray:

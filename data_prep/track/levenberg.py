@@ -19,18 +19,18 @@ CONVERGED = 1e-4  # relative decrease of the cost below which the fit has come t
 
 
 class Term(Protocol):
-    """A part of the cost. What all frames share is one of the unknowns only where the equations have shared columns."""
+    """A part of the cost. The identity is one of the unknowns only where the equations have shared columns."""
 
-    def cost(self, shared: Float[Tensor, " G"], motion: Motion) -> float: ...
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float: ...
 
     def add_to(
-        self, equations: NormalEquations, shared: Float[Tensor, " G"], motion: Motion, columns: Int[Tensor, " D"]
+        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
     ) -> None: ...
 
 
 @dataclass(frozen=True)
 class Fitted:
-    shared: Float[Tensor, " G"]
+    identity: Float[Tensor, " I"]
     motion: Motion
     costs: tuple[float, ...]  # of the start and of every accepted step
     rejected: int
@@ -38,67 +38,67 @@ class Fitted:
 
 def minimise(
     terms: Sequence[Term],
-    shared: Float[Tensor, " G"],
+    identity: Float[Tensor, " I"],
     motion: Motion,
     columns: Int[Tensor, " D"],
     iterations: int,
-    with_shared: bool,
+    with_identity: bool,
     coupled: bool,
 ) -> Fitted:
-    """At most `iterations` steps, accepted or not, of the given columns of all frames, and of what they share if asked for."""
+    """At most `iterations` steps, accepted or not, of the given columns of all frames, and of the identity if asked for."""
     damping, rejected = FIRST_DAMPING, 0
-    costs = [_total(terms, shared, motion)]
+    costs = [_total(terms, identity, motion)]
     equations: NormalEquations | None = None
     for _ in range(iterations):
         if equations is None:
-            equations = NormalEquations.zeros(len(motion), len(columns), len(shared) if with_shared else 0, coupled)
+            equations = NormalEquations.zeros(len(motion), len(columns), len(identity) if with_identity else 0, coupled)
             for term in terms:
-                term.add_to(equations, shared, motion, columns)
+                term.add_to(equations, identity, motion, columns)
         try:
             step = solve(equations, damping)
         except NotPositiveDefinite:
             damping *= 10.0
             continue
         new_motion = motion.moved(spread(step.frames, columns, motion.expression.shape[1]))
-        new_shared = shared + step.shared if with_shared else shared
-        cost = _total(terms, new_shared, new_motion)
+        new_identity = identity + step.shared if with_identity else identity
+        cost = _total(terms, new_identity, new_motion)
         if not cost < costs[-1]:  # not a number is not less
             rejected += 1
             damping *= 8.0
             if damping > MOST_DAMPING:
                 break
             continue
-        shared, motion, equations = new_shared, new_motion, None
+        identity, motion, equations = new_identity, new_motion, None
         costs.append(cost)
         damping = max(damping / 4.0, LEAST_DAMPING)
         if costs[-2] - cost < CONVERGED * cost:
             break
-    return Fitted(shared, motion, tuple(costs), rejected)
+    return Fitted(identity, motion, tuple(costs), rejected)
 
 
-def _total(terms: Sequence[Term], shared: Tensor, motion: Motion) -> float:
-    return sum(term.cost(shared, motion) for term in terms)
+def _total(terms: Sequence[Term], identity: Tensor, motion: Motion) -> float:
+    return sum(term.cost(identity, motion) for term in terms)
 
 
 @dataclass(frozen=True)
-class SharedPrior:
-    """Half the squares of what all frames share, in standard deviations."""
+class IdentityPrior:
+    """Half the squares of the identity coefficients, whose unit is their standard deviation, times `weight`."""
 
-    precision: Float[Tensor, " G"]  # 1 / variance
+    weight: float
 
-    def cost(self, shared: Float[Tensor, " G"], motion: Motion) -> float:  # noqa: ARG002
-        return float(0.5 * (self.precision * shared**2).sum())
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:  # noqa: ARG002
+        return float(0.5 * self.weight * (identity @ identity))
 
     def add_to(
         self,
         equations: NormalEquations,
-        shared: Float[Tensor, " G"],
+        identity: Float[Tensor, " I"],
         motion: Motion,  # noqa: ARG002
         columns: Int[Tensor, " D"],  # noqa: ARG002
     ) -> None:
         if len(equations.shared):
-            equations.shared.diagonal().add_(self.precision)
-            equations.shared_gradient += self.precision * shared
+            equations.shared.diagonal().add_(self.weight)
+            equations.shared_gradient += self.weight * identity
 
 
 def concatenated(parts: Sequence[Motion]) -> Motion:

@@ -47,6 +47,25 @@ class NormalEquations:
         )
 
 
+    def add_rows(
+        self,
+        frames: slice,
+        rows: Float[Tensor, "R T D"],
+        residuals: Float[Tensor, "R T"],
+        shared: Float[Tensor, "R T H"] | None,
+    ) -> None:
+        """Add R residuals of each of some frames with their derivatives; `shared` by the first H shared unknowns."""
+        by_frame = rows.permute(1, 2, 0)
+        self.diagonal[frames] += by_frame @ rows.transpose(0, 1)
+        self.gradient[frames] += torch.einsum("rtd,rt->td", rows, residuals)
+        if shared is not None:
+            own = slice(0, shared.shape[-1])
+            self.border[frames, :, own] += by_frame @ shared.transpose(0, 1)
+            flat = shared.flatten(0, 1)
+            self.shared[own, own] += flat.T @ flat
+            self.shared_gradient[own] += flat.T @ residuals.flatten()
+
+
 @dataclass(frozen=True)
 class Step:
     frames: Float[Tensor, "T D"]

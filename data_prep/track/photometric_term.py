@@ -35,8 +35,8 @@ class PhotometricTerm:
     wanted: Float[Tensor, "T N"]
     weights: Float[Tensor, "T N"]  # 0 where a point is not seen
 
-    def cost(self, shared: Float[Tensor, " G"], motion: Motion) -> float:
-        identity, total = shared[: self.points.num_identities], 0.0
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
+        total = 0.0
         for chunk in _chunks(len(motion)):
             at = to_camera(motion[chunk], self.points.positions(identity, motion[chunk]))
             residuals = self._residuals(self.camera.project(at), chunk)[0]
@@ -45,9 +45,8 @@ class PhotometricTerm:
         return total
 
     def add_to(
-        self, equations: NormalEquations, shared: Float[Tensor, " G"], motion: Motion, columns: Int[Tensor, " D"]
+        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
     ) -> None:
-        identity = shared[: self.points.num_identities]
         with_identity = len(equations.shared) > 0
         for chunk in _chunks(len(motion)):
             moving = motion[chunk]
@@ -61,16 +60,7 @@ class PhotometricTerm:
             pose = by_pose(moving, at, slopes)[:, :, 0].transpose(0, 1)  # [N, T, 6]
             J = frame_columns(pose, derivatives, columns)
             r = (residuals * robust).T
-            by_frame = J.permute(1, 2, 0)
-            equations.diagonal[chunk] += by_frame @ J.transpose(0, 1)
-            equations.gradient[chunk] += torch.einsum("ntd,nt->td", J, r)
-            if with_identity:
-                S = derivatives.identity
-                own = slice(0, len(identity))
-                equations.border[chunk, :, own] += by_frame @ S.transpose(0, 1)
-                flat = S.flatten(0, 1)
-                equations.shared[own, own] += flat.T @ flat
-                equations.shared_gradient[own] += flat.T @ r.reshape(-1)
+            equations.add_rows(chunk, J, r, derivatives.identity if with_identity else None)
 
     def _residuals(self, pixels: Float[Tensor, "T N 2"], chunk: slice) -> tuple[Tensor, Tensor]:
         """In deviations [T, N], and their derivatives by the pixels [T, N, 2]."""

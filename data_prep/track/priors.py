@@ -14,7 +14,7 @@ from data_prep.track.motion import Columns, Motion
 from data_prep.track.normal_equations import NormalEquations
 
 SCORE_SHARE = 0.7  # of a blendshape's score is expected in its coefficient
-EXPRESSION_DEVIATION = 0.35  # of coefficients that go from 0 to 1
+EXPRESSION_DEVIATION = 0.25  # of coefficients that go from 0 to 1
 STATISTICAL_DEVIATION = 1.0  # of principal components, whose unit is their standard deviation
 EYELID_DEVIATION = 0.25
 JAW_PER_SCORE = 0.3  # radians that jawOpen = 1 stands for
@@ -41,7 +41,7 @@ class Priors:
     def take(self, frames: slice | Tensor) -> Priors:
         return Priors(self.mean[frames], self.precision, self.low, self.high)
 
-    def cost(self, shared: Float[Tensor, " G"], motion: Motion) -> float:  # noqa: ARG002
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:  # noqa: ARG002
         values = motion.coefficients()
         outside = values - values.clamp(self.low, self.high)
         tie = _between_eyes(motion) / torch.tensor(EYES_TIED, dtype=values.dtype)
@@ -51,7 +51,7 @@ class Priors:
     def add_to(
         self,
         equations: NormalEquations,
-        shared: Float[Tensor, " G"],  # noqa: ARG002
+        identity: Float[Tensor, " I"],  # noqa: ARG002
         motion: Motion,
         columns: Int[Tensor, " D"],
     ) -> None:

@@ -25,8 +25,9 @@ _IRIS_ANGLE, _PUPIL_ANGLE = np.radians(28.0), np.radians(12.0)  # from the eye's
 # In distances between the eyes, from the eye's centre: as FLAME's embedding has them.
 _BROW_UP, _BROW_BEND, _BROW_HALF_HEIGHT, _BROW_REACH = 0.31, 0.4, 0.04, 0.34
 _HAIR = np.array([[0.10, 0.08, 0.07], [0.22, 0.15, 0.10], [0.45, 0.32, 0.20], [0.55, 0.53, 0.50]])  # sRGB
+_GAMMA = 2.2
 _SKY_DIRECTIONS, _SKY_SIZE = 96, 320
-_INSIDE = np.array([0.16, 0.07, 0.06])
+_INSIDE = np.array([0.02, 0.004, 0.003])  # linear
 _FLIP = np.diag([1.0, -1.0, -1.0])  # head axes (y up, z forward) in front of an OpenCV camera
 
 
@@ -183,18 +184,18 @@ def _vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def _shade(
     screen: np.ndarray, faces: np.ndarray, colours: np.ndarray, sky: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Light from all sides, a lamp above and to one side and its reflection on the skin; what is seen from inside is dark."""
+    """Light from all sides, a lamp in front and its reflection on the skin; what is seen from inside is dark."""
     raster = rasterize_mesh(screen, faces, SIZE, SIZE)
     # With depth in the scale of the pixels, the picture's own space is near enough to a Euclidean one for the light.
     in_pixels = screen * np.array([1.0, 1.0, EYE_DISTANCE * CAMERA_DISTANCE / np.median(screen[:, 2])])
     normals = _vertex_normals(in_pixels, faces)
-    light = np.array([rng.uniform(-0.7, 0.7), -0.5, -1.0])  # towards the light; y points down, z away
+    light = np.array([rng.uniform(-0.7, 0.7), rng.uniform(-0.6, 0.5), -1.0])  # towards the light; y points down, z away
     light /= np.linalg.norm(light)
     lit = np.clip(normals @ light, 0.0, 1.0) * sky
     halfway = (light + np.array([0.0, 0.0, -1.0])) / np.linalg.norm(light + np.array([0.0, 0.0, -1.0]))
-    gloss = rng.uniform(0.0, 0.25) * np.clip(normals @ halfway, 0.0, 1.0) ** 20 * sky
-    shaded = colours * (0.5 * sky + 0.55 * lit)[:, None] + gloss[:, None]
-    image = np.tile(rng.uniform(0.2, 0.8, 3), (SIZE, SIZE, 1))
+    gloss = rng.uniform(0.0, 0.2) * np.clip(normals @ halfway, 0.0, 1.0) ** 20 * sky
+    shaded = colours**_GAMMA * (0.5 * sky + 0.55 * lit)[:, None] + gloss[:, None]
+    image = np.tile(rng.uniform(0.1, 0.6, 3), (SIZE, SIZE, 1))
     covered = raster.face_id >= 0
     at = faces[raster.face_id[covered]]
     seen = np.einsum("nk,nkc->nc", raster.barycentric[covered], shaded[at])
@@ -202,4 +203,4 @@ def _shade(
     inside_out = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0  # outside, corners run counter-clockwise; y points down
     seen[inside_out] = _INSIDE
     image[covered] = seen
-    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return np.rint(np.clip(image, 0, 1) ** (1 / _GAMMA) * 255).astype(np.uint8)
