@@ -27,7 +27,9 @@ def frame_columns(
     fixed = columns[columns < Columns.EXPRESSION.start]
     expressions = columns[len(fixed) :] - Columns.EXPRESSION.start
     whole = len(expressions) == derivatives.expression.shape[-1]
-    return torch.cat((head[..., fixed], derivatives.expression if whole else derivatives.expression[..., expressions]), -1)
+    return torch.cat(
+        (head[..., fixed], derivatives.expression if whole else derivatives.expression[..., expressions]), -1
+    )
 
 
 def spread(step: Float[Tensor, "T D"], columns: Int[Tensor, " D"], expressions: int) -> Float[Tensor, "T C"]:

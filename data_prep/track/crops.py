@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +15,7 @@ Images = Callable[[int], UInt8[np.ndarray, "H W 3"]]
 Mattes = Callable[[int], UInt8[np.ndarray, "H W"]]
 
 MARGIN = 0.12  # of the face's box, on every side
-MOST_PIXELS = 2**31  # of all crops together, 2 GiB; beyond it they are made smaller
+MOST_PIXELS = 2**29  # of all crops and mattes together; beyond it they are made smaller
 
 
 @dataclass(frozen=True)
@@ -27,18 +27,17 @@ class Crops:
     origin: Float[Tensor, "T 2"]  # pixels of the frame at the crop's upper left corner
     scale: float
 
-    def to_crop(self, pixels: Float[Tensor, "T N 2"]) -> Float[Tensor, "T N 2"]:
-        """Pixels of the frames -> pixels of the crops (centres at +0.5 in both)."""
-        return (pixels - self.origin[:, None]) * self.scale
+    def to_crop(self, pixels: Float[Tensor, "T N 2"], frames: slice) -> Float[Tensor, "T N 2"]:
+        """Pixels of the given frames -> pixels of their crops (centres at +0.5 in both)."""
+        return (pixels - self.origin[frames, None]) * self.scale
 
 
 def cut_out(
     images: Images,
     mattes: Mattes,
-    frames: list[int],
+    frames: Iterable[int],
     boxes: Float[np.ndarray, "T 4"],
     scale: float,
-    progress: Callable[[int], object] = lambda _: None,
 ) -> Crops:
     """Read the frames one after the other and keep the grey values around `boxes` (left, top, right, bottom in pixels).
 
@@ -46,17 +45,16 @@ def cut_out(
     """
     middle = 0.5 * (boxes[:, :2] + boxes[:, 2:])
     size = (1 + 2 * MARGIN) * (boxes[:, 2:] - boxes[:, :2]).max(0)  # one size for all
-    scale = min(scale, float(np.sqrt(MOST_PIXELS / (2 * len(frames) * size.prod()))))
+    scale = min(scale, float(np.sqrt(MOST_PIXELS / (2 * len(boxes) * size.prod()))))
     w, h = (int(np.ceil(s * scale)) for s in size)
     origin = middle - 0.5 * np.array([w, h]) / scale
-    grey, matte = np.zeros((len(frames), h, w), np.uint8), np.zeros((len(frames), h, w), np.uint8)
+    grey, matte = np.zeros((len(boxes), h, w), np.uint8), np.zeros((len(boxes), h, w), np.uint8)
     for k, frame in enumerate(frames):
         # The centre of crop pixel i lies at origin + (i + 0.5) / scale; cv2 counts centres as whole numbers.
-        to_frame = np.array([[1 / scale, 0, origin[k, 0] + 0.5 / scale - 0.5], [0, 1 / scale, origin[k, 1] + 0.5 / scale - 0.5]])
+        to_frame = np.column_stack((np.eye(2) / scale, origin[k] + 0.5 / scale - 0.5))
         image = cv2.cvtColor(images(frame), cv2.COLOR_RGB2GRAY)
         grey[k] = _resampled(image, to_frame, w, h, scale)
         matte[k] = _resampled(mattes(frame), to_frame, w, h, scale)
-        progress(k)
     return Crops(grey, matte, torch.from_numpy(origin), scale)
 
 
@@ -83,7 +81,7 @@ class BlurredCrops:
     ) -> tuple[Float[Tensor, "T N"], Float[Tensor, "T N 2"]]:
         """Values and derivatives by the frames' pixels, at pixels of the frames; the border goes on for ever."""
         own = self._crops
-        at = (pixels - own.origin[frames, None]) * own.scale
+        at = own.to_crop(pixels, frames)
         x, y = at[..., 0], at[..., 1]
         middle = self._at(x, y, frames)
         dx = self._at(x + 0.5, y, frames) - self._at(x - 0.5, y, frames)

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.pickles import load_npz
-from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.landmark_groups import LEFT_IRIS, NUM_MESH, RIGHT_IRIS
@@ -53,7 +53,9 @@ def official_embedding(head: Path, assets: HeadAssets) -> LandmarkEmbedding | No
     arrays = load_npz(path)
     missing = [key for key in ("lmk_face_idx", "lmk_b_coords", "landmark_indices") if key not in arrays]
     if missing:
-        raise UserError(f"{path} is not FLAME's MediaPipe embedding: it lacks {', '.join(missing)}; remove or replace it")
+        raise UserError(
+            f"{path} is not FLAME's MediaPipe embedding: it lacks {', '.join(missing)}; remove or replace it"
+        )
     return checked_embedding(
         path, arrays["landmark_indices"], arrays["lmk_face_idx"], arrays["lmk_b_coords"], assets.faces.numpy()
     )
@@ -100,9 +102,7 @@ def iris_embedding(assets: HeadAssets) -> LandmarkEmbedding:
 
 def save_embedding(path: Path, embedding: LandmarkEmbedding) -> None:
     buffer = io.BytesIO()
-    np.savez(
-        buffer, landmarks=embedding.landmarks, corners=embedding.corners, barycentric=embedding.barycentric
-    )
+    np.savez(buffer, landmarks=embedding.landmarks, corners=embedding.corners, barycentric=embedding.barycentric)
     write_atomically(path, buffer.getvalue())
 
 
@@ -113,7 +113,7 @@ def load_embedding(path: Path, assets: HeadAssets) -> LandmarkEmbedding | None:
         found = LandmarkEmbedding(arrays["landmarks"], arrays["corners"], arrays["barycentric"])
         L = len(found.landmarks)
         fits = found.corners.shape == found.barycentric.shape == (L, 3) and L > 0
-        in_range = fits and 0 <= found.corners.min() and found.corners.max() < assets.num_vertices
+        in_range = fits and found.corners.min() >= 0 and found.corners.max() < assets.num_vertices
         return found if in_range and np.isfinite(found.barycentric).all() else None
     except (UserError, KeyError, ValueError, TypeError):
         return None

@@ -6,7 +6,7 @@ identity, smooth over time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from data_prep.track.landmarks import Landmarks
 from data_prep.track.levenberg import IdentityPrior, minimise
 from data_prep.track.motion import Columns, Motion, at_rest
 from data_prep.track.priors import Priors, make_priors
-from data_prep.track.smoothness import make_smoothness
+from data_prep.track.smoothness import Smoothness, make_smoothness
 from data_prep.track.start import start_poses
 from data_prep.track.surface import SurfacePoints
 
@@ -52,7 +52,7 @@ class LandmarkFit:
     columns: Int[Tensor, " D"]  # of a step, that are free
     term: LandmarkTerm
     priors: Priors
-    smoothness: object
+    smoothness: Smoothness
     costs: tuple[tuple[float, ...], ...]
 
 
@@ -118,6 +118,7 @@ def make_landmark_term(
     ]
     T = len(seen)
     return LandmarkTerm(
+        landmarks=embedding.landmarks,
         points=SurfacePoints(assets, *as_points(embedding), identities, expressions),
         camera=camera,
         observed=torch.from_numpy(seen.points[:, embedding.landmarks, :2].astype(np.float64)),
@@ -158,7 +159,7 @@ def _start(assets: HeadAssets, embedding: LandmarkEmbedding, seen: Landmarks, ca
 
 def _with_unit(term: LandmarkTerm, assets: HeadAssets, camera: Pinhole, t: Tensor) -> LandmarkTerm:
     unit = POINT_SHARE * eye_distance(assets) * camera.fx / t[:, 2]
-    return LandmarkTerm(**(term.__dict__ | {"unit": unit}))
+    return replace(term, unit=unit)
 
 
 def _plausible(priors: Priors) -> Float[Tensor, "T C"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -25,6 +26,7 @@ class LandmarkTerm:
     Each residual r adds w c^2/2 log(1 + |r|^2 / c^2) (Cauchy's loss with scale c, so that outliers count little).
     """
 
+    landmarks: Int[np.ndarray, " L"]  # MediaPipe's numbers
     points: SurfacePoints
     camera: Pinhole
     observed: Float[Tensor, "T L 2"]  # pixels
@@ -57,7 +59,7 @@ class LandmarkTerm:
     def add_to(
         self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
     ) -> None:
-        """Add the Gauss-Newton Hessian and the gradient by the given columns of a step, and by the identity where that is shared."""
+        """Add the Gauss-Newton Hessian and the gradient by columns of a step, and by the identity where that is shared."""
         with_identity = len(equations.shared) > 0
         for chunk in _chunks(len(motion)):
             part, moving = self.take(chunk), motion[chunk]

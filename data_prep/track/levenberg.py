@@ -86,15 +86,15 @@ class IdentityPrior:
 
     weight: float
 
-    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:  # noqa: ARG002
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
         return float(0.5 * self.weight * (identity @ identity))
 
     def add_to(
         self,
         equations: NormalEquations,
         identity: Float[Tensor, " I"],
-        motion: Motion,  # noqa: ARG002
-        columns: Int[Tensor, " D"],  # noqa: ARG002
+        motion: Motion,
+        columns: Int[Tensor, " D"],
     ) -> None:
         if len(equations.shared):
             equations.shared.diagonal().add_(self.weight)

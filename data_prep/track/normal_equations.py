@@ -46,7 +46,6 @@ class NormalEquations:
             empty(G),
         )
 
-
     def add_rows(
         self,
         frames: slice,
@@ -95,11 +94,8 @@ def solve(equations: NormalEquations, damping: float) -> Step:
         G = len(shared)
         schur = shared - torch.einsum("tdg,tdh->gh", equations.border, Ainv_B)
         rest = equations.shared_gradient - torch.einsum("tdg,td->g", equations.border, Ainv_a)
-        if G:
-            by_shared = -torch.cholesky_solve(rest[:, None], torch.linalg.cholesky(schur))[:, 0]
-        else:
-            by_shared = rest
-    except torch.linalg.LinAlgError as error:
+        by_shared = -torch.cholesky_solve(rest[:, None], torch.linalg.cholesky(schur))[:, 0] if G else rest
+    except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
         raise NotPositiveDefinite(str(error)) from None
     by_frames = -Ainv_a - Ainv_B @ by_shared
     # Of 1/2 x' H x + g' x with the damped H: half of -g' x at its minimum; the undamped model promises more.

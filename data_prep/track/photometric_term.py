@@ -79,7 +79,7 @@ def mean_texture(
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, " T"]]:
     """The grey value of every point and the gain of every frame whose products are nearest to `values`.
 
-    Alternating weighted least squares, reweighted for Cauchy's loss; the gains have mean 1. Points that no frame sees are 0.
+    Alternating weighted least squares, reweighted for Cauchy's loss; the gains have mean 1. Unseen points are 0.
     """
     gain = values.new_ones(len(values))
     robust = weights

@@ -41,7 +41,7 @@ class Priors:
     def take(self, frames: slice | Tensor) -> Priors:
         return Priors(self.mean[frames], self.precision, self.low, self.high)
 
-    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:  # noqa: ARG002
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
         values = motion.coefficients()
         outside = values - values.clamp(self.low, self.high)
         tie = _between_eyes(motion) / torch.tensor(EYES_TIED, dtype=values.dtype)
@@ -51,7 +51,7 @@ class Priors:
     def add_to(
         self,
         equations: NormalEquations,
-        identity: Float[Tensor, " I"],  # noqa: ARG002
+        identity: Float[Tensor, " I"],
         motion: Motion,
         columns: Int[Tensor, " D"],
     ) -> None:
@@ -74,7 +74,7 @@ class Priors:
         at = len(columns) - len(moved)
         equations.gradient[:, at:] += gradient[:, moved - pose]
         equations.diagonal[:, at:, at:] += hessian[:, moved - pose][:, :, moved - pose]
-        assert T == len(equations.gradient) and C == len(self.precision)
+        assert len(equations.gradient) == T and len(self.precision) == C
 
 
 def _between_eyes(motion: Motion) -> Float[Tensor, "T 2"]:

@@ -7,15 +7,14 @@ point of an adjacent triangle that does so best.
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from data_prep.prepare import cache_folder
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
+from data_prep.prepare import cache_folder
 from data_prep.track.embedding import LandmarkEmbedding, load_embedding, save_embedding
 from data_prep.track.landmark_groups import NUM_MESH
 from data_prep.track.tinted_heads import render_tinted_heads

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from avatar.head.rasterize import rasterize_mesh
-from data_prep.track.crops import Crops
 
 COUNT = 2500
 _DEPTH_TOLERANCE = 2e-3  # metres

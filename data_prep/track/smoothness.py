@@ -35,7 +35,7 @@ class Smoothness:
         follows[:1] = 0.0
         return Smoothness(self.head_points, follows, self.pose, self.first, self.second)
 
-    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:  # noqa: ARG002
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
         one, two = self.follows[1:, None], (self.follows[2:] * self.follows[1:-1])[:, None]
         values = motion.coefficients()
         points = to_camera(motion, self.head_points.expand(len(motion), 4, 3)) * self.pose
@@ -46,7 +46,7 @@ class Smoothness:
     def add_to(
         self,
         equations: NormalEquations,
-        identity: Float[Tensor, " I"],  # noqa: ARG002
+        identity: Float[Tensor, " I"],
         motion: Motion,
         columns: Int[Tensor, " D"],
     ) -> None:

@@ -71,11 +71,13 @@ def render_tinted_heads(assets: HeadAssets, count: int, seed: int = 0) -> Iterat
         raster = rasterize_mesh(screen, faces, SIZE, SIZE)
         with_hair = _project(assets, _raised(vertices, faces, paint.hair * rng.uniform(0.05, 0.3) * paint.unit), turn)
         colours = paint(rng)
-        yield TintedHead(_shade(with_hair, faces, colours, paint.sky, rng), screen, visible_vertices(raster.depth, screen))
+        yield TintedHead(
+            _shade(with_hair, faces, colours, paint.sky, rng), screen, visible_vertices(raster.depth, screen)
+        )
 
 
 def visible_vertices(depth: np.ndarray, screen: np.ndarray, tolerance: float = 3e-3) -> np.ndarray:
-    """[V] whether a vertex lies in the picture and not behind what the z-buffer [H, W] holds, but for `tolerance` metres."""
+    """[V] whether a vertex lies in the picture and not, by `tolerance` metres, behind what the z-buffer [H, W] holds."""
     H, W = depth.shape
     column, row = np.floor(screen[:, 0]).astype(int), np.floor(screen[:, 1]).astype(int)
     inside = (column >= 0) & (column < W) & (row >= 0) & (row < H) & (screen[:, 2] > 0)
@@ -106,7 +108,8 @@ class _Paint:
             self.lips[assets.regions["lips"].numpy()] = True
         self.sky = _open_sky(template.astype(np.float64), assets.faces.numpy(), self.unit)
         self.hair = _hair((template - centres.mean(0)) / self.unit)
-        self.brows, self.eyes, self.iris, self.pupil = np.zeros(V), np.zeros(V, bool), np.zeros(V, bool), np.zeros(V, bool)
+        self.brows = np.zeros(V)
+        self.eyes, self.iris, self.pupil = (np.zeros(V, bool) for _ in range(3))
         for joint, centre in zip((LEFT_EYE, RIGHT_EYE), centres, strict=True):
             offset = (template - centre) / self.unit
             ball = weights[:, joint] > 0.5
