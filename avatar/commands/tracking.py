@@ -15,8 +15,8 @@ from avatar.commands.outputs import check_outputs
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.avatar_track import read_info, recognise
+from data_prep.cache import cache_folder
 from data_prep.open import HEAD_VARIABLE
-from data_prep.prepare import cache_folder
 from data_prep.track.crop import parse_crop
 from data_prep.track.footage import Span
 from data_prep.track.pictures import is_footage, open_footage

@@ -14,6 +14,7 @@ from avatar.commands.opening import check_data, moved_source, source_of, split_s
 from avatar.commands.tracking import head_for_video, is_video, tracked_once
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
+from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.lock import locked
@@ -53,6 +54,7 @@ def train_new(source: Source, overrides: list[str], run: Path) -> int:
     with locked(run):
         refuse_trained(run)
         subject, assets = open_subject(source, split_sizes(config))
+        check_divided(subject.split)
         perceptual = choose_perceptual(config.trainer, print)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, subject.identity, config.model)

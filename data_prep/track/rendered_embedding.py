@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
-from data_prep.prepare import cache_folder
+from data_prep.cache import cache_folder
 from data_prep.track.embedding import LandmarkEmbedding, load_embedding, save_embedding
 from data_prep.track.landmark_groups import NUM_MESH
 from data_prep.track.tinted_heads import render_tinted_heads
