@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Compile the core to WebAssembly (Debian: emscripten): avatar/web/avatar.wasm, and what it was made of.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+command -v em++ >/dev/null || { echo "make wasm needs emscripten (Debian: apt install emscripten)"; exit 1; }
+source=avatar/csrc
+out=avatar/web
+build=build/wasm
+mkdir -p "$build" "$out"
+# Debian's emscripten runs a node that warns of its own fetch.
+export NODE_OPTIONS="${NODE_OPTIONS:-} --no-experimental-fetch"
+flags=(-std=c++17 -O3 -msimd128 -msse2 -fno-math-errno -fno-trapping-math -ffp-contract=off -I "$source")
+kernels=(compose/kernels.cpp hyper/kernels.cpp splat/raster_kernels.cpp)
+plain=(compose/dispatch.cpp hyper/dispatch.cpp splat/raster_dispatch.cpp instruction_set.cpp block_store.cpp
+  splat/bin.cpp splat/project.cpp splat/splat.cpp web/one_thread.cpp web/portrait.cpp web/exports.cpp)
+objects=()
+for file in "${kernels[@]}"; do
+  object=$build/$(echo "$file" | tr / _).o
+  em++ "${flags[@]}" -DAVATAR_KERNELS=kernels_baseline -c "$source/$file" -o "$object"
+  objects+=("$object")
+done
+for file in "${plain[@]}"; do
+  object=$build/$(echo "$file" | tr / _).o
+  em++ "${flags[@]}" -c "$source/$file" -o "$object"
+  objects+=("$object")
+done
+em++ "${flags[@]}" "${objects[@]}" -o "$build/avatar.wasm" --no-entry -s ALLOW_MEMORY_GROWTH=1 \
+  -s INITIAL_MEMORY=64MB -s MAXIMUM_MEMORY=1GB -s TOTAL_STACK=1MB -s FILESYSTEM=0 -s ASSERTIONS=0
+cp "$build/avatar.wasm" "$out/avatar.wasm"
+ls -l "$out/avatar.wasm"
