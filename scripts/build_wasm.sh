@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Compile the core to WebAssembly (Debian: emscripten): avatar/web/avatar.wasm, and what it was made of.
+# Compile the core to WebAssembly (Debian: emscripten): avatar/web/avatar.wasm, and beside it the SHA-256 of the module, of
+# this script and of every source that went into it, which a test compares with the sources that are there.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 command -v em++ >/dev/null || { echo "make wasm needs emscripten (Debian: apt install emscripten)"; exit 1; }
@@ -14,17 +15,18 @@ kernels=(compose/kernels.cpp hyper/kernels.cpp splat/raster_kernels.cpp)
 plain=(compose/dispatch.cpp hyper/dispatch.cpp splat/raster_dispatch.cpp instruction_set.cpp block_store.cpp
   splat/bin.cpp splat/project.cpp splat/splat.cpp web/one_thread.cpp web/portrait.cpp web/exports.cpp)
 objects=()
-for file in "${kernels[@]}"; do
-  object=$build/$(echo "$file" | tr / _).o
-  em++ "${flags[@]}" -DAVATAR_KERNELS=kernels_baseline -c "$source/$file" -o "$object"
+compile() { # FILE [FLAGS]
+  local object
+  object=$build/$(echo "$1" | tr / _).o
+  em++ "${flags[@]}" "${@:2}" -MMD -MF "${object%.o}.d" -c "$source/$1" -o "$object"
   objects+=("$object")
-done
-for file in "${plain[@]}"; do
-  object=$build/$(echo "$file" | tr / _).o
-  em++ "${flags[@]}" -c "$source/$file" -o "$object"
-  objects+=("$object")
-done
+}
+for file in "${kernels[@]}"; do compile "$file" -DAVATAR_KERNELS=kernels_baseline; done
+for file in "${plain[@]}"; do compile "$file"; done
 em++ "${flags[@]}" "${objects[@]}" -o "$build/avatar.wasm" --no-entry -s ALLOW_MEMORY_GROWTH=1 \
   -s INITIAL_MEMORY=64MB -s MAXIMUM_MEMORY=1GB -s TOTAL_STACK=1MB -s FILESYSTEM=0 -s ASSERTIONS=0
-cp "$build/avatar.wasm" "$out/avatar.wasm"
+install -m 644 "$build/avatar.wasm" "$out/avatar.wasm"
+read_sources=$(cat "${objects[@]/%.o/.d}" | tr ' \\' '\n\n' | grep "^$source/" | sort -u)
+# shellcheck disable=SC2086
+sha256sum "$out/avatar.wasm" scripts/build_wasm.sh $read_sources > "$out/avatar.wasm.sha256"
 ls -l "$out/avatar.wasm"

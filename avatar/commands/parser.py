@@ -107,10 +107,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
     )
 
-    export = commands.add_parser("export", help="write an avatar as a file to take away")
-    add_avatar(export)
-    export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.safetensors")
-    export.add_argument("--with-head", action="store_true", help="pack the head model in; mind its licence")
+    add_export(commands.add_parser("export", help="write an avatar as a file to take away"))
 
     drive_file = commands.add_parser("drive-file", help="write a tracked folder's motion as a drive file")
     add_source(drive_file)
@@ -162,6 +159,21 @@ def build_parser() -> argparse.ArgumentParser:
 
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser
+
+
+def add_export(export: argparse.ArgumentParser) -> None:
+    add_avatar(export)
+    export.add_argument(
+        "--format",
+        choices=("web", "web-avatar", "avatar"),
+        help="web: a page that any browser opens; web-avatar: the file that <avatar-view> shows in pages of your own; "
+        "avatar: what the other commands take (default: told from --out, else web)",
+    )
+    export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.html, .avatar, .safetensors")
+    export.add_argument(
+        "--precision", choices=("small", "float"), help="web, web-avatar: of the parameters (default: small)"
+    )
+    export.add_argument("--with-head", action="store_true", help="avatar: pack the head model in; mind its licence")
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from avatar.evaluation.conditions import yaw
 from avatar.export.drawing import ARRAYS, Drawing, reduce_avatar
+from avatar.export.licence import SKINNING, licence_of
 from avatar.runs.trained import TrainedAvatar
 
 FORMAT = "AVW1"
@@ -135,6 +136,7 @@ def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
     low, high = np.percentile(angles, [1, 99])
     return {
         "name": recording.name,
+        "licence": licence_of(SKINNING),
         "sizes": drawing.sizes,
         "parents": list(drawing.parents),
         "fps": recording.fps,

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.export.licence import SKINNING, licence_of
 from avatar.export.web_file import Precision, encode_avatar
 from avatar.files.atomic import write_atomically
 from avatar.runs.trained import TrainedAvatar
@@ -18,11 +19,6 @@ WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
 PAGE_MODULES = ("core.js", "motion.js", "webgl.js", "view.js", "page.js")
 WORKER_MODULES = ("core.js", "worker.js")
-NOTICE = (
-    "It shows one person, and is for people who have that person's consent. Skinning comes from a head model that keeps its "
-    "own licence: pass the page on only if that allows it (FLAME 2023 Open: CC-BY-4.0, Max Planck Institute for Intelligent "
-    "Systems)."
-)
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,7 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
     encoded = encode_avatar(trained, precision)
     parts = {
         "title": html.escape(trained.name),
-        "licence": html.escape(NOTICE),
+        "licence": html.escape(licence_of(SKINNING)),
         "style": read("page.css"),
         "script": f"(() => {{\n{bundle(PAGE_MODULES)}\n}})();",
         "worker": script_text(json.dumps(bundle(WORKER_MODULES))),
