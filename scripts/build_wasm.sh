@@ -13,7 +13,7 @@ export NODE_OPTIONS="${NODE_OPTIONS:-} --no-experimental-fetch"
 flags=(-std=c++17 -O3 -msimd128 -msse2 -fno-math-errno -fno-trapping-math -ffp-contract=off -I "$source")
 kernels=(compose/kernels.cpp hyper/kernels.cpp splat/raster_kernels.cpp)
 plain=(compose/dispatch.cpp hyper/dispatch.cpp splat/raster_dispatch.cpp instruction_set.cpp block_store.cpp
-  splat/bin.cpp splat/project.cpp splat/splat.cpp web/one_thread.cpp web/portrait.cpp web/exports.cpp)
+  splat/bin.cpp splat/project.cpp splat/splat.cpp web/one_thread.cpp web/pack.cpp web/portrait.cpp web/exports.cpp)
 objects=()
 compile() { # FILE [FLAGS]
   local object

@@ -18,12 +18,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from avatar.evaluation.conditions import yaw
 from avatar.export.drawing import ARRAYS, Drawing, reduce_avatar
 from avatar.export.licence import SKINNING, licence_of
+from avatar.motion.controls import expression_controls, joint_ranges
+from avatar.motion.orbit import orbit_limits
 from avatar.runs.trained import TrainedAvatar
 
 FORMAT = "AVW1"
@@ -45,7 +44,6 @@ SMALL: dict[str, tuple[str, str]] = {  # array -> type, what a column is
     "opacity_logits": ("i2", "all"),
     "sh": ("i1", "last two"),
 }
-COMPONENTS = 12  # sliders, for head models whose coefficients have no names
 MAX_MOTION = 1500  # frames: a minute at 25 a second
 
 
@@ -120,20 +118,14 @@ def motion_arrays(trained: TrainedAvatar, drawing: Drawing) -> dict[str, np.ndar
 
 
 def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
-    """What the page says and where its limits are."""
+    """What the page says, and how far things can be moved there."""
     recording, kept = trained.recording, list(drawing.kept)
     train = list(recording.split.train)
-    expression = recording.tracks["expression"][train][:, kept]
+    frames = [(recording.camera(i), recording.params(i)) for i in train]
+    expressions = recording.tracks["expression"][train]
     rest, camera = trained.rest_params(), trained.rest_camera()
     names = trained.assets.names.names
-    moves = {
-        "jaw": _moves(recording.tracks["jaw"][train]),
-        "neck": _moves(recording.tracks["neck"][train]),
-        "eyes": _moves(recording.tracks["eyes"][train]),
-        "lids": _moves(recording.tracks["eyelids"][train]),
-    }
-    angles = [yaw(recording.camera(i), recording.params(i)) for i in train]
-    low, high = np.percentile(angles, [1, 99])
+    controls = expression_controls(expressions, rest.expression, trained.avatar.head)
     return {
         "name": recording.name,
         "licence": licence_of(SKINNING),
@@ -142,10 +134,17 @@ def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
         "fps": recording.fps,
         "background": list(trained.config.data.background),
         "expressions": [names[i] if i < len(names) and names[i] else f"expression {i}" for i in kept],
-        "named": any(names[i] for i in kept if i < len(names)),
-        "range": [expression.amin(0).tolist(), expression.amax(0).tolist()],
-        "components": principal_components(expression),
-        "moves": moves,
+        "controls": [
+            {
+                "group": control.part,
+                "name": control.name,
+                "values": [round(value, 6) for value in control.direction[kept].tolist()],
+                "range": [control.low, control.high],
+            }
+            for control in controls
+        ],
+        "joints": joint_ranges([params for _, params in frames]),
+        "orbit": orbit_limits((camera, rest), frames)._asdict(),
         "rest": torch.cat((rest.expression[kept], rest.jaw, rest.eyes, rest.eyelids, rest.neck)).tolist(),
         "camera": {
             "rotation": camera.R_cam_world.flatten().tolist(),
@@ -156,22 +155,5 @@ def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
             "cy": camera.cy / camera.width,
             "aspect": camera.width / camera.height,
         },
-        "yaw": [float(low), float(high)],
         "size": camera.width,
     }
-
-
-def principal_components(expression: Float[Tensor, "T E"]) -> list[dict[str, Any]]:
-    """The directions in which the training expressions vary most, and how far."""
-    centred = expression.double() - expression.double().mean(0)
-    _, spread, directions = torch.linalg.svd(centred, full_matrices=False)
-    deviations = spread / max(len(expression), 1) ** 0.5
-    count = int((deviations > 1e-3 * deviations[:1]).sum()) if len(deviations) else 0
-    return [
-        {"values": directions[k].tolist(), "deviation": float(deviations[k])} for k in range(min(COMPONENTS, count))
-    ]
-
-
-def _moves(track: Float[Tensor, "T D"]) -> bool:
-    """Whether training has shown it move: else the avatar does not know what it looks like."""
-    return bool((track.amax(0) - track.amin(0)).max() > 0.02)

@@ -5,6 +5,7 @@
 
 #include "compose/compose.h"
 #include "hyper/kernels.h"
+#include "web/layer.h"
 
 namespace avatar::web {
 namespace {
@@ -47,50 +48,21 @@ Rotation product(const Rotation& a, const Rotation& b) {
     return r;
 }
 
-// Four rows of x [rows, depth] times w [depth, width] plus bias: x is read four times less often than one by one.
-template <bool relu>
-void layer(const float* x, const float* w, const float* bias, int rows, int depth, int width, float* out) {
-    constexpr int kRows = 4;
-    for (int begin = 0; begin < rows; begin += kRows) {
-        const int count = std::min(kRows, rows - begin);
-        float* to[kRows];
-        const float* from[kRows];
-        for (int r = 0; r < kRows; ++r) {
-            const int row = begin + std::min(r, count - 1);  // the last ones again where rows end
-            to[r] = out + std::int64_t{row} * width;
-            from[r] = x + std::int64_t{row} * depth;
-        }
-        for (int r = 0; r < count; ++r) std::copy(bias, bias + width, to[r]);
-        for (int k = 0; k < depth; ++k) {
-            const float* row = w + std::int64_t{k} * width;
-            if (count == kRows) {
-                const float a = from[0][k], b = from[1][k], c = from[2][k], d = from[3][k];
-                float *__restrict__ pa = to[0], *__restrict__ pb = to[1], *__restrict__ pc = to[2], *__restrict__ pd = to[3];
-                for (int j = 0; j < width; ++j) {
-                    pa[j] += a * row[j];
-                    pb[j] += b * row[j];
-                    pc[j] += c * row[j];
-                    pd[j] += d * row[j];
-                }
-            } else {
-                for (int r = 0; r < count; ++r)
-                    for (int j = 0; j < width; ++j) to[r][j] += from[r][k] * row[j];
-            }
-        }
-        if (relu)
-            for (int r = 0; r < count; ++r)
-                for (int j = 0; j < width; ++j) to[r][j] = std::max(to[r][j], 0.0f);
-    }
-}
-
 }  // namespace
 
-Portrait::Portrait(const Sizes& s) : sizes_(s) {
+void array_lengths(const Sizes& s, std::int64_t lengths[kArrays]) {
     const std::int64_t V = s.vertices, E = s.expressions, G = s.gaussians, M = s.nodes, W = s.width, H = s.layers - 1;
-    const std::int64_t lengths[kArrays] = {
+    const std::int64_t values[kArrays] = {
         V * 3, E * V * 3, kPoseValues * V * 3, V * kJoints, kEyelids * V * 3, kJoints * 3, E * kJoints * 3, G * 3,
         M * W, condition_count(s) * W, W, H * W * W, H * W, W * s.latent, s.latent, s.has_grid ? G * 4 : 0,
         s.has_heads ? G * s.latent * kOffsets : 0, s.has_heads ? G * kOffsets : 0, G * 4, G * 3, G, G * s.coefficients * 3};
+    std::copy(values, values + kArrays, lengths);
+}
+
+Portrait::Portrait(const Sizes& s) : sizes_(s) {
+    const std::int64_t V = s.vertices, G = s.gaussians, M = s.nodes, W = s.width;
+    std::int64_t lengths[kArrays];
+    array_lengths(s, lengths);
     for (int which = 0; which < kArrays; ++which) arrays_[which].resize(lengths[which]);
     corners_.resize(G * 3);
     cells_.resize(s.has_grid ? G * 4 : 0);
@@ -100,6 +72,7 @@ Portrait::Portrait(const Sizes& s) : sizes_(s) {
     points_.resize(G * 3);
     layer_.resize(M * W);
     next_layer_.resize(M * W);
+    block_.resize(2 * kLanes * W);
     latents_.resize(M * s.latent);
     own_latents_.resize(s.has_grid ? G * s.latent : 0);
     raw_.resize(s.has_heads ? G * kOffsets : 0);
@@ -110,10 +83,6 @@ Portrait::Portrait(const Sizes& s) : sizes_(s) {
 }
 
 float* Portrait::array(int which) { return which >= 0 && which < kArrays ? arrays_[which].data() : nullptr; }
-
-std::int64_t Portrait::length(int which) const {
-    return which >= 0 && which < kArrays ? static_cast<std::int64_t>(arrays_[which].size()) : -1;
-}
 
 bool Portrait::is_sound() const {
     const auto within = [](const std::vector<std::int32_t>& values, std::int32_t limit) {
@@ -144,6 +113,7 @@ void Portrait::skin() {
         add_scaled(shape_, arrays_[kExpressionDirs].data() + e * V * 3, expression[e]);
         for (int i = 0; i < kJoints * 3; ++i) joints[i] += expression[e] * arrays_[kExpressionJoints][e * kJoints * 3 + i];
     }
+    // Most of a pose's correctives are zero: joints that do not turn.
     const Rotation own[kJoints] = {{{1, 0, 0, 0, 1, 0, 0, 0, 1}}, rotation_from_6d(neck), rotation_from_6d(jaw),
                                    rotation_from_6d(eyes), rotation_from_6d(eyes + 6)};
     for (int joint = 1; joint < kJoints; ++joint)
@@ -198,11 +168,11 @@ void Portrait::evaluate_network() {
         for (int j = 0; j < W; ++j) layer_[m * W + j] = std::max(of_code[m * W + j] + of_frame[j], 0.0f);
     for (int h = 0; h + 1 < sizes_.layers; ++h) {
         layer<true>(layer_.data(), arrays_[kHiddenWeights].data() + std::int64_t{h} * W * W,
-                    arrays_[kHiddenBiases].data() + std::int64_t{h} * W, M, W, W, next_layer_.data());
+                    arrays_[kHiddenBiases].data() + std::int64_t{h} * W, M, W, W, block_.data(), next_layer_.data());
         layer_.swap(next_layer_);
     }
     layer<false>(layer_.data(), arrays_[kOutputWeights].data(), arrays_[kOutputBias].data(), M, W, sizes_.latent,
-                 latents_.data());
+                 block_.data(), latents_.data());
 }
 
 void Portrait::offset() {

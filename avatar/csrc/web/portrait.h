@@ -51,13 +51,19 @@ enum Array {
     kArrays
 };
 
+// How many values each array has. The sizes may be any that fit into 20 bits, without memory being taken.
+void array_lengths(const Sizes& sizes, std::int64_t lengths[kArrays]);
+
+// A Gaussian as a viewer on another device draws it: mean 3, opacity, colour 3 as seen from the camera, and the upper
+// triangle of the covariance (xx, xy, xz, yy, yz, zz).
+constexpr int kPacked = 13;
+
 class Portrait {
 public:
     explicit Portrait(const Sizes& sizes);
 
-    // Where a caller writes the values of an array, and how many; null for one that does not exist.
+    // Where a caller writes the values of an array; null for one that does not exist.
     float* array(int which);
-    std::int64_t length(int which) const;
     std::int32_t* corners() { return corners_.data(); }    // [G * 3] vertices of each Gaussian's triangle
     std::int32_t* cells() { return cells_.data(); }        // [G * 4] nodes around each Gaussian
     float* parameters() { return parameters_.data(); }     // of the next frame
@@ -73,11 +79,9 @@ public:
     // finite; throws what splat::forward throws, which ends the module where exceptions are not compiled in.
     bool draw(const splat::Camera& camera, const float background[3], std::uint8_t* rgba);
 
-    // Of the pose: what a viewer on another device draws by itself.
-    const float *means() const { return means_.data(); }
-    const float *quats() const { return quats_.data(); }
-    const float *scales() const { return scales_.data(); }
-    const float *opacities() const { return opacities_.data(); }
+    // What was posed, for a viewer on another device: [G * kPacked], the farthest from the camera first.
+    const float* pack(const splat::Camera& camera);
+
     const Sizes& sizes() const { return sizes_; }
 
 private:
@@ -89,9 +93,10 @@ private:
     std::vector<float> arrays_[kArrays];
     std::vector<std::int32_t> corners_, cells_;
     std::vector<float> parameters_, shape_, posed_, points_;
-    std::vector<float> layer_, next_layer_, latents_, own_latents_, raw_;
+    std::vector<float> layer_, next_layer_, block_, latents_, own_latents_, raw_;
     std::vector<float> means_, quats_, scales_, opacities_;
-    std::vector<float> image_, alpha_;
+    std::vector<float> image_, alpha_, packed_;
+    std::vector<std::uint32_t> order_;
 };
 
 }  // namespace avatar::web
