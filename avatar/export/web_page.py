@@ -17,7 +17,7 @@ from avatar.runs.trained import TrainedAvatar
 
 WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
-PAGE_MODULES = ("core.js", "motion.js", "webgl.js", "view.js", "page.js")
+PAGE_MODULES = ("core.js", "motion.js", "webgl.js", "view.js", "steer.js", "controls.js", "page.js")
 WORKER_MODULES = ("core.js", "worker.js")
 
 

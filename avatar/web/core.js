@@ -12,7 +12,7 @@ const SIZES = [
 ];
 const TYPES = { f4: Float32Array, i2: Int16Array, i1: Int8Array, u4: Uint32Array, u2: Uint16Array };
 const MAX_BYTES = 2 ** 28; // of an unpacked file
-const PACKED = 13; // values of a packed Gaussian
+export const PACKED = 13; // values of a packed Gaussian: mean 3, opacity, colour 3, covariance 6
 
 /** What is wrong with a file, for people. */
 export class AvatarError extends Error {}
@@ -81,7 +81,6 @@ function check(header, arrays) {
   need(typeof header.name === "string" && typeof header.licence === "string", "its name is missing");
   need(finite(header.rest, parameters), "the neutral face is missing");
   need(texts(header.expressions) && header.expressions.length === E, "names are missing");
-  need(header.range?.length === 2 && Array.from(header.range).every((r) => finite(r, E)), "ranges are missing");
   need(finite(header.parents, 5) && finite(header.background, 3), "its joints are missing");
   need(finite(header.orbit?.yaw, 2) && finite(header.orbit?.pitch, 2), "its limits are missing");
   const isJoints = header.joints && typeof header.joints === "object" && !Array.isArray(header.joints);

@@ -1,15 +1,19 @@
-// <avatar-view src="anna.avatar">: an avatar in any page. See README.md for the whole interface.
-import { AvatarView, steer } from "./view.js";
+// <avatar-view src="anna.avatar">: an avatar in any page. README.md and index.d.ts describe the whole interface.
+import { AvatarError } from "./core.js";
+import { steer } from "./steer.js";
+import { AvatarView } from "./view.js";
 
-export { AvatarError } from "./core.js";
-export { AvatarView, steer };
+export { AvatarError, AvatarView, steer };
 
 const BASE = new URL(".", import.meta.url);
+const INSIDE = `<style>:host{display:inline-block;width:256px;max-width:100%}
+  canvas{width:100%;display:block;touch-action:none;cursor:grab}p{font:14px system-ui}</style>
+  <canvas tabindex="0" role="img" part="canvas"></canvas><p role="alert" hidden part="message"></p>`;
 
-/** Bytes of a URL. Throws Error with what the server said. */
+/** Bytes of a URL. Throws AvatarError with what the server said. */
 async function fetchBytes(url) {
-  const response = await fetch(url);
-  if (!response.ok) throw new Error(`${url} answers ${response.status}`);
+  const response = await fetch(url).catch(() => null);
+  if (!response?.ok) throw new AvatarError(`${url} cannot be fetched (${response ? response.status : "no answer"}).`);
   return response.arrayBuffer();
 }
 
@@ -17,6 +21,13 @@ export class AvatarViewElement extends HTMLElement {
   static observedAttributes = ["src"];
   #view;
   #letGo;
+  #loads = 0; // so that the last of several wins
+  #isHere = false;
+
+  constructor() {
+    super();
+    this.attachShadow({ mode: "open" }).innerHTML = INSIDE;
+  }
 
   /** The AvatarView behind the element; undefined until `src` is loaded. */
   get view() {
@@ -24,67 +35,88 @@ export class AvatarViewElement extends HTMLElement {
   }
 
   connectedCallback() {
-    if (!this.shadowRoot) {
-      const root = this.attachShadow({ mode: "open" });
-      root.innerHTML = `<style>:host{display:inline-block;width:256px;max-width:100%}
-        canvas{width:100%;display:block;touch-action:none;cursor:grab}p{font:14px system-ui}</style>
-        <canvas tabindex="0" role="img" part="canvas"></canvas><p role="alert" hidden part="message"></p>`;
-    }
-    if (this.getAttribute("src") && !this.#view) this.load(this.getAttribute("src"));
+    this.#isHere = true;
+    this.#loadSource();
   }
 
   disconnectedCallback() {
-    this.#letGo?.();
-    this.#view?.close();
-    this.#view = undefined;
+    this.#isHere = false;
+    ++this.#loads;
+    this.#close();
   }
 
   attributeChangedCallback(_, before, after) {
-    if (this.isConnected && before !== after && after) this.load(after);
+    if (before !== after) this.#loadSource();
+  }
+
+  #loadSource() {
+    const source = this.getAttribute("src");
+    if (this.#isHere && source) this.load(source).catch(() => {}); // it is shown, and told by "error"
+  }
+
+  #close() {
+    this.#letGo?.();
+    this.#view?.close();
+    this.#view = this.#letGo = undefined;
   }
 
   /** Load an avatar from a URL or bytes. Fires `load` or `error`; resolves with its header. */
   async load(source) {
-    this.disconnectedCallback();
-    const canvas = this.shadowRoot.querySelector("canvas").cloneNode();
-    this.shadowRoot.querySelector("canvas").replaceWith(canvas);
+    const mine = ++this.#loads, message = this.shadowRoot.querySelector("p");
+    this.#close();
+    message.hidden = true;
     try {
       const [file, wasm] = await Promise.all([
-        source instanceof ArrayBuffer ? source : fetchBytes(source),
+        typeof source === "string" ? fetchBytes(new URL(source, document.baseURI)) : source,
         fetchBytes(new URL("avatar.wasm", BASE)),
       ]);
+      if (mine !== this.#loads) throw new AvatarError("Another avatar was loaded meanwhile.");
+      const old = this.shadowRoot.querySelector("canvas"), canvas = old.cloneNode(); // a context cannot change its kind
+      old.replaceWith(canvas);
       const worker = new Worker(new URL("worker.js", BASE), { type: "module" });
       const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-      this.#view = new AvatarView(canvas, { worker, wasm, file }, { renderer: this.getAttribute("renderer") ?? "auto", still });
-      const header = await this.#view.ready;
+      const view = new AvatarView(canvas, { worker, wasm, file }, { renderer: this.getAttribute("renderer") ?? "auto", still });
+      this.#view = view;
+      const header = await view.ready;
       canvas.setAttribute("aria-label", `Avatar of ${header.name}. Arrow keys turn it.`);
-      this.#letGo = steer(this.#view, canvas);
-      this.#view.addEventListener("drawn", () => this.dispatchEvent(new Event("drawn")));
+      this.#letGo = steer(view, canvas);
+      view.addEventListener("drawn", () => this.dispatchEvent(new Event("drawn")));
+      view.addEventListener("failed", ({ detail }) => this.#say(detail));
       this.dispatchEvent(new Event("load"));
       return header;
     } catch (error) {
-      const message = this.shadowRoot.querySelector("p");
-      message.hidden = false;
-      message.textContent = error.message;
-      this.dispatchEvent(new CustomEvent("error", { detail: error.message }));
+      if (mine === this.#loads) {
+        this.#close();
+        this.#say(error.message);
+      }
       throw error;
     }
   }
 
+  #say(sentence) {
+    Object.assign(this.shadowRoot.querySelector("p"), { hidden: false, textContent: sentence });
+    this.dispatchEvent(new CustomEvent("error", { detail: sentence }));
+  }
+
   setExpression(values) {
-    return this.#view.setExpression(values);
+    return this.#loaded.setExpression(values);
   }
 
   setPose(pose) {
-    this.#view.setPose(pose);
+    this.#loaded.setPose(pose);
   }
 
   play(kind, options) {
-    this.#view.play(kind, options);
+    this.#loaded.play(kind, options);
   }
 
   pause() {
-    this.#view.pause();
+    this.#loaded.pause();
+  }
+
+  get #loaded() {
+    if (!this.#view?.header) throw new AvatarError("The avatar is not loaded yet: wait for the load event.");
+    return this.#view;
   }
 }
 

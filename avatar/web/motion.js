@@ -19,29 +19,22 @@ export function multiply(a, b) {
   return out;
 }
 
-export function apply(m, v) {
-  return [0, 3, 6].map((i) => m[i] * v[0] + m[i + 1] * v[1] + m[i + 2] * v[2]);
-}
-
 /** The first two rows, flattened: how parameters hold a rotation. */
 export const sixD = (m) => m.slice(0, 6);
 
 /**
- * The camera after turning it about the head: `yaw` and `pitch` in degrees, `zoom` a factor, `shift` a part of the width.
- * `base` as in the avatar's header, `size` the width in pixels.
+ * The camera after turning the head before it: `yaw` and `pitch` in degrees, `zoom` a factor; `orbited` of
+ * avatar/motion/orbit.py. `base` as in the avatar's header, `size` the width in pixels.
  */
-export function orbit(base, { yaw = 0, pitch = 0, zoom = 1, shift = [0, 0] }, size, pivot = [0, 0, 0]) {
+export function orbit(base, { yaw = 0, pitch = 0, zoom = 1 }, size) {
   const turn = multiply(rotation([(pitch * Math.PI) / 180, 0, 0]), rotation([0, (yaw * Math.PI) / 180, 0]));
-  // x_cam = R (T (x - p) + p) + t: the head turns about its middle.
-  const R = multiply(base.rotation, turn), there = apply(turn, pivot);
-  const moved = apply(base.rotation, pivot.map((p, i) => p - there[i]));
   return {
-    rotation: R,
-    translation: base.translation.map((t, i) => t + moved[i]),
+    rotation: multiply(base.rotation, turn),
+    translation: base.translation,
     fx: base.fx * size * zoom,
     fy: base.fy * size * zoom,
-    cx: (0.5 + (base.cx - 0.5) * zoom + shift[0]) * size,
-    cy: (0.5 / base.aspect + (base.cy - 0.5 / base.aspect) * zoom + shift[1]) * size,
+    cx: (0.5 + (base.cx - 0.5) * zoom) * size,
+    cy: (0.5 / base.aspect + (base.cy - 0.5 / base.aspect) * zoom) * size,
   };
 }
 

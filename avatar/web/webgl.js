@@ -1,7 +1,6 @@
 // Draws posed Gaussians with WebGL2: one quad each, farthest first, blended. What it draws is packed by the module
 // (avatar/csrc/web/pack.cpp). Semantics as in the program's splatter: 0.3 px^2 of blur, alpha below 1/255 dropped.
-
-const PACKED = 13; // floats of a Gaussian: mean 3, opacity, colour 3, covariance 6
+import { PACKED } from "./core.js";
 
 const VERTEX = `#version 300 es
 precision highp float;
