@@ -7,16 +7,25 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from tqdm import tqdm
+
 from avatar.commands import OK
-from avatar.commands.opening import open_trained
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_trained
 from avatar.commands.outputs import check_outputs
 from avatar.errors import UserError
-from avatar.export.licence import SKINNING, WHOLE, licence_of
+from avatar.export.glb import encode_glb
+from avatar.export.licence import MESH, NOTHING, SKINNING, WHOLE, licence_of
+from avatar.export.movie import write_movie
+from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
+from avatar.files.atomic import write_atomically
 from avatar.runs.avatar_file import read_portrait, write_portrait
+from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.trained import TrainedAvatar
+from avatar.types import HeadParams
 
 MIB = 2**20
+TEXTURE, MAX_SIZE = 1024, 4096  # pixels
 
 
 def run_export(arguments: Namespace) -> int:
@@ -26,7 +35,8 @@ def run_export(arguments: Namespace) -> int:
     out: Path = arguments.out or Path(f"{trained.name}{SUFFIXES[format]}")
     if out.suffix.lower() != SUFFIXES[format]:
         raise UserError(f"--format {format} writes {SUFFIXES[format]} files, not {out.name}")
-    check_outputs([out], [arguments.run, trained.source, arguments.head])
+    motion = Path(arguments.motion) if arguments.motion else None
+    check_outputs([out], [arguments.run, trained.source, arguments.head, motion])
     WRITERS[format](trained, out, arguments)
     return OK
 
@@ -47,11 +57,13 @@ def chosen_format(format: str | None, out: Path | None) -> str:
 
 def check_options(arguments: Namespace, format: str) -> None:
     """Raise UserError for an option that another format has."""
+    if arguments.texture is not None and not 64 <= arguments.texture <= MAX_SIZE:
+        raise UserError(f"--texture must be from 64 to {MAX_SIZE}, not {arguments.texture}")
     for option, formats in OPTIONS.items():
         value = getattr(arguments, option)
-        if value not in (None, False) and format not in formats:
+        if value is not None and value is not False and format not in formats:
             name = option.replace("_", "-")
-            raise UserError(f"--{name} belongs to --format {' and '.join(formats)}; this writes {format}")
+            raise UserError(f"--{name} belongs to --format {' or '.join(formats)}; this writes {format}")
 
 
 def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
@@ -68,6 +80,66 @@ def write_web_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> N
     print(f"Licence  {licence_of(SKINNING)}")
 
 
+def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    licence = licence_of(NOTHING)
+    clip = chosen_clip(trained, arguments)
+    if clip is None:
+        write_atomically(out, encode_ply(trained.gaussians(chosen_pose(trained, arguments)), licence))
+        print(f"Splats   {out} ({out.stat().st_size / MIB:.1f} MiB)")
+    else:
+        for number, (params, _) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
+            write_atomically(numbered(out, number), encode_ply(trained.gaussians(params), licence))
+        print(f"Splats   {numbered(out, 0)} to {numbered(out, len(clip) - 1).name}, {clip.fps:g} a second")
+    print(f"Licence  {licence}")
+
+
+def write_mesh(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    licence = licence_of(MESH)
+    data, targets = encode_glb(trained, chosen_pose(trained, arguments), arguments.texture or TEXTURE, licence)
+    write_atomically(out, data)
+    print(f"Mesh     {out} ({len(data) / MIB:.1f} MiB) with {len(targets)} morph targets: {', '.join(targets)}")
+    print(f"Licence  {licence}")
+
+
+def write_clip(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    clip = chosen_clip(trained, arguments, "test")
+    assert clip is not None
+    path = arguments.camera or "recorded"
+    write_movie(trained, clip, out, path, arguments.size)
+    print(f"Video    {out}: {len(clip)} frames, camera {path}")
+
+
+def chosen_pose(trained: TrainedAvatar, arguments: Namespace) -> HeadParams:
+    """The frame of --frame, else the neutral face."""
+    if arguments.frame is None:
+        return trained.rest_params()
+    count = len(trained.recording)
+    if not 0 <= arguments.frame < count:
+        raise UserError(f"--frame must be from 0 to {count - 1}, not {arguments.frame}")
+    return trained.recording.params(arguments.frame)
+
+
+def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | None = None) -> Clip | None:
+    """What --motion names: frames of the avatar's own video, or a drive file."""
+    motion: str | None = arguments.motion or otherwise
+    if motion is None:
+        return None
+    if arguments.frame is not None:
+        raise UserError("--frame is one frame and --motion are many: give one of the two")
+    if (size := arguments.size) is not None and not 16 <= size <= MAX_SIZE:
+        raise UserError(f"--size must be from 16 to {MAX_SIZE}, not {size}")
+    width = size or trained.config.data.size
+    if motion in OWN:
+        return own_clip(trained, motion, width)
+    if Path(motion).suffix.lower() not in DRIVE_SUFFIXES:
+        raise UserError(f"--motion must be {', '.join(OWN)}, or a drive file (.npz, .csv), not {motion}")
+    return driven_clip(trained, open_drive_file(Path(motion), trained), width)
+
+
+def numbered(out: Path, number: int) -> Path:
+    return out.with_name(f"{out.stem}-{number:05d}{out.suffix}")
+
+
 def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     portrait = read_portrait(trained.source)
     head = trained.assets if arguments.with_head else None
@@ -80,10 +152,28 @@ def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -
         print(f"Next     avatar reenact {out} --head HEAD --driver DRIVER; it needs the head model it was trained with")
 
 
-SUFFIXES = {"web": ".html", "web-avatar": ".avatar", "avatar": ".safetensors"}
+SUFFIXES = {
+    "web": ".html",
+    "web-avatar": ".avatar",
+    "avatar": ".safetensors",
+    "ply": ".ply",
+    "glb": ".glb",
+    "video": ".mp4",
+}
 WRITERS: dict[str, Callable[[TrainedAvatar, Path, Namespace], None]] = {
     "web": write_web,
     "web-avatar": write_web_file,
     "avatar": write_avatar_file,
+    "ply": write_splats,
+    "glb": write_mesh,
+    "video": write_clip,
 }
-OPTIONS = {"precision": ("web", "web-avatar"), "with_head": ("avatar",)}
+OPTIONS = {
+    "precision": ("web", "web-avatar"),
+    "with_head": ("avatar",),
+    "frame": ("ply", "glb"),
+    "motion": ("ply", "video"),
+    "texture": ("glb",),
+    "camera": ("video",),
+    "size": ("video",),
+}

@@ -165,15 +165,24 @@ def add_export(export: argparse.ArgumentParser) -> None:
     add_avatar(export)
     export.add_argument(
         "--format",
-        choices=("web", "web-avatar", "avatar"),
+        choices=("web", "web-avatar", "avatar", "ply", "glb", "video"),
         help="web: a page that any browser opens; web-avatar: the file that <avatar-view> shows in pages of your own; "
-        "avatar: what the other commands take (default: told from --out, else web)",
+        "avatar: what the other commands take; ply: Gaussians; glb: a mesh (default: told from --out, else web)",
     )
-    export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.html, .avatar, .safetensors")
+    export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.html, .avatar, .ply ...")
     export.add_argument(
         "--precision", choices=("small", "float"), help="web, web-avatar: of the parameters (default: small)"
     )
     export.add_argument("--with-head", action="store_true", help="avatar: pack the head model in; mind its licence")
+    export.add_argument("--frame", type=int, metavar="N", help="ply, glb: of its video (default: the neutral face)")
+    export.add_argument(
+        "--motion", metavar="MOTION", help="ply, video: test, train or all frames of its video, or a drive file"
+    )
+    export.add_argument("--texture", type=int, metavar="N", help="glb: width of the texture (default: 1024)")
+    export.add_argument(
+        "--camera", choices=("recorded", "still", "turntable", "orbit"), help="video: its path (default: recorded)"
+    )
+    export.add_argument("--size", type=int, metavar="N", help="video: its width in pixels (default: as in training)")
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:

@@ -43,7 +43,7 @@ class ExpressionControl:
 def expression_controls(
     expressions: Float[Tensor, "T E"], rest: Float[Tensor, " E"], head: HeadModel
 ) -> list[ExpressionControl]:
-    """A control for each coefficient that has a name, else for the directions in which the training expressions vary most."""
+    """A control for each coefficient that has a name, else for the directions in which training varies most."""
     away = expressions.double() - rest.double()
     names = head.assets.names.names
     if any(names):

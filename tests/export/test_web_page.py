@@ -57,10 +57,8 @@ def opened(browser: Any, page_file: Path) -> Iterator[Any]:
     wrong: list[str] = []
     page.on("console", lambda said: wrong.append(said.text) if said.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on(
-        "request",
-        lambda request: None if request.url.startswith(("file:", "blob:", "data:")) else wrong.append(request.url),
-    )
+    local = ("file:", "blob:", "data:")
+    page.on("request", lambda request: None if request.url.startswith(local) else wrong.append(request.url))
     page.goto(f"{page_file.as_uri()}?width=64")
     page.locator("#message").wait_for(state="hidden", timeout=20000)
     until(page, "avatar.canvas.width === 64")
@@ -174,7 +172,8 @@ def test_keys_mouse_and_wheel_turn_the_head(opened: Any) -> None:
     yaw, pitch, zoom = opened.evaluate(view)
     assert yaw == pytest.approx(70 * 40 / box["width"], rel=0.05) and abs(pitch) < 0.2 and zoom > 1.2
     assert canvas.get_attribute("role") == "img" and "arrow keys" in canvas.get_attribute("aria-label")
-    unnamed = "Array.from(document.querySelectorAll('input,button')).filter(e => !(e.ariaLabel || e.labels?.[0]?.innerText || e.innerText))"
+    name = "(e.ariaLabel || e.labels?.[0]?.innerText || e.innerText)"
+    unnamed = f"Array.from(document.querySelectorAll('input,button')).filter(e => !{name})"
     assert opened.evaluate(f"{unnamed}.length") == 0
 
 
