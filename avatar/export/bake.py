@@ -16,8 +16,12 @@ from avatar.runs.trained import TrainedAvatar
 from avatar.splat.sh import C0
 from avatar.types import Camera, HeadParams
 
-YAWS, PITCHES = (-60.0, -30.0, 0.0, 30.0, 60.0), (-25.0, 0.0, 25.0)  # degrees: beyond, the rim of the training video
-SHARPNESS = 4  # power of the cosine between a texel's normal and the ray: squarely seen texels win
+YAWS, PITCHES = (-60.0, -30.0, 0.0, 30.0, 60.0), (-25.0, 0.0, 25.0)  # degrees from the camera at rest
+SHARPNESS = 2  # power of the cosine between a texel's normal and the ray: squarely seen texels win
+# Factor of a view's weight for every degree from the front: other views only fill, because what stands off the mesh, such
+# as glasses, lies elsewhere on it in each, and because the training video shows the sides less.
+ASIDE = 0.8
+SOLID = 0.7  # least alpha of a pixel that counts; what shines through from behind is taken out
 BEHIND = 0.003  # metres by which a texel may lie behind the mesh and still be seen
 PICTURE = 2  # pixels of a picture for each of the texture, sideways
 
@@ -34,14 +38,17 @@ def bake_texture(trained: TrainedAvatar, params: HeadParams, size: int) -> UInt8
     for yaw in YAWS:
         for pitch in PITCHES:
             camera = orbited(front, yaw, pitch)
-            seen = _seen(trained, vertices, points, normals, camera)
-            picture = trained.render(params, camera).image.clamp(0, 1)
-            colours += seen[:, None] * _sampled(picture, camera.project(points))
-            weights += seen
+            rendering = trained.render(params, camera)
+            own = rendering.image - (1 - rendering.alpha[..., None]) * trained.background
+            found = _sampled(torch.cat((own, rendering.alpha[..., None]), dim=2), camera.project(points))
+            weight = ASIDE ** max(abs(yaw), abs(pitch)) * (found[:, 3] > SOLID)
+            weight = weight * _seen(trained, vertices, points, normals, camera)
+            colours += weight[:, None] * found[:, :3] / found[:, 3:].clamp(min=SOLID)
+            weights += weight
     texture, is_known = np.zeros((size, size, 3), np.float32), np.zeros((size, size), bool)
     row, column = texels.row.numpy(), texels.column.numpy()
-    known = (weights > 1e-3).numpy()
-    texture[row, column] = (colours / weights.clamp(min=1e-6)[:, None]).numpy()
+    known = (weights > 0).numpy()
+    texture[row, column] = (colours / weights.clamp(min=1e-30)[:, None]).numpy()
     is_known[row[known], column[known]] = True
     _fill_from_gaussians(trained, texture, is_known)
     pixels = (texture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
@@ -69,7 +76,7 @@ def _seen(
     return visible * facing.clamp(min=0) ** SHARPNESS
 
 
-def _sampled(picture: Float[Tensor, "H W 3"], places: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+def _sampled(picture: Float[Tensor, "H W C"], places: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
     """The picture between its pixels."""
     height, width = picture.shape[:2]
     grid = torch.stack((2 * places[:, 0] / width - 1, 2 * places[:, 1] / height - 1), dim=1)[None, :, None]
