@@ -69,6 +69,9 @@ class Viewer:
         self._own: Angles = seen_from(camera, stage.trained.rest_params())
         position = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
         self._distance = math.hypot(*position)
+        # Sharing would open a tunnel past the gate.
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.scene.world_axes.visible = False
         self._server.scene.set_up_direction("+y")
         self._server.initial_camera.position = position
         self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
@@ -171,7 +174,9 @@ class Viewer:
         self._scrub.on_update(seek)
 
     def _slider(self, label: str, limits: tuple[float, float], part: str, key: int | str) -> Any:
-        low, high = limits
+        low, high = (round(limit, 2) for limit in limits)
+        if low == high:
+            low, high = limits
         slider = self._server.gui.add_slider(label, min=low, max=high, step=(high - low) / 200, initial_value=0.0)
 
         def moved(_: Any) -> None:
