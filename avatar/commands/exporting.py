@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from avatar.commands import OK
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_trained
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
 from avatar.export.licence import MESH, NOTHING, SKINNING, WHOLE, licence_of
@@ -33,8 +33,7 @@ def run_export(arguments: Namespace) -> int:
     check_options(arguments, format)
     trained = open_trained(arguments.run, arguments.head)
     out: Path = arguments.out or Path(f"{trained.name}{SUFFIXES[format]}")
-    if out.suffix.lower() != SUFFIXES[format]:
-        raise UserError(f"--format {format} writes {SUFFIXES[format]} files, not {out.name}")
+    check_file(out, [SUFFIXES[format]], f"--format {format}")
     motion = Path(arguments.motion) if arguments.motion else None
     check_outputs([out], [arguments.run, trained.source, arguments.head, motion])
     WRITERS[format](trained, out, arguments)

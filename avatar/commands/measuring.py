@@ -7,15 +7,20 @@ from argparse import Namespace
 
 from avatar.commands import OK
 from avatar.commands.opening import open_run
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
+from avatar.evaluation.protocol import choose_protocols
 
 
 def run_eval(arguments: Namespace) -> int:
     run = open_run(arguments.run, arguments.head, arguments.folder)
-    evaluate(run, arguments.protocol, write_frames=arguments.frames)
+    results = evaluate(run, arguments.protocol, write_frames=arguments.frames or arguments.verify)
+    if arguments.verify:
+        from avatar.evaluation.verify import verify  # imports scikit-image, which nothing else here needs
+
+        verify(results, [protocol.name for protocol in choose_protocols(arguments.protocol)])
     return OK
 
 
@@ -28,6 +33,7 @@ def run_report(arguments: Namespace) -> int:
 
 def run_compare(arguments: Namespace) -> int:
     if arguments.out is not None:
+        check_folder_output(arguments.out)
         check_outputs([arguments.out], [])
     comparison = compare_runs(arguments.runs, arguments.protocol)
     if arguments.out is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import Any, Literal
 
 import torch
@@ -10,14 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.splat.counters import Counters
-from avatar.splat.cpu import count_cpu, splat_cpu
+from avatar.splat.cpu import CannotDraw, count_cpu, splat_cpu
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["Counters", "counters", "splat"]
+__all__ = ["CannotDraw", "Counters", "counters", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
@@ -61,8 +62,8 @@ def splat(
     zero quaternion is the identity, with zero gradient. The sign of a scale has no effect.
 
     The image and alpha of the "cpu" backend are the same to the last bit for any number of threads.
-    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device, for non-finite values
-    (with count and first index), for colours that overflow, and for scenes beyond the kernel's stated limits.
+    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
+    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits.
     """
     options = _checked_options(
         gaussians,
@@ -79,7 +80,10 @@ def splat(
         region=region,
     )
     if backend == "reference":
-        check_finite(**gaussians._asdict(), background=background)
+        try:
+            check_finite(**gaussians._asdict(), background=background)
+        except ValueError as error:
+            raise CannotDraw(str(error)) from None
         return splat_reference(gaussians, camera, background, **options)
     return splat_cpu(gaussians, camera, background, **options)
 
@@ -139,7 +143,7 @@ def _checked_options(
     pixels = check_region(region, camera.width, camera.height)
 
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
-    alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, max(t_min, T_MIN)], dtype=torch.float32).tolist()
+    alpha_min, alpha_max, t_min = struct.unpack("3f", struct.pack("3f", alpha_min, alpha_max, max(t_min, T_MIN)))
     return {
         "sh_degree": sh_degree,
         "alpha_min": alpha_min,
@@ -166,7 +170,8 @@ def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: s
 
 
 def _check_camera(camera: Camera) -> None:
-    check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)
+    if not all(map(math.isfinite, (*camera.R_cam_world.flatten().tolist(), *camera.t_cam_world.tolist()))):
+        check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)  # names and counts them
     for name in ("fx", "fy"):
         value = getattr(camera, name)
         if not (value > 0 and math.isfinite(value)):

@@ -283,7 +283,9 @@ def test_the_command_writes_pages_and_element_files(tracked_folder: Path, tmp_pa
     assert "{{" not in out.read_text() and "CC-BY-4.0" in out.read_text()
     said = avatar("export", run, "--out", tmp_path / "x.avatar", "--precision", "float")
     assert '<avatar-view src="x.avatar">' in said and (tmp_path / "x.avatar").read_bytes()[:2] == b"\x1f\x8b"
-    assert "writes .html files" in avatar("export", run, "--format", "web", "--out", tmp_path / "x.png", status=1)
+    assert "--format web is written as .html" in avatar(
+        "export", run, "--format", "web", "--out", tmp_path / "x.png", status=1
+    )
     refused = avatar("export", run, "--with-head", "--out", tmp_path / "y.html", status=1)
     assert "--with-head belongs to --format avatar" in refused and not (tmp_path / "y.html").exists()
 

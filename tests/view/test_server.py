@@ -126,7 +126,12 @@ def test_a_person_plays_and_moves_a_slider(viewer: Viewer) -> None:
 def test_the_command_serves_and_ends(tracked_folder: Path, tmp_path: Path) -> None:
     run = lively_run(tracked_folder, tmp_path / "run", "model.uv_size=8")
     words = ["view", str(run), "--port", "0", "--stream", "0", "--host", "0.0.0.0", "--size", "64"]
-    process = subprocess.Popen([sys.executable, "-m", "avatar.cli", *words], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "avatar.cli", *words],
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what runs behind
+    )
     try:
         assert process.stdout is not None
         said = ""

@@ -58,24 +58,29 @@ const float* Portrait::pack(const splat::Camera& camera) {
     sort_farthest_first(depths, order_);
 
     packed_.resize(G * kPacked);
-    for (std::int64_t i = 0; i < G; ++i) {
-        const std::int64_t g = order_[i];
-        const float* mean = means_.data() + 3 * g;
-        float* to = packed_.data() + i * kPacked;
-        std::copy_n(mean, 3, to);
-        to[3] = opacities_[g];
-        float direction[3], basis[splat::kMaxCoefficients];
-        for (int k = 0; k < 3; ++k) direction[k] = mean[k] - eye[k];
-        const float norm = std::sqrt(direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2]);
-        for (float& value : direction) value /= norm > 0 ? norm : 1.0f;
-        splat::sh_basis(degree, direction, basis);
-        const float* sh = arrays_[kSh].data() + g * K * 3;
-        for (int c = 0; c < 3; ++c) {
-            float colour = 0.5f;
-            for (int k = 0; k < K; ++k) colour += basis[k] * sh[3 * k + c];
-            to[4 + c] = std::max(colour, 0.0f);
+    for (std::int64_t begin = 0; begin < G; begin += kLanes) {
+        const int count = static_cast<int>(std::min<std::int64_t>(kLanes, G - begin));
+        Floats direction[3] = {}, basis[splat::kMaxCoefficients];
+        for (int lane = 0; lane < count; ++lane) {
+            const float* mean = means_.data() + 3 * std::int64_t{order_[begin + lane]};
+            const float d[3] = {mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]};
+            const float norm = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+            for (int k = 0; k < 3; ++k) direction[k][lane] = norm > 0 ? d[k] / norm : 0.0f;
         }
-        covariance(quats_.data() + 4 * g, scales_.data() + 3 * g, to + 7);
+        splat::sh_basis(degree, direction, basis);
+        for (int lane = 0; lane < count; ++lane) {
+            const std::int64_t g = order_[begin + lane];
+            float* to = packed_.data() + (begin + lane) * kPacked;
+            std::copy_n(means_.data() + 3 * g, 3, to);
+            to[3] = opacities_[g];
+            const float* sh = arrays_[kSh].data() + g * K * 3;
+            for (int c = 0; c < 3; ++c) {
+                float colour = 0.5f;
+                for (int k = 0; k < K; ++k) colour += basis[k][lane] * sh[3 * k + c];
+                to[4 + c] = std::max(colour, 0.0f);
+            }
+            covariance(quats_.data() + 4 * g, scales_.data() + 3 * g, to + 7);
+        }
     }
     return packed_.data();
 }
