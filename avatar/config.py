@@ -215,7 +215,7 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
         raise UserError(f"the configuration has {shown(values)} where the keys {prefix}* should be")
     kinds = get_type_hints(schema)
     if unknown := [key for key in values if key not in kinds]:
-        raise UserError(f"there is no configuration key '{prefix}{unknown[0]}'{_nearest_hint(f'{prefix}{unknown[0]}')}")
+        raise _no_such_key(f"{prefix}{unknown[0]}")
     if missing := [key for key in kinds if key not in values]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(
@@ -234,12 +234,18 @@ def _check_overrides(overrides: Sequence[str]) -> None:
     for override in overrides:
         key, separator, value = override.partition("=")
         if not separator or not key:
-            raise UserError(f"'{override}' is not of the form key=value")
+            raise UserError(f"'{shown(override)}' is not of the form key=value")
         if key in groups:
             if value not in groups[key]:
-                raise UserError(f"{key}={value}: there is no such file; configs/{key}/ has {', '.join(groups[key])}")
+                raise UserError(
+                    f"{key}={shown(value)}: there is no such file; configs/{key}/ has {', '.join(groups[key])}"
+                )
         elif key not in keys:
-            raise UserError(f"there is no configuration key '{key}'{_nearest_hint(key, list(groups))}")
+            raise _no_such_key(key, list(groups))
+
+
+def _no_such_key(key: str, groups: Sequence[str] = ()) -> UserError:
+    return UserError(f"there is no configuration key '{shown(key)}'{_nearest_hint(shown(key), groups)}")
 
 
 def _groups() -> dict[str, list[str]]:

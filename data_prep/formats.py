@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep import imavatar, insta, vhap
+from data_prep import avatar_track, imavatar, insta, refined, vhap
 from data_prep.frame_files import find_frame_files
 from data_prep.metrical_tracker import read_tracking
 from data_prep.tracked_folder import TrackedFolder, matte_notes
@@ -14,7 +14,7 @@ from data_prep.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
 _LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}
-FORMATS = (METRICAL_TRACKER, *_LISTED)
+FORMATS = (METRICAL_TRACKER, *_LISTED, avatar_track.NAME)
 
 
 def open_tracked_folder(
@@ -30,6 +30,10 @@ def open_tracked_folder(
     """
     if format not in (None, *FORMATS):
         raise UserError(f"--format must be one of {', '.join(FORMATS)}, not {format!r}")
+    if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
+        if tracking is not None:
+            raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
+        return refined.open_folder(folder)
     frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
     name = format or detect_format(folder, frames)
     if name == METRICAL_TRACKER:

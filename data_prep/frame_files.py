@@ -108,6 +108,11 @@ def find_frame_files(
     )
 
 
+def find_numbered(folder: Path, complain: Callable[[str], object]) -> dict[int, Path]:
+    """The pictures of a folder by the number at the end of their names; `complain` as in `find_frame_files`."""
+    return _numbered(folder, IMAGE_SUFFIXES, complain)
+
+
 def transparent(images: Mapping[int, Path]) -> dict[int, Path]:
     """The images as their own mattes, where any of a few is transparent somewhere; else none."""
     for number in list(images)[:: max(1, len(images) // _SAMPLES)]:

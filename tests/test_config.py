@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import pytest
 
@@ -148,3 +149,9 @@ def test_every_key_in_the_yaml_files_has_a_comment() -> None:
             continue
         for line in file.read_text().splitlines():
             assert line.startswith(("#", "name: hyper")) or " # " in line, f"{file.name}: {line}"
+
+
+def test_a_key_of_any_length_is_answered_in_a_short_sentence() -> None:
+    with pytest.raises(UserError) as refused:
+        config_from_dict({**asdict(load_config()), "x" * 20_000: 1})
+    assert "there is no configuration key 'xxx" in str(refused.value) and len(str(refused.value)) < 300

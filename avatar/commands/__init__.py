@@ -9,8 +9,9 @@ from importlib import import_module
 OK, INTERRUPTED = 0, 130
 
 MODULES = {
-    "train": "training",
+    "train": "rounds",
     "eval": "measuring",
+    "refine": "refining",
     "report": "measuring",
     "compare": "measuring",
     "reenact": "driving",

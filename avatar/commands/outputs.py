@@ -11,7 +11,7 @@ from avatar.runs.lock import LOCK_FILE
 from avatar.runs.run import RUN_FILE
 
 RUN_FILES = (RUN_FILE, AVATAR_FILE, LOCK_FILE)
-RUN_FOLDERS = ("checkpoints", "tensorboard", "previews", "eval")
+RUN_FOLDERS = ("checkpoints", "tensorboard", "previews", "eval", "rounds")
 
 
 def check_file(output: Path, suffixes: Sequence[str], what: str) -> None:

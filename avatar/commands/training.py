@@ -148,7 +148,11 @@ def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: li
                     f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
                     "start a new run"
                 )
-    source = info.source
+    refuse_other_source(run, info.source, arguments)
+
+
+def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None:
+    """Of the options that say how the folder is read, none may change."""
     given = replace(
         source,
         tracking=source.tracking if arguments.tracking is None else arguments.tracking.resolve(),

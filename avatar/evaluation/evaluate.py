@@ -37,6 +37,7 @@ from avatar.evaluation.protocol import HELD_OUT, SHARED_CHOICES, Protocol, choos
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
+from avatar.evaluation.tracked import describe_tracking, measure_tracked, tracking_notes
 from avatar.files.atomic import write_atomically
 from avatar.files.video import video_writer
 from avatar.losses.lpips_network import Lpips, Net
@@ -103,6 +104,7 @@ def evaluate(
 
     for protocol in chosen:
         add_jitter(results[protocol.name], jitter[protocol.look], run)
+    tracking = describe_tracking(run, order)
     summary: dict[str, Any] = {
         "format": RESULTS_FORMAT,
         "subject": subject.name,
@@ -113,7 +115,13 @@ def evaluate(
         "config": run.config.to_dict(),
         "versions": versions(),
         "shared_choices": SHARED_CHOICES,
-        "notes": [*left_out.values(), *background_notes(chosen, data.background), *region_notes(chosen, run)],
+        "tracking": tracking,
+        "notes": [
+            *left_out.values(),
+            *background_notes(chosen, data.background),
+            *region_notes(chosen, run),
+            *tracking_notes(tracking),
+        ],
         "left_out": left_out,
         "rendering": speed(renderer, subject, order, data.size),
         "protocols": {
@@ -121,6 +129,9 @@ def evaluate(
             for protocol in chosen
         },
     }
+    if subject.given is not None:
+        for name, entry in measure_tracked(run, subject.given, renderer, indices, chosen, lpips).items():
+            summary["protocols"][name]["tracked"] = entry
     for protocol in chosen:
         rows = frames_csv(protocol.columns, results[protocol.name]).encode()
         write_atomically(folder / protocol.name / FRAMES_FILE, rows)

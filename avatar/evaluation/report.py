@@ -28,9 +28,12 @@ def table(results: Mapping[str, Any]) -> str:
     for first in range(0, len(shown), REGIONS_BESIDE):
         lines += [*_means(protocols, shown[first : first + REGIONS_BESIDE]), ""]
     lines += [*_intervals(protocols), ""]
+    if any("tracked" in entry for entry in protocols.values()):
+        lines += [*_tracked(protocols), ""]
     name, entry = next(iter(protocols.items()))
     lines += [*_details(name, entry), _speed(results["rendering"]), ""]
     lines += [f"{name}: {entry['choices']['summary']}" for name, entry in protocols.items()]
+    lines += _tracking(results["tracking"])
     lines += [f"LPIPS: {note}" for note in dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())]
     lines += [f"Note: {note}" for note in results["notes"]]
     return "\n".join(line.rstrip() for line in lines)
@@ -70,6 +73,35 @@ def _intervals(protocols: Mapping[str, Any]) -> list[str]:
         cells = (_interval(measure, entry["intervals"][measure]) for measure in (*MEASURES, "jitter"))
         jitter = "-" if entry["means"]["jitter"] is None else f"{entry['means']['jitter']:.2f}"
         lines.append(f"{name:{name_width}}{''.join(cells)}{jitter:>9}")
+    return lines
+
+
+def _tracked(protocols: Mapping[str, Any]) -> list[str]:
+    """Two lines for each protocol: the same avatar and frames with the tracker's tracking and with the refined one."""
+    regions: tuple[Region | None, ...] = (None, "head")
+    name_width = _name_width(protocols)
+    width = sum(len(_cell(measure, None)) for measure in MEASURES)
+    titles = "   ".join((f"{region} only" if region else MAIN_TITLE).center(width) for region in regions)
+    lines = ["the same avatar and frames by both trackings", f"{'protocol':{name_width}} {'driven by':9}   {titles}"]
+    for name, entry in protocols.items():
+        for title, means in (("tracked", entry["tracked"]["means"]), ("refined", entry["means"])):
+            cells = (
+                "".join(_cell(measure, means.get(column(measure, region))) for measure in MEASURES)
+                for region in regions
+            )
+            lines.append(f"{name:{name_width}} {title:9}   {'   '.join(cells)}")
+    return lines
+
+
+def _tracking(tracking: Mapping[str, Any]) -> list[str]:
+    """What the tracking of the measured frames has seen."""
+    lines = [f"tracked: as {tracking['tracker']} left it; {tracking['tracked']}"]
+    for one in tracking["rounds"]:
+        both = one["measured_frames_trained_on"] or "none"
+        lines.append(
+            f"refined: each frame fitted to its own picture through the avatar of {one['run']} (step {one['step']}), which "
+            f"was trained on {one['frames_trained_on']} frames, {both} of them measured"
+        )
     return lines
 
 

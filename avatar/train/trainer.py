@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,6 +16,7 @@ from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw, splat
 from avatar.train.colours import colour_from_frames
+from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
 from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
@@ -115,29 +110,3 @@ def render_held_out(
         return frame.composite(background), splat(avatar(frame.params), frame.camera, background).image
     except CannotDraw as error:
         raise stopped(step, frame, str(error)) from error
-
-
-@contextmanager
-def interruption() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a flag that the loop reads between steps; a second one acts at once.
-
-    A signal that is ignored (a job in the background of a shell, nohup) stays ignored, and outside the main thread the
-    signals are somebody else's.
-    """
-    caught = False
-    previous: dict[int, Any] = {}
-
-    def note(number: int, _: FrameType | None) -> None:
-        nonlocal caught
-        caught = True
-        signal.signal(number, previous[number])
-
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) != signal.SIG_IGN:
-                previous[number] = signal.signal(number, note)
-    try:
-        yield lambda: caught
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

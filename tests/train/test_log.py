@@ -12,7 +12,7 @@ from avatar.train.log import TrainingLog
 
 
 def test_no_psnr_is_shown_before_one_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    image = torch.full((3, 4, 4), 0.5)
+    image = torch.full((4, 4, 3), 0.5)
     loss = PhotometricLoss(*torch.ones(len(PhotometricLoss._fields)))
     with TrainingLog(tmp_path, 0, 3, every=2) as log:
         shown = []
