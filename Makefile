@@ -11,7 +11,7 @@ DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup demo test stress fuzz sanitize arm64 check format smoke wheel clean
+.PHONY: help setup demo test stress fuzz sanitize wasm arm64 check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
@@ -31,6 +31,9 @@ fuzz: setup ## give every reader damaged and hostile files (FUZZ_CASES=20000 in 
 
 sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh
+
+wasm: ## compile the core to WebAssembly for avatar/web (Debian: emscripten)
+	scripts/build_wasm.sh
 
 arm64: ## compile the core for 64-bit ARM with a cross compiler (Debian: g++-aarch64-linux-gnu)
 	scripts/check_arm64.sh

@@ -29,10 +29,14 @@ set -x
 "$avatar" eval run --frames
 "$avatar" reenact run --driver driver --frame-offset 1 # 20 frames are too few to detect it
 "$avatar" export run --with-head --out alone.safetensors
+"$avatar" export run # a page: the scripts and the WebAssembly module are in the wheel
+"$avatar" export run --out actor.glb
+"$avatar" export run --out actor.ply
+"$avatar" export run --out actor.mp4 --camera orbit
 mkdir elsewhere
 (cd elsewhere && "$avatar" drive-file ../driver --frame-offset 1 --out motion.npz &&
   "$avatar" reenact ../alone.safetensors --driver motion.npz)
-for made in elsewhere/reenact/motion-relative.mp4 run/eval/results.json run/eval/hypergaussians/renders/00048.png run/reenact/driver-relative.mp4; do
+for made in elsewhere/reenact/motion-relative.mp4 run/eval/results.json run/eval/hypergaussians/renders/00048.png run/reenact/driver-relative.mp4 actor.html actor.glb actor.ply actor.mp4; do
   test -s "$made"
 done
 set +x

@@ -18,6 +18,8 @@ MODULES = {
     "reenact": "driving",
     "drive-file": "driving",
     "export": "exporting",
+    "view": "viewing",
+    "send": "viewing",
     "prepare": "preparing",
     "check": "preparing",
     "demo-data": "demonstrating",

@@ -13,6 +13,7 @@ from avatar.data.source import Source
 from avatar.demo import make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
+from avatar.export.web_page import write_page
 from avatar.motion.reenact import reenact
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.run import RUN_FILE, read_run_info
@@ -51,8 +52,10 @@ def run_demo(arguments: Namespace) -> int:
     trained = open_trained(run)
     video = reenact(trained, open_driver(driver, trained), run / "reenact" / "driver-relative.mp4")
     results = evaluate(open_run(run), None, write_frames=False)
+    page = write_page(trained, out / "avatar.html")
     print("\nThe demo is done. Look at")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
+    print(f"  {page.path}   the avatar itself, alive in any browser: open this first")
     return OK

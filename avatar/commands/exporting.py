@@ -3,31 +3,176 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from avatar.commands import OK
-from avatar.commands.opening import open_trained
-from avatar.commands.outputs import check_file, check_outputs
-from avatar.runs.avatar_file import read_portrait, write_portrait
+from tqdm import tqdm
 
-LICENCE = (
-    "The head model in this file keeps its own licence: FLAME 2023 Open (CC-BY-4.0) may be passed on with attribution to "
-    "the Max Planck Institute for Intelligent Systems; FLAME 2020 and 2023 may not be passed on; the demo's is free."
-)
+from avatar.commands import OK
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_trained
+from avatar.commands.outputs import check_file, check_outputs
+from avatar.errors import UserError
+from avatar.export.glb import encode_glb
+from avatar.export.licence import MESH, NOTHING, SKINNING, WHOLE, licence_of
+from avatar.export.movie import write_movie
+from avatar.export.ply import encode_ply
+from avatar.export.web_page import write_page, write_web_avatar
+from avatar.files.atomic import write_atomically
+from avatar.runs.avatar_file import read_portrait, write_portrait
+from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import HeadParams
+
+MIB = 2**20
+TEXTURE, MAX_SIZE = 1024, 4096  # pixels
 
 
 def run_export(arguments: Namespace) -> int:
+    format = chosen_format(arguments.format, arguments.out)
+    check_options(arguments, format)
     trained = open_trained(arguments.run, arguments.head)
-    out: Path = arguments.out or Path(f"{trained.name}.safetensors")
-    check_file(out, [".safetensors"], "an avatar file")
-    check_outputs([out], [arguments.run, trained.source, arguments.head])
+    out: Path = arguments.out or Path(f"{trained.name}{SUFFIXES[format]}")
+    check_file(out, [SUFFIXES[format]], f"--format {format}")
+    motion = Path(arguments.motion) if arguments.motion else None
+    check_outputs([out], [arguments.run, trained.source, arguments.head, motion])
+    WRITERS[format](trained, out, arguments)
+    return OK
+
+
+def chosen_format(format: str | None, out: Path | None) -> str:
+    """What --format says, else what the suffix of --out does, else the page that any browser opens."""
+    if format is not None:
+        return format
+    if out is None:
+        return "web"
+    found = next((name for name, suffix in SUFFIXES.items() if out.suffix.lower() == suffix), None)
+    if found is None:
+        raise UserError(
+            f"{out.name} does not say what to write: end it in {', '.join(SUFFIXES.values())}, or give --format"
+        )
+    return found
+
+
+def check_options(arguments: Namespace, format: str) -> None:
+    """Raise UserError for an option that another format has."""
+    if arguments.texture is not None and not 64 <= arguments.texture <= MAX_SIZE:
+        raise UserError(f"--texture must be from 64 to {MAX_SIZE}, not {arguments.texture}")
+    for option, formats in OPTIONS.items():
+        value = getattr(arguments, option)
+        if value is not None and value is not False and format not in formats:
+            name = option.replace("_", "-")
+            raise UserError(f"--{name} belongs to --format {' or '.join(formats)}; this writes {format}")
+
+
+def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    page = write_page(trained, out, arguments.precision or "small")
+    print(f"Page     {out} ({page.bytes / MIB:.1f} MiB): opens in any browser, without a network")
+    if page.note:
+        print(f"Note     {page.note}")
+    print(f"Licence  {licence_of(SKINNING)}")
+
+
+def write_web_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    size = write_web_avatar(trained, out, arguments.precision or "small")
+    print(f'Avatar   {out} ({size / MIB:.1f} MiB), for <avatar-view src="{out.name}">')
+    print(f"Licence  {licence_of(SKINNING)}")
+
+
+def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    licence = licence_of(NOTHING)
+    clip = chosen_clip(trained, arguments)
+    if clip is None:
+        write_atomically(out, encode_ply(trained.gaussians(chosen_pose(trained, arguments)), licence))
+        print(f"Splats   {out} ({out.stat().st_size / MIB:.1f} MiB)")
+    else:
+        for number, (params, _) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
+            write_atomically(numbered(out, number), encode_ply(trained.gaussians(params), licence))
+        print(f"Splats   {numbered(out, 0)} to {numbered(out, len(clip) - 1).name}, {clip.fps:g} a second")
+    print(f"Licence  {licence}")
+
+
+def write_mesh(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    licence = licence_of(MESH)
+    data, targets = encode_glb(trained, chosen_pose(trained, arguments), arguments.texture or TEXTURE, licence)
+    write_atomically(out, data)
+    print(f"Mesh     {out} ({len(data) / MIB:.1f} MiB) with {len(targets)} morph targets: {', '.join(targets)}")
+    print(f"Licence  {licence}")
+
+
+def write_clip(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    clip = chosen_clip(trained, arguments, "test")
+    assert clip is not None
+    path = arguments.camera or "recorded"
+    write_movie(trained, clip, out, path, arguments.size)
+    print(f"Video    {out}: {len(clip)} frames, camera {path}")
+
+
+def chosen_pose(trained: TrainedAvatar, arguments: Namespace) -> HeadParams:
+    """The frame of --frame, else the neutral face."""
+    if arguments.frame is None:
+        return trained.rest_params()
+    count = len(trained.recording)
+    if not 0 <= arguments.frame < count:
+        raise UserError(f"--frame must be from 0 to {count - 1}, not {arguments.frame}")
+    return trained.recording.params(arguments.frame)
+
+
+def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | None = None) -> Clip | None:
+    """What --motion names: frames of the avatar's own video, or a drive file."""
+    motion: str | None = arguments.motion or otherwise
+    if motion is None:
+        return None
+    if arguments.frame is not None:
+        raise UserError("--frame is one frame and --motion are many: give one of the two")
+    if (size := arguments.size) is not None and not 16 <= size <= MAX_SIZE:
+        raise UserError(f"--size must be from 16 to {MAX_SIZE}, not {size}")
+    width = size or trained.config.data.size
+    if motion in OWN:
+        return own_clip(trained, motion, width)
+    if Path(motion).suffix.lower() not in DRIVE_SUFFIXES:
+        raise UserError(f"--motion must be {', '.join(OWN)}, or a drive file (.npz, .csv), not {motion}")
+    return driven_clip(trained, open_drive_file(Path(motion), trained), width)
+
+
+def numbered(out: Path, number: int) -> Path:
+    return out.with_name(f"{out.stem}-{number:05d}{out.suffix}")
+
+
+def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     portrait = read_portrait(trained.source)
     head = trained.assets if arguments.with_head else None
-    write_portrait(out, replace(portrait, head=head), LICENCE if arguments.with_head else None)
-    print(f"Avatar   {out} ({out.stat().st_size / 2**20:.1f} MiB)")
-    if arguments.with_head:
-        print(f"Licence  {LICENCE}")
+    licence = licence_of(WHOLE) if arguments.with_head else None
+    write_portrait(out, replace(portrait, head=head), licence)
+    print(f"Avatar   {out} ({out.stat().st_size / MIB:.1f} MiB)")
+    if licence:
+        print(f"Licence  {licence}")
     else:
         print(f"Next     avatar reenact {out} --head HEAD --driver DRIVER; it needs the head model it was trained with")
-    return OK
+
+
+SUFFIXES = {
+    "web": ".html",
+    "web-avatar": ".avatar",
+    "avatar": ".safetensors",
+    "ply": ".ply",
+    "glb": ".glb",
+    "video": ".mp4",
+}
+WRITERS: dict[str, Callable[[TrainedAvatar, Path, Namespace], None]] = {
+    "web": write_web,
+    "web-avatar": write_web_file,
+    "avatar": write_avatar_file,
+    "ply": write_splats,
+    "glb": write_mesh,
+    "video": write_clip,
+}
+OPTIONS = {
+    "precision": ("web", "web-avatar"),
+    "with_head": ("avatar",),
+    "frame": ("ply", "glb"),
+    "motion": ("ply", "video"),
+    "texture": ("glb",),
+    "camera": ("video",),
+    "size": ("video",),
+}

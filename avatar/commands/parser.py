@@ -150,10 +150,15 @@ def build_parser() -> argparse.ArgumentParser:
         "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
     )
 
-    export = commands.add_parser("export", help="write an avatar as a file to take away")
-    add_avatar(export)
-    export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.safetensors")
-    export.add_argument("--with-head", action="store_true", help="pack the head model in; mind its licence")
+    add_export(commands.add_parser("export", help="write an avatar as a file to take away"))
+
+    add_view(commands.add_parser("view", help="show an avatar in a browser, move it by hand and drive it live"))
+
+    send = commands.add_parser("send", help="replay a drive file to avatar view --stream")
+    send.add_argument("drive", type=Path, metavar="FILE", help="drive file (.npz, .csv)")
+    send.add_argument("port", type=int, metavar="PORT", help="of avatar view --stream on this machine")
+    send.add_argument("--head", type=Path, metavar="PATH", required=True, help="the avatar's head model")
+    send.add_argument("--loop", action="store_true", help="again and again, until Ctrl-C")
 
     drive_file = commands.add_parser("drive-file", help="write a tracked folder's motion as a drive file")
     add_source(drive_file)
@@ -209,6 +214,45 @@ def build_parser() -> argparse.ArgumentParser:
 
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser
+
+
+def add_export(export: argparse.ArgumentParser) -> None:
+    add_avatar(export)
+    export.add_argument(
+        "--format",
+        choices=("web", "web-avatar", "avatar", "ply", "glb", "video"),
+        help="web: a page that any browser opens; web-avatar: the file that <avatar-view> shows in pages of your own; "
+        "avatar: what the other commands take; ply: Gaussians; glb: a mesh (default: told from --out, else web)",
+    )
+    export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.html, .avatar, .ply ...")
+    export.add_argument(
+        "--precision", choices=("small", "float"), help="web, web-avatar: of the parameters (default: small)"
+    )
+    export.add_argument("--with-head", action="store_true", help="avatar: pack the head model in; mind its licence")
+    export.add_argument("--frame", type=int, metavar="N", help="ply, glb: of its video (default: the neutral face)")
+    export.add_argument(
+        "--motion", metavar="MOTION", help="ply, video: test, train or all frames of its video, or a drive file"
+    )
+    export.add_argument("--texture", type=int, metavar="N", help="glb: width of the texture (default: 1024)")
+    export.add_argument(
+        "--camera", choices=("recorded", "still", "turntable", "orbit"), help="video: its path (default: recorded)"
+    )
+    export.add_argument("--size", type=int, metavar="N", help="video: its width in pixels (default: as in training)")
+
+
+def add_view(view: argparse.ArgumentParser) -> None:
+    add_avatar(view)
+    add_folder(view)
+    view.add_argument("--drive", type=Path, action="append", default=[], metavar="FILE", help="a motion to play, too")
+    view.add_argument("--size", type=int, metavar="N", help="width of the picture in pixels (default: as in training)")
+    view.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on; others than this machine's need a token"
+    )
+    view.add_argument("--port", type=int, default=8080, help="default: 8080; 0 takes a free one")
+    view.add_argument("--token", metavar="TEXT", help="what a browser must know (default: made up where it is needed)")
+    view.add_argument(
+        "--stream", type=int, metavar="PORT", help="take frames there: JSON lines, OSC, Live Link Face; 0: a free port"
+    )
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:

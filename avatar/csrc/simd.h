@@ -2,6 +2,9 @@
 // Vectors of floats and of doubles as wide as the target of this compilation, through the vector extensions of GCC and
 // Clang. Included only by the kernels, which are compiled once for each instruction set: everything here has internal
 // linkage, and no standard-library template may be used beside it, or code for one set could be linked into another.
+#if defined(__wasm_simd128__)
+#include <wasm_simd128.h>
+#endif
 #if defined(__SSE2__)
 #include <immintrin.h>
 #elif defined(__ARM_NEON)
@@ -71,15 +74,22 @@ inline void finish_stores_past_caches() {
 #endif
 }
 
+// GCC makes a constant of a vector that is filled so, Clang only if it is told to.
+#if defined(__clang__)
+#define AVATAR_FOR_EACH_LANE(i) _Pragma("clang loop unroll(full)") for (int i = 0; i < kLanes; ++i)
+#else
+#define AVATAR_FOR_EACH_LANE(i) for (int i = 0; i < kLanes; ++i)
+#endif
+
 // 0, 1, 2 ... modulo n, and divided by n without a rest.
 inline Floats remainders(int n) {
     Floats v{};
-    for (int i = 0; i < kLanes; ++i) v[i] = float(i % n);
+    AVATAR_FOR_EACH_LANE(i) v[i] = float(i % n);
     return v;
 }
 inline Floats quotients(int n) {
     Floats v{};
-    for (int i = 0; i < kLanes; ++i) v[i] = float(i / n);
+    AVATAR_FOR_EACH_LANE(i) v[i] = float(i / n);
     return v;
 }
 
@@ -102,6 +112,8 @@ inline Floats min(Floats a, Floats b) {
     return (Floats)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b);
 #elif defined(__AVX2__)
     return (Floats)_mm256_min_ps((__m256)a, (__m256)b);
+#elif defined(__wasm_simd128__)  // its own: Emscripten's _mm_min_ps takes three instructions
+    return (Floats)wasm_f32x4_pmin((v128_t)b, (v128_t)a);
 #elif defined(__SSE2__)
     return (Floats)_mm_min_ps((__m128)a, (__m128)b);
 #else
@@ -114,6 +126,8 @@ inline Floats max(Floats a, Floats b) {
     return (Floats)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b);
 #elif defined(__AVX2__)
     return (Floats)_mm256_max_ps((__m256)a, (__m256)b);
+#elif defined(__wasm_simd128__)
+    return (Floats)wasm_f32x4_pmax((v128_t)b, (v128_t)a);
 #elif defined(__SSE2__)
     return (Floats)_mm_max_ps((__m128)a, (__m128)b);
 #else
@@ -185,7 +199,7 @@ inline unsigned at_most(Floats a, Floats b) {
 #if defined(__AVX512F__)
     return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OS);  // GCC goes a longer way from the comparison
 #else
-    return signs(a <= b);
+    return signs((Ints)(a <= b));  // where long has 32 bits, Clang compares to a vector of those
 #endif
 }
 

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.subject import Subject
-from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.head.model import HeadModel
+from avatar.motion.orbit import seen_from
 from avatar.types import IDENTITY_6D, Camera, HeadParams
 
 
@@ -38,9 +39,7 @@ def yaw(camera: Camera, params: HeadParams) -> float:
     """The angle in degrees, about the head's vertical axis, from which the camera sees it: 0 from the front, positive from
     the head's own left. The neck's rotation counts as the head's.
     """
-    position = -camera.R_cam_world.T @ camera.t_cam_world  # of the camera in the head's world
-    x, _, z = (matrix_from_6d(params.neck).T @ position).tolist()
-    return math.degrees(math.atan2(x, z))
+    return seen_from(camera, params).yaw
 
 
 def expression_distances(head: HeadModel, frames: Sequence[HeadParams], training: Sequence[HeadParams]) -> list[float]:

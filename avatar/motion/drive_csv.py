@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ ARKIT_FPS = 60.0  # of Live Link Face, where the timecodes do not tell
 # Where the head model does not say otherwise: what ARKit's 1 stands for. Rough means of what people can do; ARKit
 # gives no angles with these blendshapes.
 JAW_OPEN_RADIANS, GAZE_RADIANS = 0.35, 0.6
+_POSE = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")
 _TIMECODE = re.compile(r"(\d+):(\d+):(\d+):[\d.]+")
 
 
@@ -98,13 +99,32 @@ def _from_arkit(
         for column, name in enumerate(header)
         if plain(name) not in ("timecode", "blendshapecount")
     }
-    eyelids = np.stack([values.pop(f"eyeblink{side}", np.zeros(len(rows))) for side in ("left", "right")], axis=1)
-    eyes = _gaze(values, len(rows))
-    pose = [name for name in list(values) if re.fullmatch(r"(head|lefteye|righteye)(yaw|pitch|roll)", name)]
-    for name in pose:
-        del values[name]
-    expression, jaw, unmapped = np.zeros((len(rows), num_expressions)), np.zeros((len(rows), 3)), []
+    pose = [name for name in values if _POSE.fullmatch(name)]
+    arrays, unread = from_blendshapes(values, len(rows), num_expressions, names)
+    unmapped = [next(own for own in header if plain(own) == name) for name in unread]
+    if not arrays["expression"].any() and len(unmapped) > 1:
+        raise UserError(
+            f"{path} holds ARKit's blendshapes, and the head model does not say which of its expressions they are: put "
+            f"{NAMES_FILE} beside the model file, with the name of each coefficient or ARKit's weights (docs/transfer.md)"
+        )
+    if unmapped:
+        say(f"Note: {len(unmapped)} of ARKit's blendshapes move nothing on this head model: {_some(unmapped)}")
+    if any(name.startswith("head") for name in pose):
+        say(f"Note: the head's turns in {path.name} are not used; the avatar's own camera is shown")
+    return arrays | {"fps": np.array(_timecode_fps([row[0] for row in rows]))}
+
+
+def from_blendshapes(
+    values: Mapping[str, np.ndarray], frames: int, num_expressions: int, names: ExpressionNames
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Arrays of an .npz drive file from ARKit's blendshapes [T] by their plain names, and the names that move nothing."""
+    values = dict(values)
+    eyelids = np.stack([values.pop(f"eyeblink{side}", np.zeros(frames)) for side in ("left", "right")], axis=1)
+    eyes = _gaze(values, frames)
+    expression, jaw, unmapped = np.zeros((frames, num_expressions)), np.zeros((frames, 3)), []
     for name, value in values.items():
+        if _POSE.fullmatch(name):
+            continue
         targets = names.targets(name)
         if not targets and name == "jawopen":
             targets = {"jaw_x": JAW_OPEN_RADIANS}
@@ -114,21 +134,11 @@ def _from_arkit(
             else:
                 expression[:, target] += weight * value
         if not targets and not name.startswith("eyelook"):
-            unmapped.append(next(own for own in header if plain(own) == name))
-    if not expression.any() and len(unmapped) > 1:
-        raise UserError(
-            f"{path} holds ARKit's blendshapes, and the head model does not say which of its expressions they are: put "
-            f"{NAMES_FILE} beside the model file, with the name of each coefficient or ARKit's weights (docs/transfer.md)"
-        )
-    if unmapped:
-        say(f"Note: {len(unmapped)} of ARKit's blendshapes move nothing on this head model: {_some(unmapped)}")
-    if any(name.startswith("head") for name in pose):
-        say(f"Note: the head's turns in {path.name} are not used; the avatar's own camera is shown")
-    arrays = {"expression": expression, "jaw": jaw, "eyes": eyes, "eyelids": eyelids}
-    return arrays | {"fps": np.array(_timecode_fps([row[0] for row in rows]))}
+            unmapped.append(name)
+    return {"expression": expression, "jaw": jaw, "eyes": eyes, "eyelids": eyelids}, unmapped
 
 
-def _gaze(values: dict[str, np.ndarray], frames: int) -> np.ndarray:
+def _gaze(values: Mapping[str, np.ndarray], frames: int) -> np.ndarray:
     """Rotation vectors [T, 6] from EyeLook{In, Out, Up, Down}; x turns the eye down, y to the subject's left."""
 
     def look(direction: str, side: str) -> np.ndarray:

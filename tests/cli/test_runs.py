@@ -191,5 +191,7 @@ def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert before.step == 12
     output = avatar("demo", tmp_path / "demo")
     assert "Resuming" in output and "The demo is done" in output
+    page = tmp_path / "demo" / "avatar.html"
+    assert output.rstrip().splitlines()[-1].startswith(f"  {page} ") and page.stat().st_size > 10**5
     assert newest_checkpoint(run).step == 16
     assert "strict" in output, "the whole avatar is measured"

@@ -1,0 +1,94 @@
+"""The avatar's mesh for programs that know meshes: posed, with its expressions as morph targets and a baked texture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
+
+from avatar.export.bake import bake_texture
+from avatar.motion.controls import expression_controls, joint_ranges, posed
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import HeadParams
+
+LEAST = 1e-6  # metres: a target that moves nothing so far is left out
+FLOAT = 5126  # of glTF
+
+
+def encode_glb(trained: TrainedAvatar, params: HeadParams, size: int, licence: str) -> tuple[bytes, tuple[str, ...]]:
+    """A glTF 2.0 binary and the names of its morph targets. Metres, y up, the face to +z, as glTF has it.
+
+    Weight 1 of a target is as far as the training video shows, from the pose of the file.
+    """
+    assets = trained.assets
+    corners = torch.stack((assets.faces.reshape(-1), assets.uv_faces.reshape(-1)), dim=1)
+    unique, index = torch.unique(corners, dim=0, return_inverse=True)
+    of_vertex, of_uv = unique.unbind(dim=1)
+    base = trained.renderer.vertices(params)
+    image = Image.fromarray(bake_texture(trained, params, size))
+    material = PBRMaterial(
+        name=trained.name, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+    )
+    mesh = trimesh.Trimesh(
+        base[of_vertex].numpy(),
+        index.reshape(-1, 3).numpy(),
+        visual=TextureVisuals(uv=assets.uvs[of_uv].numpy(), material=material),
+        process=False,
+    )
+    targets = {name: (moved - base)[of_vertex] for name, moved in shapes(trained, params).items()}
+    targets = {name: moved for name, moved in targets.items() if float(moved.abs().max()) > LEAST}
+
+    def add_targets(buffer_items: Any, tree: dict[str, Any]) -> None:
+        (gltf_mesh,) = tree["meshes"]
+        primitive = gltf_mesh["primitives"][0]
+        primitive["targets"] = [
+            {"POSITION": add_accessor(buffer_items, tree, name, moved)} for name, moved in targets.items()
+        ]
+        gltf_mesh["weights"] = [0.0] * len(targets)
+        gltf_mesh["name"] = trained.name
+        gltf_mesh["extras"] = {"targetNames": list(targets)}
+        tree["asset"]["copyright"] = licence
+
+    data = export_glb(trimesh.Scene(mesh), include_normals=True, buffer_postprocessor=add_targets)
+    return data, tuple(targets)
+
+
+def add_accessor(buffer_items: Any, tree: dict[str, Any], name: str, values: Float[Tensor, "T 3"]) -> int:
+    """Append values to the file's buffer; the number of their accessor."""
+    array = values.numpy().astype("<f4")
+    buffer_items[f"target {name}"] = np.ascontiguousarray(array).tobytes()
+    tree["accessors"][f"target {name}"] = {
+        "bufferView": len(buffer_items) - 1,
+        "componentType": FLOAT,
+        "count": len(array),
+        "type": "VEC3",
+        "min": array.min(axis=0).tolist(),
+        "max": array.max(axis=0).tolist(),
+    }
+    return len(tree["accessors"]) - 1
+
+
+def shapes(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tensor, "V 3"]]:
+    """The mesh with each control and joint moved from `params` as far as the training video shows."""
+    train = list(trained.recording.split.train)
+    head, rest = trained.avatar.head, trained.rest_params()
+    moved: dict[str, HeadParams] = {}
+    for control in expression_controls(trained.recording.tracks["expression"][train], rest.expression, head):
+        far = max(control.low, control.high, key=abs)
+        name = f"{control.part}: {control.name}"
+        moved[name] = replace(params, expression=params.expression + far * control.direction)
+    for joint, (low, high) in joint_ranges(trained.recording.motion(train)).items():
+        turned = posed(rest, None, {joint: max(low, high, key=abs)})
+        part = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "nod": "neck", "turn": "neck"}
+        field = part.get(joint, "eyes")
+        moved[joint.replace("_", " ")] = replace(params, **{field: getattr(turned, field)})
+    return {name: head.vertices(pose) for name, pose in moved.items()}

@@ -1,0 +1,59 @@
+"""Motion as a video, seen along a path of the camera that stays where the training video was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tqdm import tqdm
+
+from avatar.files.video import write_video
+from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
+from avatar.runs.clips import Clip
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import Camera, HeadParams
+
+CameraPath = Literal["recorded", "still", "turntable", "orbit"]
+PATHS: tuple[CameraPath, ...] = ("recorded", "still", "turntable", "orbit")
+PERIOD = 6.0  # seconds of one round
+
+
+def limits_of(trained: TrainedAvatar) -> OrbitLimits:
+    """How far the camera may turn from its place at rest."""
+    recording = trained.recording
+    frames = [(recording.camera(i), recording.params(i)) for i in recording.split.train]
+    return orbit_limits((trained.rest_camera(), trained.rest_params()), frames)
+
+
+def path_camera(rest: Camera, limits: OrbitLimits, path: CameraPath, seconds: float, period: float = PERIOD) -> Camera:
+    """Where the camera of a path is: turntable from side to side, orbit around an ellipse; both within `limits`."""
+    phase = 2 * math.pi * seconds / period
+    middle_yaw, middle_pitch = ((high + low) / 2 for low, high in limits)
+    reach_yaw, reach_pitch = ((high - low) / 2 for low, high in limits)
+    if path == "turntable":
+        return orbited(rest, middle_yaw + reach_yaw * math.sin(phase))
+    if path == "orbit":
+        return orbited(rest, middle_yaw + reach_yaw * math.sin(phase), middle_pitch + reach_pitch * math.cos(phase))
+    return rest
+
+
+def along_path(
+    trained: TrainedAvatar, clip: Clip, path: CameraPath, size: int | None = None
+) -> Iterator[tuple[HeadParams, Camera]]:
+    """The clip's frames with the cameras of the path; "recorded" keeps the head's pose of each frame."""
+    if path == "recorded":
+        yield from clip.frames
+        return
+    rest, limits = trained.rest_camera(size), limits_of(trained)
+    for number, (params, _) in enumerate(clip.frames):
+        yield params, path_camera(rest, limits, path, number / clip.fps)
+
+
+def write_movie(trained: TrainedAvatar, clip: Clip, out: Path, path: CameraPath, size: int | None = None) -> None:
+    """H.264 in MP4, drawn over the colour that the avatar was trained over."""
+    images = (rendering.image for rendering in trained.stream(along_path(trained, clip, path, size)))
+    pixels = ((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for image in images)
+    write_video(out, tqdm(pixels, total=len(clip), desc="video", unit="frame", dynamic_ncols=True), clip.fps)

@@ -1,0 +1,88 @@
+"""Which frame is shown now: of a motion that plays, stands still or is scrubbed, or of a stream."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from avatar.runs.clips import Clip
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import Camera, HeadParams
+
+NEUTRAL, STREAM = "neutral face", "stream"
+
+
+@dataclass(frozen=True)
+class Shown:
+    params: HeadParams
+    camera: Camera
+    recorded: int | None  # of the avatar's own video
+    key: object  # another one for another frame
+
+
+class Player:
+    """`clock` gives seconds; `live` the newest frame of a stream, or None before the first."""
+
+    def __init__(
+        self,
+        trained: TrainedAvatar,
+        clips: Mapping[str, Clip],
+        clock: Callable[[], float],
+        live: Callable[[], tuple[int, HeadParams] | None] | None = None,
+    ) -> None:
+        self._clips, self._clock, self._live = dict(clips), clock, live
+        self._rest = Shown(trained.rest_params(), trained.rest_camera(), None, NEUTRAL)
+        self.name = NEUTRAL if live is None else STREAM
+        self.is_playing = False
+        self._since, self._first = 0.0, 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (NEUTRAL, *self._clips, *([STREAM] if self._live else []))
+
+    @property
+    def clip(self) -> Clip | None:
+        return self._clips.get(self.name)
+
+    @property
+    def index(self) -> int:
+        """Of the frame in the clip that is shown; it starts again after its end."""
+        clip = self.clip
+        if clip is None:
+            return 0
+        passed = int((self._clock() - self._since) * clip.fps) if self.is_playing else 0
+        return (self._first + passed) % len(clip)
+
+    @property
+    def share(self) -> float:
+        clip = self.clip
+        return self.index / max(len(clip) - 1, 1) if clip else 0.0
+
+    def choose(self, name: str) -> None:
+        if name not in self.names:
+            raise ValueError(f"there is no motion {name!r}; there are {', '.join(self.names)}")
+        self.name, self._first, self.is_playing = name, 0, False
+
+    def play(self) -> None:
+        self._first, self._since = self.index, self._clock()
+        self.is_playing = self.clip is not None
+
+    def pause(self) -> None:
+        self._first, self.is_playing = self.index, False
+
+    def seek(self, share: float) -> None:
+        """To a part of the clip, from 0 to 1; what plays goes on from there."""
+        if (clip := self.clip) is not None:
+            self._first = round(min(max(share, 0.0), 1.0) * (len(clip) - 1))
+            self._since = self._clock()
+
+    def now(self) -> Shown:
+        clip = self.clip
+        if clip is not None:
+            index = self.index
+            params, camera = clip.frames[index]
+            return Shown(params, camera, clip.recorded[index] if clip.recorded else None, (self.name, index))
+        if self.name == STREAM and self._live is not None and (newest := self._live()) is not None:
+            number, params = newest
+            return replace(self._rest, params=params, key=(STREAM, number))
+        return self._rest

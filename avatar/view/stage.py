@@ -1,0 +1,158 @@
+"""What the viewer shows, as a function of what is set: no server, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avatar.files.video import error_map
+from avatar.head.rasterize import rasterize_mesh
+from avatar.motion.controls import ExpressionControl, expression_controls, joint_ranges, posed
+from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
+from avatar.report.pictures import UNCERTAINTY_GAIN
+from avatar.runs.trained import TrainedAvatar
+from avatar.splat import splat
+from avatar.splat.sh import C0
+from avatar.types import Camera, HeadParams
+
+Overlay = Literal["none", "mesh", "uncertainty", "error"]
+OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "uncertainty", "error")
+ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
+MARGIN = 10.0  # degrees by which the camera may leave what the training video shows
+ZOOM = (0.5, 4.0)
+JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "nod": "neck", "turn": "neck"}  # else eyes
+LINES = (30, 200, 120)  # RGB of the mesh
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the camera is turned away from that of the frame: degrees, and a factor."""
+
+    yaw: float = 0.0
+    pitch: float = 0.0
+    zoom: float = 1.0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """All that a person has set, but the frame of a motion that is shown."""
+
+    look: Look = Look()
+    expressions: Mapping[int, float] = field(default_factory=dict)  # number of a control -> how far
+    joints: Mapping[str, float] = field(default_factory=dict)
+    overlay: Overlay = "none"
+    with_truth: bool = False
+
+
+class Stage:
+    """An avatar with its controls, their ranges and the pictures that it was trained on, if they are there."""
+
+    def __init__(
+        self, trained: TrainedAvatar, truth: Callable[[int, int], Float[Tensor, "H W 3"]] | None = None
+    ) -> None:
+        """`truth(index, width)` is the picture of a frame of the avatar's own video."""
+        self.trained, self.truth = trained, truth
+        recording = trained.recording
+        train = list(recording.split.train)
+        motion = recording.motion(train)
+        rest = trained.rest_params()
+        self.controls: list[ExpressionControl] = expression_controls(
+            recording.tracks["expression"][train], rest.expression, trained.avatar.head
+        )
+        self.joints = joint_ranges(motion)
+        frames = list(zip((recording.camera(i) for i in train), motion, strict=True))
+        self.limits: OrbitLimits = orbit_limits((trained.rest_camera(), rest), frames)
+        self._uncertainty = _uncertainty_colours(trained)
+
+    @property
+    def overlays(self) -> tuple[Overlay, ...]:
+        """Those that this avatar has."""
+        has = {"uncertainty": self._uncertainty is not None, "error": self.truth is not None}
+        return tuple(name for name in OVERLAYS if has.get(name, True))
+
+    def within(self, look: Look) -> tuple[Look, bool]:
+        """The nearest look that is allowed, and whether the training video shows the head from there."""
+        (yaw_low, yaw_high), (pitch_low, pitch_high) = self.limits
+        kept = Look(
+            min(max(look.yaw, yaw_low - MARGIN), yaw_high + MARGIN),
+            min(max(look.pitch, pitch_low - MARGIN), pitch_high + MARGIN),
+            min(max(look.zoom, ZOOM[0]), ZOOM[1]),
+        )
+        return kept, yaw_low <= kept.yaw <= yaw_high and pitch_low <= kept.pitch <= pitch_high
+
+    def params(self, frame: HeadParams, setting: Setting) -> HeadParams:
+        """A frame with what was set by hand: expressions are added, joints that were moved replace the frame's."""
+        expression = frame.expression
+        for number, value in setting.expressions.items():
+            expression = expression + value * self.controls[number].direction
+        moved = {name: value for name, value in setting.joints.items() if value != 0.0}
+        by_hand = posed(frame, None, moved)
+        fields = {JOINT_FIELD.get(name, "eyes") for name in moved} - {"eyelids"}
+        eyelids = frame.eyelids.clone()
+        for k, name in enumerate(("left_lid", "right_lid")):
+            eyelids[k] = moved.get(name, eyelids[k])
+        turned = {name: getattr(by_hand, name) for name in fields}
+        return replace(frame, expression=expression, eyelids=eyelids, **turned)
+
+    def distance(self, params: HeadParams) -> float:
+        """From the training expressions: above 1 the avatar guesses."""
+        return float(self.trained.repertoire.expressions.distances([params])[0])
+
+    @torch.no_grad()
+    def draw(
+        self, frame: tuple[HeadParams, Camera], setting: Setting, width: int, recorded: int | None = None
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """The picture, `width` pixels wide; `recorded` is the number of the frame in the avatar's own video.
+
+        With the truth or the error, which exist for frames of the video only, they stand at its right.
+        """
+        params = self.params(frame[0], setting)
+        own = frame[1].resized(width, max(1, round(width * frame[1].height / frame[1].width)))
+        look, _ = self.within(setting.look)
+        camera = orbited(own, look.yaw, look.pitch, look.zoom)
+        gaussians = self.trained.gaussians(params)
+        if setting.overlay == "uncertainty" and self._uncertainty is not None:
+            gaussians = gaussians._replace(sh=self._uncertainty)
+        picture = to_bytes(splat(gaussians, camera, self.trained.background).image)
+        if setting.overlay == "mesh":
+            _draw_mesh(picture, self.trained.renderer.vertices(params), self.trained.assets.faces, camera)
+        beside = [picture]
+        if self.truth is not None and recorded is not None and (setting.with_truth or setting.overlay == "error"):
+            truth = self.truth(recorded, width)
+            if setting.with_truth:
+                beside.append(to_bytes(truth))
+            if setting.overlay == "error":  # of the recorded view, whatever the camera
+                drawn = splat(self.trained.gaussians(frame[0]), own, self.trained.background).image
+                beside.append(to_bytes(error_map(drawn, truth, ERROR_SCALE)))
+        return np.concatenate(beside, axis=1)
+
+
+def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def _uncertainty_colours(trained: TrainedAvatar) -> Float[Tensor, "N 1 3"] | None:
+    """Coefficients of a colour for each Gaussian, on the scale of the report's map: dark where it is sure."""
+    if trained.avatar.hyper is None:
+        return None
+    with torch.no_grad():
+        values = torch.sigmoid(UNCERTAINTY_GAIN * trained.avatar.hyper.uncertainty())
+    levels = (values * 255).round().byte().numpy()[:, None]
+    colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)[:, 0]
+    return ((torch.from_numpy(colours.copy()).float() / 255 - 0.5) / C0)[:, None]
+
+
+def _draw_mesh(picture: np.ndarray, vertices: Float[Tensor, "V 3"], faces: Tensor, camera: Camera) -> None:
+    """The edges of the faces that are seen, into the picture."""
+    screen = camera.project(vertices).numpy()
+    corners = faces.numpy()
+    seen = np.unique(rasterize_mesh(screen, corners, camera.height, camera.width).face_id)
+    outlines = np.round(screen[corners[seen[seen >= 0]], :2] * 16).astype(np.int32)
+    cv2.polylines(picture, list(outlines), True, LINES, 1, cv2.LINE_AA, shift=4)

@@ -1,0 +1,89 @@
+// The page around a view: sliders, the recorded motion, pictures. Works from a file, without a network.
+import { makeSliders } from "./controls.js";
+import { steer } from "./steer.js";
+import { AvatarView } from "./view.js";
+
+const MOST_PIXELS = 640, LEAST_PIXELS = 160;
+const TOO_SLOW = 45, FAST = 20; // milliseconds of a picture between which its size is left alone
+const find = (id) => document.getElementById(id);
+const wantsStillness = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+async function start() {
+  const script = URL.createObjectURL(new Blob([JSON.parse(find("worker").textContent)], { type: "text/javascript" }));
+  const asked = new URLSearchParams(location.search), options = { still: wantsStillness(), renderer: asked.get("renderer") ?? "auto" };
+  const parts = { worker: new Worker(script), wasm: decoded("module"), file: decoded("data") };
+  const view = new AvatarView(find("canvas"), parts, options);
+  window.avatar = view; // for the curious, and for tests
+  view.addEventListener("failed", ({ detail }) => say(detail));
+  const header = await view.ready;
+  document.documentElement.style.setProperty("--stage", `rgb(${header.background.map((c) => 255 * c).join(" ")})`);
+  steer(view, find("canvas"));
+  const putBack = makeSliders(view, header, find("controls"));
+  view.addEventListener("drawn", () => say(""), { once: true });
+  view.addEventListener("view", () => (find("guess").hidden = view.isSupported));
+  connectBar(view, header, putBack);
+  const width = Number(asked.get("width"));
+  if (width > 0) view.resize(width);
+  else fitSize(view, header);
+}
+
+/** Bytes of an element's base64 text, which is let go of. */
+function decoded(id) {
+  const element = find(id), bytes = Uint8Array.from(atob(element.textContent.trim()), (letter) => letter.charCodeAt(0));
+  element.remove();
+  return bytes.buffer;
+}
+
+function say(sentence) {
+  Object.assign(find("message"), { textContent: sentence, hidden: sentence === "" });
+}
+
+function connectBar(view, header, putBack) {
+  const [play, scrub, time] = ["play", "scrub", "time"].map(find);
+  const seconds = view.frameCount / header.fps;
+  scrub.max = String(Math.max(seconds - 1 / header.fps, 0));
+  scrub.disabled = play.disabled = view.frameCount === 0;
+  play.addEventListener("click", () => (view.isPlaying ? view.pause() : view.play("recorded")));
+  scrub.addEventListener("input", () => view.seek(Number(scrub.value)));
+  view.addEventListener("motion", () => (play.textContent = view.isPlaying ? "Pause" : "Play"));
+  view.addEventListener("drawn", () => {
+    if (view.isPlaying) scrub.value = String(view.time);
+    time.textContent = `${Math.floor(view.time / 60)}:${String(Math.floor(view.time % 60)).padStart(2, "0")}`;
+    scrub.setAttribute("aria-valuetext", `${view.time.toFixed(1)} seconds of ${seconds.toFixed(1)}`);
+    const { milliseconds } = view.statistics, where = view.renderer === "webgl" ? "GPU" : "processor";
+    find("speed").textContent = `${view.canvas.width} × ${view.canvas.height} pixels, ${milliseconds.toFixed(0)} ms a picture, ${where}`;
+  });
+  find("reset").addEventListener("click", () => {
+    view.release();
+    putBack();
+    view.look({ yaw: 0, pitch: 0, zoom: 1 });
+    scrub.value = "0";
+    view.play(wantsStillness() ? "rest" : "idle");
+  });
+  find("shot").addEventListener("click", async () => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(await view.screenshot());
+    link.download = `${header.name}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  });
+}
+
+/** As many pixels as the machine draws fluently: fewer while it is too slow, more while there is time. */
+function fitSize(view, header) {
+  const most = Math.min(MOST_PIXELS, 2 * header.size);
+  let size = Math.min(header.size, most), since = performance.now(), times = [];
+  view.resize(size);
+  view.addEventListener("drawn", () => {
+    const now = performance.now();
+    times.push(view.statistics.milliseconds);
+    if (now - since < 1500) return;
+    const typical = times.sort((a, b) => a - b)[times.length >> 1];
+    [since, times] = [now, []];
+    const wanted = typical > TOO_SLOW ? size * 0.8 : typical < FAST ? size * 1.2 : size;
+    const fitted = Math.round(Math.min(Math.max(wanted, LEAST_PIXELS), most) / 16) * 16;
+    if (fitted !== size) view.resize((size = fitted));
+  });
+}
+
+start().catch((error) => say(error.message));

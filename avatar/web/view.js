@@ -1,0 +1,274 @@
+// An avatar on a canvas: loads it and draws it whenever it has changed. No interface of its own; <avatar-view> and the page
+// are built on this.
+import { AvatarError } from "./core.js";
+import { idle, mix, multiply, orbit, places, recorded, rotation, sixD } from "./motion.js";
+import { WebglRenderer, hasRealGpu } from "./webgl.js";
+
+const BLEND_SECONDS = 0.4; // from one motion to another
+const MARGIN = 10; // degrees by which the camera may leave what the training video shows
+const ZOOM = [0.5, 4];
+
+export class AvatarView extends EventTarget {
+  /**
+   * @param canvas  where to draw
+   * @param parts   { worker: Worker, wasm: ArrayBuffer, file: ArrayBuffer }
+   * @param options { renderer: "auto" | "wasm" | "webgl", still: boolean }
+   */
+  constructor(canvas, parts, options = {}) {
+    super();
+    this.canvas = canvas;
+    this.options = { renderer: "auto", still: false, ...options };
+    this.view = { yaw: 0, pitch: 0, zoom: 1 };
+    this.statistics = { milliseconds: 0, framesPerSecond: 0 };
+    this.#worker = parts.worker;
+    this.#worker.onmessage = ({ data }) => this.#receive(data);
+    this.#worker.onerror = () => this.#fail("The drawing worker could not be started in this browser.");
+    const kind = this.options.renderer;
+    this.#wantsGpu = kind === "webgl" || (kind === "auto" && hasRealGpu());
+    /** Resolves with the avatar's header when it can be drawn. */
+    this.ready = new Promise((resolve, reject) => (this.#settle = { resolve, reject }));
+    this.#worker.postMessage({ type: "load", wasm: parts.wasm, file: parts.file });
+  }
+
+  #worker;
+  #wantsGpu;
+  #settle;
+  #gpu;
+  #context;
+  #core; // { header, motion, poses }
+  #source = { kind: "idle", since: 0, first: 0, frame: 0, paused: false };
+  #previous; // the pose that a new motion blends from
+  #pose;
+  #pinned = new Map(); // parameter index -> value that a caller has set
+  #controls = new Map(); // control -> value that a caller has set
+  #turned = [0, 0];
+  #shown; // what was asked for last
+  #inFlight = false;
+  #loop;
+  #size = 0;
+  #times = [];
+
+  get header() {
+    return this.#core?.header;
+  }
+
+  get renderer() {
+    return this.#gpu ? "webgl" : "wasm";
+  }
+
+  /** Seconds into the recorded motion. */
+  get time() {
+    return this.#source.kind === "recorded" ? this.#source.frame / this.header.fps : 0;
+  }
+
+  get isPlaying() {
+    return this.#source.kind === "recorded" && !this.#source.paused;
+  }
+
+  get frameCount() {
+    return this.#core ? this.#core.poses.length / 12 : 0;
+  }
+
+  /**
+   * Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); they stay until `release`.
+   * Unknown names are ignored and returned.
+   */
+  setExpression(values) {
+    const { header } = this, unknown = [];
+    for (const [key, value] of Object.entries(values)) {
+      const control = header.controls.find((c) => `${c.group}: ${c.name}` === key);
+      const index = /^\d+$/.test(key) ? Number(key) : header.expressions.indexOf(key);
+      if (!Number.isFinite(value)) unknown.push(key);
+      else if (control) this.#controls.set(control, value);
+      else if (index >= 0 && index < header.sizes.expressions) this.#pinned.set(index, value);
+      else unknown.push(key);
+    }
+    return unknown;
+  }
+
+  /** Jaw, gaze and neck as rotation vectors in radians, lids from 0 (open) to 1; `head`: [yaw, pitch] in degrees. */
+  setPose({ jaw, gaze, neck, lids, head } = {}) {
+    const at = places(this.header.sizes.expressions);
+    const pin = (start, values) => values.forEach((v, i) => this.#pinned.set(start + i, v));
+    if (jaw) pin(at.jaw, sixD(rotation(jaw)));
+    if (neck) pin(at.neck, sixD(rotation(neck)));
+    if (gaze) [at.eyes, at.eyes + 6].forEach((start) => pin(start, sixD(rotation(gaze))));
+    if (lids) pin(at.eyelids, lids);
+    if (head) this.#turned = head;
+  }
+
+  /** All parameters at once, in the order of `header.rest`; null lets go of them. Throws AvatarError for another number. */
+  setParameters(values) {
+    const count = this.header.rest.length;
+    if (values && (values.length !== count || !Array.from(values).every(Number.isFinite)))
+      throw new AvatarError(`This avatar takes ${count} parameters, all of them numbers.`);
+    this.release();
+    if (values) values.forEach((value, i) => this.#pinned.set(i, value));
+  }
+
+  /** Let go of what was set. */
+  release() {
+    this.#pinned.clear();
+    this.#controls.clear();
+    this.#turned = [0, 0];
+  }
+
+  /** Play "idle", "recorded" (the motion that came with the avatar) or "rest"; `from` in seconds. */
+  play(kind = "recorded", { from } = {}) {
+    if (kind === "recorded" && this.frameCount === 0) kind = "idle";
+    this.#previous = this.#pose && { pose: this.#pose, since: performance.now() };
+    const frame = kind === "recorded" ? this.#clampFrame((from ?? this.time) * this.header.fps) : 0;
+    this.#source = { kind, since: performance.now(), first: frame, frame, paused: false };
+    this.#tell("motion");
+  }
+
+  pause() {
+    this.#source.paused = true;
+    this.#tell("motion");
+  }
+
+  /** Show one frame of the recorded motion, and stay there. */
+  seek(seconds) {
+    if (this.frameCount === 0) return;
+    const frame = this.#clampFrame(seconds * this.header.fps);
+    this.#source = { kind: "recorded", since: performance.now(), first: frame, frame, paused: true };
+    this.#tell("motion");
+  }
+
+  /** Turn the camera, within `limits`; `zoom` is a factor. */
+  look(view) {
+    const clamp = (value, [low, high], otherwise) =>
+      Number.isFinite(value) ? Math.min(Math.max(value, low), high) : otherwise;
+    const { yaw, pitch, zoom } = { ...this.view, ...view }, { limits } = this;
+    this.view = {
+      yaw: clamp(yaw, limits.yaw, this.view.yaw),
+      pitch: clamp(pitch, limits.pitch, this.view.pitch),
+      zoom: clamp(zoom, ZOOM, this.view.zoom),
+    };
+    this.#tell("view");
+  }
+
+  /** Degrees by which the camera may turn: what the training video shows, and a margin in which the avatar guesses. */
+  get limits() {
+    const widened = ([low, high]) => [low - MARGIN, high + MARGIN];
+    return { yaw: widened(this.header.orbit.yaw), pitch: widened(this.header.orbit.pitch) };
+  }
+
+  /** Whether the camera is where the training video was. */
+  get isSupported() {
+    return ["yaw", "pitch"].every((axis) => {
+      const [low, high] = this.header.orbit[axis];
+      return this.view[axis] >= low - 0.01 && this.view[axis] <= high + 0.01;
+    });
+  }
+
+  /** Width of the drawn picture in pixels. */
+  resize(width) {
+    this.#size = Math.min(Math.max(32, Math.round(width)), 4096);
+  }
+
+  /** A PNG of what is shown. */
+  screenshot() {
+    return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
+  }
+
+  close() {
+    this.#worker.terminate();
+    cancelAnimationFrame(this.#loop);
+  }
+
+  #clampFrame(frame) {
+    return Math.min(Math.max(Math.round(frame), 0), Math.max(this.frameCount - 1, 0));
+  }
+
+  #receive(data) {
+    if (data.type === "failed") return this.#fail(data.sentence);
+    if (data.type === "ready") return this.#start(data);
+    this.#inFlight = false;
+    const { camera, width, height } = this.#shown;
+    if (data.type === "gaussians") {
+      this.#gpu.draw(data.values, camera, width, height, this.header.background);
+    } else {
+      const { canvas } = this;
+      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+      this.#context.putImageData(new ImageData(data.values, width, height), 0, 0);
+    }
+    this.#count(data.milliseconds);
+    this.#tell("drawn");
+  }
+
+  #start({ header, motion, poses }) {
+    this.#core = { header, motion, poses };
+    this.#size ||= header.size;
+    if (this.#wantsGpu) {
+      try {
+        this.#gpu = new WebglRenderer(this.canvas);
+      } catch (error) {
+        return this.#fail(`This browser cannot draw with WebGL2 (${error.message}).`);
+      }
+    } else {
+      this.#context = this.canvas.getContext("2d");
+    }
+    this.play(this.options.still ? "rest" : "idle");
+    this.#settle.resolve(header);
+    const loop = (now) => {
+      this.#loop = requestAnimationFrame(loop);
+      if (!this.#inFlight) this.#request(now);
+    };
+    this.#loop = requestAnimationFrame(loop);
+  }
+
+  #request(now) {
+    const { header } = this, pose = this.#current(now), base = { ...header.camera };
+    if (pose.rotation) Object.assign(base, { rotation: pose.rotation, translation: pose.translation });
+    const [yaw, pitch] = [0, 1].map((i) => (pose.turn?.[i] ?? 0) + this.#turned[i]);
+    base.rotation = multiply(base.rotation, rotation([(pitch * Math.PI) / 180, (yaw * Math.PI) / 180, 0]));
+    const width = this.#size, height = Math.max(1, Math.round(width / base.aspect));
+    const camera = orbit(base, this.view, width);
+    const key = JSON.stringify([Array.from(pose.parameters), camera, width]);
+    if (key === this.#shown?.key) return; // nothing has changed
+    this.#shown = { camera, width, height, key };
+    this.#inFlight = true;
+    this.#worker.postMessage({
+      type: "frame", parameters: pose.parameters, camera, width, height, background: header.background,
+      wants: this.#gpu ? "gaussians" : "picture",
+    });
+  }
+
+  #current(now) {
+    const { header } = this, source = this.#source, seconds = Math.max(now - source.since, 0) / 1000;
+    let pose;
+    if (source.kind === "recorded") {
+      if (!source.paused) source.frame = Math.round(source.first + seconds * header.fps) % this.frameCount;
+      pose = recorded(this.#core, source.frame);
+    } else {
+      pose = idle(header, seconds, source.kind === "rest" || source.paused);
+    }
+    const since = this.#previous ? (now - this.#previous.since) / 1000 : Infinity;
+    let parameters = Float32Array.from(pose.parameters);
+    if (since < BLEND_SECONDS) parameters = mix(this.#previous.pose.parameters, parameters, Math.max(since, 0) / BLEND_SECONDS);
+    if (this.#controls.size > 0) {
+      parameters.set(header.rest.slice(0, header.sizes.expressions));
+      for (const [{ values }, share] of this.#controls) values.forEach((value, i) => (parameters[i] += share * value));
+    }
+    for (const [index, value] of this.#pinned) parameters[index] = value;
+    this.#pose = { ...pose, parameters };
+    return this.#pose;
+  }
+
+  #count(milliseconds) {
+    const now = performance.now();
+    this.#times = [...this.#times.filter((t) => now - t < 2000), now];
+    const span = (now - this.#times[0]) / 1000;
+    this.statistics = { milliseconds, framesPerSecond: span > 0.2 ? (this.#times.length - 1) / span : 0 };
+  }
+
+  #fail(sentence) {
+    this.#settle.reject(new AvatarError(sentence));
+    this.dispatchEvent(new CustomEvent("failed", { detail: sentence }));
+  }
+
+  #tell(kind) {
+    this.dispatchEvent(new Event(kind));
+  }
+}

@@ -1,0 +1,116 @@
+"""What docs/view.md says: sizes, speed and likeness of an avatar's page in headless Chromium, and of the viewer's pictures.
+
+python scripts/measure_page.py RUN [--head PATH]      needs Chromium, and playwright from the extra [test]
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import shutil
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from avatar.commands.opening import open_trained
+from avatar.export.web_page import write_page
+from avatar.runs.trained import TrainedAvatar
+from avatar.splat.cpu import thread_count
+from avatar.view.stage import Look, Setting, Stage
+
+FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FRAMES, SIZE, SECONDS, MIB = 20, 256, 6, 2**20
+SETTLED = """() => new Promise(done => {
+  let timer;
+  const rest = () => { avatar.removeEventListener("drawn", wait); done(); };
+  const wait = () => { clearTimeout(timer); timer = setTimeout(rest, 400); };
+  avatar.addEventListener("drawn", wait);
+  wait();
+})"""
+
+
+def open_page(browser: Any, path: Path, renderer: str) -> tuple[Any, float]:
+    """The page with a still face, and the seconds until its first picture."""
+    page = browser.new_page(reduced_motion="reduce")
+    begin = time.perf_counter()
+    page.goto(f"{path.as_uri()}?width={SIZE}&renderer={renderer}")
+    page.locator("#message").wait_for(state="hidden", timeout=60000)
+    return page, time.perf_counter() - begin
+
+
+def likeness(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
+    """Lowest and mean PSNR to our renderer over FRAMES held-out frames, 8 bits a channel."""
+    test = list(trained.recording.split.test)
+    found = []
+    for k in range(FRAMES):
+        frame = k * len(test) // FRAMES
+        page.evaluate(f"avatar.seek({frame} / avatar.header.fps)")
+        page.evaluate(SETTLED)
+        data = page.evaluate("avatar.screenshot().then(b => b.arrayBuffer()).then(b => Array.from(new Uint8Array(b)))")
+        picture = iio.imread(io.BytesIO(bytes(data)))[..., :3].astype(np.float64)
+        index = test[frame]
+        image = trained.render(trained.recording.params(index), trained.recording.camera(index, SIZE)).image
+        truth = (image.clamp(0, 1) * 255).round().numpy().astype(np.float64)
+        found.append(-10 * np.log10(max(np.square((picture - truth) / 255).mean(), 1e-12)))
+    return min(found), statistics.mean(found)
+
+
+def speed(page: Any) -> tuple[float, float]:
+    """Pictures a second while the recorded motion plays at a frame rate that it cannot reach, and ms of the worker."""
+    page.evaluate("avatar.header.fps = 240; avatar.play('recorded')")
+    page.wait_for_timeout(2500)
+    count = "(window.drawn = 0, avatar.addEventListener('drawn', () => ++drawn), performance.now())"
+    begin = page.evaluate(count)
+    page.wait_for_timeout(1000 * SECONDS)
+    drawn, end = page.evaluate("[drawn, performance.now()]")
+    return 1000 * drawn / (end - begin), page.evaluate("avatar.statistics.milliseconds")
+
+
+def measure_viewer(trained: TrainedAvatar) -> None:
+    stage = Stage(trained)
+    frames = list(trained.recording.split.test)[:40]
+    for width in (SIZE, 2 * SIZE):
+        times = []
+        for k, i in enumerate(frames):
+            begin = time.perf_counter()
+            stage.draw((trained.recording.params(i), trained.recording.camera(i)), Setting(Look(0.1 * k)), width)
+            times.append(1000 * (time.perf_counter() - begin))
+        print(f"viewer   {width}x{width}: {statistics.median(times):.1f} ms a picture, {thread_count()} threads")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Sizes, speed and likeness of an avatar's page.")
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--head", type=Path)
+    arguments = parser.parse_args()
+    trained = open_trained(arguments.run, arguments.head)
+    print(f"avatar   {len(trained.avatar):,} Gaussians")
+    measure_viewer(trained)
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
+        for precision in ("small", "float"):
+            page_file = write_page(trained, Path(folder) / f"{precision}.html", precision)
+            print(
+                f"page     {precision}: {page_file.bytes / MIB:.2f} MiB, of it avatar {page_file.avatar_bytes / MIB:.2f}"
+            )
+            for renderer in ("wasm", "webgl"):
+                page, first = open_page(browser, page_file.path, renderer)
+                least, mean = likeness(page, trained)
+                line = f"{precision}, {renderer}: PSNR at least {least:.1f} dB, mean {mean:.1f}"
+                line += f"; first picture {first:.1f} s"
+                if precision == "small":
+                    rate, milliseconds = speed(page)
+                    line += f"; {rate:.1f} pictures a second at {SIZE}x{SIZE} ({milliseconds:.0f} ms in the worker)"
+                print(f"page     {line}", flush=True)
+                page.close()
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""Exported splats, meshes and videos, read back with other libraries."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from command_line import avatar
+from lively import lively_avatar, lively_run, psnr
+
+from avatar.export.bake import bake_texture
+from avatar.export.glb import encode_glb
+from avatar.export.movie import limits_of, path_camera
+from avatar.export.ply import FIELDS, encode_ply
+from avatar.motion.orbit import seen_from
+from avatar.runs.trained import TrainedAvatar
+from avatar.splat import splat
+from avatar.types import Gaussians
+
+
+@pytest.fixture(scope="module")
+def run(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lively_run(tracked_folder, tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="module")
+def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
+    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run")
+
+
+def read_splats(data: bytes) -> Gaussians:
+    """As viewers of 3D Gaussian splatting read it, through trimesh's reader of PLY."""
+    loaded = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+    raw = loaded.metadata["_ply_raw"]["vertex"]["data"]  # type: ignore[union-attr]
+    assert raw.dtype.names == FIELDS and all(raw.dtype[name] == "<f4" for name in FIELDS)
+
+    def columns(*names: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([raw[name] for name in names], axis=1).astype(np.float32))
+
+    rest = columns(*(f"f_rest_{i}" for i in range(45))).reshape(-1, 3, 15).permute(0, 2, 1)
+    return Gaussians(
+        columns("x", "y", "z"),
+        columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        columns("scale_0", "scale_1", "scale_2").exp(),
+        torch.sigmoid(columns("opacity"))[:, 0],
+        torch.cat((columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest), dim=1),
+    )
+
+
+def test_splats_read_back_draw_the_same_picture(trained: TrainedAvatar) -> None:
+    for i in (0, 7):
+        params, camera = trained.recording.params(i), trained.recording.camera(i, 96)
+        again = read_splats(encode_ply(trained.gaussians(params), "a\nb"))
+        assert again.sh.shape[1] == 16
+        picture = splat(again, camera, trained.background).image
+        assert psnr(picture, trained.render(params, camera).image) > 50
+    other = splat(again, trained.recording.camera(0, 96), trained.background).image
+    assert psnr(other, trained.render(trained.recording.params(0), trained.recording.camera(0, 96)).image) < 40
+
+
+def test_the_command_writes_a_frame_and_a_sequence(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.ply"
+    avatar("export", run, "--out", out, "--frame", 3)
+    one = out.read_bytes()
+    assert b"comment Nothing of the head model is in it" in one[:300]
+    said = avatar("export", run, "--out", out, "--motion", "all")
+    sequence = sorted(tmp_path.glob("x-*.ply"))
+    assert len(sequence) == 30 and sequence[3].read_bytes() == one != sequence[4].read_bytes()
+    assert "x-00000.ply to x-00029.ply, 25 a second" in said
+    assert "--frame must be from 0 to 29" in avatar("export", run, "--out", out, "--frame", 30, status=1)
+    assert "give one of the two" in avatar("export", run, "--out", out, "--frame", 1, "--motion", "test", status=1)
+    assert "or a drive file" in avatar("export", run, "--out", out, "--motion", "tset", status=1)
+    assert "--camera belongs to --format video" in avatar("export", run, "--out", out, "--camera", "orbit", status=1)
+
+
+def test_a_mesh_has_the_pose_the_texture_and_the_expressions(trained: TrainedAvatar) -> None:
+    params = trained.recording.params(4)
+    data, names = encode_glb(trained, params, 128, "a licence")
+    scene = trimesh.load(io.BytesIO(data), file_type="glb")
+    (mesh,) = scene.geometry.values()  # type: ignore[union-attr]
+    posed = trained.avatar.head.vertices(params).numpy()
+    corners = posed[trained.assets.faces.numpy()]
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], corners, atol=1e-6)
+    uv = trained.assets.uvs.numpy()[trained.assets.uv_faces.numpy()]
+    np.testing.assert_allclose(mesh.visual.uv[mesh.faces], uv, atol=1e-5)
+    assert mesh.visual.material.baseColorTexture.size == (128, 128)
+    tree, buffer = gltf_parts(data)
+    assert tree["asset"]["copyright"] == "a licence"
+    (gltf_mesh,) = tree["meshes"]
+    assert tuple(gltf_mesh["extras"]["targetNames"]) == names and {"jaw", "left lid"} <= set(names)
+    targets = gltf_mesh["primitives"][0]["targets"]
+    assert len(targets) == len(names) == len(gltf_mesh["weights"])
+    lid = accessor(tree, buffer, targets[names.index("left lid")]["POSITION"])
+    moved = np.abs(trained.assets.eyelid_dirs[0].numpy()).max(axis=1)[trained.assets.faces.numpy()]
+    assert ((np.abs(lid).max(axis=1)[mesh.faces] > 1e-7) <= (moved > 0)).all() and np.abs(lid).max() > 1e-4
+    position = accessor(tree, buffer, gltf_mesh["primitives"][0]["attributes"]["POSITION"])
+    assert position.shape == lid.shape
+    np.testing.assert_allclose(position, mesh.vertices, atol=1e-6)
+
+
+def gltf_parts(data: bytes) -> tuple[dict, bytes]:
+    import json
+
+    length = int.from_bytes(data[12:16], "little")
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def accessor(tree: dict, buffer: bytes, index: int) -> np.ndarray:
+    found = tree["accessors"][index]
+    view = tree["bufferViews"][found["bufferView"]]
+    values = np.frombuffer(buffer, "<f4", 3 * found["count"], view.get("byteOffset", 0)).reshape(-1, 3)
+    np.testing.assert_allclose(values.min(axis=0), found["min"], atol=1e-6)
+    return values
+
+
+def test_the_texture_is_what_is_seen(trained: TrainedAvatar) -> None:
+    """The textured mesh, drawn from the front, looks like the avatar where the avatar is its mesh."""
+    params, camera = trained.rest_params(), trained.rest_camera(96)
+    with torch.no_grad():
+        flat = lively_copy(trained)
+    texture = bake_texture(flat, params, 256)
+    from avatar.head.rasterize import rasterize_mesh
+
+    assets = trained.assets
+    vertices = camera.project(trained.renderer.vertices(params)).numpy()
+    raster = rasterize_mesh(vertices, assets.faces.numpy(), 96, 96)
+    uv = (assets.uvs.numpy()[assets.uv_faces.numpy()][raster.face_id] * raster.barycentric[..., None]).sum(axis=2)
+    drawn = cv2.remap(
+        texture, (uv[..., 0] * 256 - 0.5).astype(np.float32), ((1 - uv[..., 1]) * 256 - 0.5).astype(np.float32), 1
+    )
+    picture = flat.render(params, camera).image.clamp(0, 1).numpy()
+    inside = cv2.erode((raster.face_id >= 0).astype(np.uint8), np.ones((9, 9))).astype(bool)
+    error = np.abs(drawn / 255 - picture)[inside]
+    contrast = np.abs(picture - picture[inside].mean(axis=0))[inside]
+    assert error.mean() < 0.35 * contrast.mean()
+
+
+def lively_copy(trained: TrainedAvatar) -> TrainedAvatar:
+    """The same avatar with opaque Gaussians whose colour changes slowly over the mesh."""
+    import copy
+    from dataclasses import replace
+
+    model = copy.deepcopy(trained.avatar)
+    points = model.embedding.points(model.head.neutral_vertices())
+    model.sh_dc[:, 0] = 1.5 * torch.sin(points * 60)
+    model.sh_rest.zero_()
+    for parameter in (*model.deformation.parameters(), *model.hyper.parameters()):  # on the mesh
+        parameter.zero_()
+    model.log_scales.fill_(float(torch.log(torch.tensor(0.004))))
+    model.opacity_logits.fill_(4.0)
+    return replace(trained, avatar=model)
+
+
+def test_paths_stay_where_the_training_video_was(trained: TrainedAvatar) -> None:
+    limits = limits_of(trained)
+    rest, params = trained.rest_camera(), trained.rest_params()
+    own = seen_from(rest, params)
+    turns = [seen_from(path_camera(rest, limits, "turntable", s / 10), params).yaw - own.yaw for s in range(60)]
+    assert min(turns) == pytest.approx(-limits.yaw[1], abs=0.2) and max(turns) == pytest.approx(-limits.yaw[0], abs=0.2)
+    assert max(turns) - min(turns) > 4
+    heights = [path_camera(rest, limits, "orbit", s / 10) for s in range(60)]
+    elevations = [seen_from(camera, params).elevation - own.elevation for camera in heights]
+    assert max(elevations) - min(elevations) > 4 and max(elevations) < limits.pitch[1] + 1
+    assert path_camera(rest, limits, "still", 1.0) == rest
+
+
+def test_the_command_writes_videos(run: Path, tracked_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.mp4"
+    avatar("export", run, "--out", out, "--motion", "all", "--size", 64)
+    recorded = iio.imread(out)
+    assert recorded.shape == (30, 64, 64, 3)
+    avatar("export", run, "--out", out, "--motion", "all", "--size", 64, "--camera", "turntable")
+    turned = iio.imread(out)
+    assert turned.shape == recorded.shape and np.abs(turned.astype(int) - recorded).mean() > 1
+    csv = tmp_path / "drive.csv"
+    csv.write_text("time,expression_0,jaw_x,jaw_y,jaw_z\n0,0,0,0,0\n0.1,0.5,0.1,0,0\n")
+    avatar("export", run, "--out", out, "--motion", csv, "--size", 48, "--camera", "still")
+    assert iio.imread(out).shape == (2, 48, 48, 3)
+    assert "--size must be from" in avatar("export", run, "--out", out, "--size", 100000, status=1)
+    before = csv.read_bytes()
+    avatar("export", run, "--format", "video", "--out", csv, "--motion", csv, status=1)
+    assert csv.read_bytes() == before

@@ -1,0 +1,122 @@
+"""What the viewer draws for what is set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lively import lively_avatar
+
+from avatar.motion.controls import posed
+from avatar.motion.orbit import orbited
+from avatar.runs.clips import own_clip
+from avatar.runs.trained import TrainedAvatar
+from avatar.view.player import NEUTRAL, STREAM, Player
+from avatar.view.stage import MARGIN, Look, Setting, Stage, to_bytes
+
+WIDTH = 64
+
+
+@pytest.fixture(scope="module")
+def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
+    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="module")
+def stage(trained: TrainedAvatar) -> Stage:
+    return Stage(trained, lambda index, width: torch.full((width, width, 3), index / 100))
+
+
+def test_a_frame_is_drawn_as_the_program_draws_it(stage: Stage, trained: TrainedAvatar) -> None:
+    params, camera = trained.recording.params(5), trained.recording.camera(5, 48)
+    look = Look(stage.limits.yaw[1], stage.limits.pitch[0], 1.5)
+    drawn = stage.draw((params, camera), Setting(look), WIDTH, 5)
+    expected = trained.render(params, orbited(camera.resized(WIDTH, WIDTH), look.yaw, look.pitch, look.zoom)).image
+    np.testing.assert_array_equal(drawn, to_bytes(expected))
+    assert not np.array_equal(drawn, stage.draw((params, camera), Setting(), WIDTH))
+
+
+def test_controls_add_and_joints_replace(stage: Stage, trained: TrainedAvatar) -> None:
+    frame = trained.recording.params(9)
+    moved = stage.params(frame, Setting(expressions={0: 0.5, 1: -0.25}, joints={"jaw": 0.2, "left_lid": 0.7}))
+    expected = frame.expression + 0.5 * stage.controls[0].direction - 0.25 * stage.controls[1].direction
+    torch.testing.assert_close(moved.expression, expected)
+    torch.testing.assert_close(moved.jaw, posed(frame, None, {"jaw": 0.2}).jaw)
+    assert moved.eyelids[0] == 0.7 and moved.eyelids[1] == frame.eyelids[1]
+    assert torch.equal(moved.eyes, frame.eyes) and torch.equal(moved.neck, frame.neck)
+    assert stage.params(frame, Setting(joints={"jaw": 0.0})).jaw.equal(frame.jaw)
+
+
+def test_the_camera_stays_where_the_avatar_is_known(stage: Stage) -> None:
+    kept, is_supported = stage.within(Look(500.0, -500.0, 100.0))
+    assert kept == Look(stage.limits.yaw[1] + MARGIN, stage.limits.pitch[0] - MARGIN, 4.0) and not is_supported
+    assert stage.within(Look()) == (Look(), True)
+
+
+def test_overlays(stage: Stage, trained: TrainedAvatar) -> None:
+    frame = trained.recording.params(5), trained.recording.camera(5, WIDTH)
+    plain = stage.draw(frame, Setting(), WIDTH, 5)
+    mesh = stage.draw(frame, Setting(overlay="mesh"), WIDTH, 5)
+    changed = (mesh != plain).any(axis=2)
+    assert 0.02 < changed.mean() < 0.9
+    uncertain = stage.draw(frame, Setting(overlay="uncertainty"), WIDTH, 5)
+    assert uncertain.shape == plain.shape and not np.array_equal(uncertain, plain)
+    nothing = (trained.render(*frame).alpha == 0).numpy()
+    assert nothing.mean() > 0.1 and (uncertain[nothing] == 255).all() and uncertain[~nothing].min() < 255
+    both = stage.draw(frame, Setting(overlay="error", with_truth=True), WIDTH, 5)
+    assert both.shape == (WIDTH, 3 * WIDTH, 3)
+    assert (both[:, WIDTH : 2 * WIDTH] == round(255 * 0.05)).all(), "the truth of frame 5"
+    turned = stage.draw(frame, Setting(Look(5.0), overlay="error"), WIDTH, 5)
+    np.testing.assert_array_equal(turned[:, WIDTH:], both[:, 2 * WIDTH :], "the error is of the recorded view")
+    assert stage.draw(frame, Setting(overlay="error", with_truth=True), WIDTH).shape == plain.shape, (
+        "no truth of other motion"
+    )
+
+
+def test_overlays_that_an_avatar_does_not_have(tracked_folder: Path, tmp_path: Path, stage: Stage) -> None:
+    assert stage.overlays == ("none", "mesh", "uncertainty", "error")
+    other = Stage(lively_avatar(tracked_folder, tmp_path / "run", "model=flashavatar"))
+    assert other.overlays == ("none", "mesh")
+
+
+def test_the_distance_is_that_of_the_repertoire(stage: Stage, trained: TrainedAvatar) -> None:
+    rest = trained.rest_params()
+    far = replace(rest, expression=rest.expression + 20)
+    own = trained.repertoire.expressions.distances([trained.recording.params(3)])
+    assert stage.distance(trained.recording.params(3)) == float(own[0])
+    assert stage.distance(far) > 2 * stage.distance(rest)
+
+
+def test_a_motion_plays_pauses_and_is_scrubbed(trained: TrainedAvatar) -> None:
+    now = [100.0]
+    clip = own_clip(trained, "train")
+    player = Player(trained, {"train": clip}, lambda: now[0])
+    assert player.names == (NEUTRAL, "train") and player.now().recorded is None
+    player.play()
+    assert not player.is_playing, "a face at rest does not play"
+    player.choose("train")
+    player.play()
+    now[0] += 3.5 / clip.fps
+    assert player.index == 3 and player.now().recorded == clip.recorded[3] and player.now().params is clip.frames[3][0]
+    player.pause()
+    now[0] += 10
+    assert player.index == 3
+    player.seek(1.0)
+    assert player.index == len(clip) - 1 and player.share == 1.0
+    player.play()
+    now[0] += 1.5 / clip.fps
+    assert player.index == 0, "it starts again after its end"
+    with pytest.raises(ValueError, match="there is no motion 'dance'"):
+        player.choose("dance")
+
+
+def test_a_stream_is_shown_from_its_first_frame_on(trained: TrainedAvatar) -> None:
+    newest: list = [None]
+    player = Player(trained, {}, lambda: 0.0, lambda: newest[0])
+    assert player.name == STREAM and player.now().params.expression.equal(trained.rest_params().expression)
+    newest[0] = (7, trained.recording.params(3))
+    shown = player.now()
+    assert shown.params is newest[0][1] and shown.key == (STREAM, 7) and shown.recorded is None
