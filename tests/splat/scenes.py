@@ -13,10 +13,14 @@ import torch
 from torch import Tensor
 
 from avatar.bench.scenes import head_camera, head_shell
+from avatar.compute.device import interpreted
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, Rendering
 
 SIMD = ("baseline", "avx2", "avx512")
+# The gpu backend takes part where there is a GPU, and where Triton interprets its kernels: make gpu-check.
+GPU = ["gpu"] if interpreted() or torch.cuda.is_available() else []
+BACKENDS = ["cpu", "reference", *GPU]
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,11 @@ SCENES: dict[str, Scene] = {
 
 
 def render(scene: Scene, backend: Any = "cpu") -> Rendering:
+    """On whatever device the scene is; drawn by a GPU, the rendering of a scene on the CPU comes back to it."""
+    if backend == "gpu" and not interpreted() and scene.background.is_cpu:
+        gaussians = Gaussians(*(tensor.cuda() for tensor in scene.gaussians))
+        moved = replace(scene, gaussians=gaussians, background=scene.background.cuda())
+        return Rendering(*(tensor.cpu() for tensor in render(moved, backend)))
     return splat(scene.gaussians, scene.camera, scene.background, backend=backend, **scene.options)
 
 

@@ -1,0 +1,22 @@
+"""Where tensors are, and what may be done with them there."""
+
+from __future__ import annotations
+
+import os
+
+from torch import Tensor
+
+
+def interpreted() -> bool:
+    """Whether Triton interprets kernels on the CPU, which is slow and for tests: the variable TRITON_INTERPRET."""
+    return os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def on_gpu(tensor: Tensor) -> bool:
+    """Whether the kernels of `avatar.kernels` take the tensor.
+
+    It is on a GPU; or on torch's meta device, where tensors have shapes only and nothing is computed; or on the CPU, where
+    Triton interprets.
+    """
+    kind = tensor.device.type
+    return kind in ("cuda", "meta") or (kind == "cpu" and interpreted())
