@@ -7,6 +7,8 @@ near-ties would be drawn in another order. Zwicker et al., "EWA splatting" (2002
 import triton
 import triton.language as tl
 
+from avatar.kernels.rows import load3, load4
+
 # Where `view` holds what: a float64 block that `avatar.splat.gpu.view_block` makes of a camera and two options.
 TRANSLATION = tl.constexpr(9)  # behind the nine elements of the rotation, row by row
 FX, FY, CX, CY = tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
@@ -23,23 +25,6 @@ def not_finite(x):
     """On the bits of a float32, so that no optimisation can decide it."""
     bits = x.to(tl.int32, bitcast=True)
     return (bits & 0x7F800000) == 0x7F800000
-
-
-@triton.jit
-def load3(rows, index, mask):
-    x = tl.load(rows + 3 * index, mask=mask, other=0.0)
-    y = tl.load(rows + 3 * index + 1, mask=mask, other=0.0)
-    z = tl.load(rows + 3 * index + 2, mask=mask, other=0.0)
-    return x, y, z
-
-
-@triton.jit
-def load4(rows, index, mask):
-    w = tl.load(rows + 4 * index, mask=mask, other=0.0)
-    x = tl.load(rows + 4 * index + 1, mask=mask, other=0.0)
-    y = tl.load(rows + 4 * index + 2, mask=mask, other=0.0)
-    z = tl.load(rows + 4 * index + 3, mask=mask, other=0.0)
-    return w, x, y, z
 
 
 @triton.jit

@@ -17,7 +17,6 @@ from avatar.kernels.geometry import (
     dot3,
     image_rows,
     in_camera,
-    load3,
     load_scales,
     not_finite,
     rotation_of,
@@ -25,6 +24,7 @@ from avatar.kernels.geometry import (
     view_direction,
 )
 from avatar.kernels.harmonics import colour
+from avatar.kernels.rows import load3
 
 REACH_MARGIN = tl.constexpr(1e-4)  # in log2 of alpha; far above float rounding there
 # A count that no capacity holds: a value that is not finite makes the image NaN as too many pairs do.

@@ -16,13 +16,13 @@ from avatar.kernels.geometry import (
     dot3,
     image_rows,
     in_camera,
-    load3,
     load_scales,
     rotation_of,
     unit_quaternion,
     view_direction,
 )
 from avatar.kernels.harmonics import colour, colour_backward
+from avatar.kernels.rows import load3, store3, store4
 
 HALF_LOG2E = tl.constexpr(0.72134752044448170368)
 
@@ -156,9 +156,9 @@ def project_backward(
     h00, h10, h20 = t00 * g00 + t10 * g10, t01 * g00 + t11 * g10, t02 * g00 + t12 * g10
     h01, h11, h21 = t00 * g01 + t10 * g11, t01 * g01 + t11 * g11, t02 * g01 + t12 * g11
     h02, h12, h22 = t00 * g02 + t10 * g12, t01 * g02 + t11 * g12, t02 * g02 + t12 * g12
-    tl.store(grad_scales + 3 * i, dot3(h00, h10, h20, r00, r10, r20).to(tl.float32), mask=here)
-    tl.store(grad_scales + 3 * i + 1, dot3(h01, h11, h21, r01, r11, r21).to(tl.float32), mask=here)
-    tl.store(grad_scales + 3 * i + 2, dot3(h02, h12, h22, r02, r12, r22).to(tl.float32), mask=here)
+    by_s0, by_s1 = dot3(h00, h10, h20, r00, r10, r20), dot3(h01, h11, h21, r01, r11, r21)
+    by_s2 = dot3(h02, h12, h22, r02, r12, r22)
+    store3(grad_scales, i, by_s0.to(tl.float32), by_s1.to(tl.float32), by_s2.to(tl.float32), here)
     h00, h10, h20 = h00 * s0, h10 * s0, h20 * s0
     h01, h11, h21 = h01 * s1, h11 * s1, h21 * s1
     h02, h12, h22 = h02 * s2, h12 * s2, h22 * s2
@@ -179,10 +179,9 @@ def project_backward(
     by_y = 2 * (qw * (h02 - h20) + qx * (h01 + h10) - 2 * qy * (h00 + h22) + qz * (h12 + h21))
     by_z = 2 * (qw * (h10 - h01) + qx * (h02 + h20) + qy * (h12 + h21) - 2 * qz * (h00 + h11))
     radial = by_w * qw + by_x * qx + by_y * qy + by_z * qz
-    tl.store(grad_quats + 4 * i, ((by_w - radial * qw) * inv_length).to(tl.float32), mask=here)
-    tl.store(grad_quats + 4 * i + 1, ((by_x - radial * qx) * inv_length).to(tl.float32), mask=here)
-    tl.store(grad_quats + 4 * i + 2, ((by_y - radial * qy) * inv_length).to(tl.float32), mask=here)
-    tl.store(grad_quats + 4 * i + 3, ((by_z - radial * qz) * inv_length).to(tl.float32), mask=here)
+    by_w, by_x = ((by_w - radial * qw) * inv_length).to(tl.float32), ((by_x - radial * qx) * inv_length).to(tl.float32)
+    by_y, by_z = ((by_y - radial * qy) * inv_length).to(tl.float32), ((by_z - radial * qz) * inv_length).to(tl.float32)
+    store4(grad_quats, i, by_w, by_x, by_y, by_z, here)
 
     # A row of T is f / z (R_row - slope R_z), and the slope p / z where it is not clamped.
     fx, fy = tl.load(view + FX), tl.load(view + FY)
@@ -216,6 +215,4 @@ def project_backward(
     m_x = dot3(v0, v3, v6, by_px, by_py, by_pz) + (by_dx - along * d_x) * inv_distance
     m_y = dot3(v1, v4, v7, by_px, by_py, by_pz) + (by_dy - along * d_y) * inv_distance
     m_z = dot3(v2, v5, v8, by_px, by_py, by_pz) + (by_dz - along * d_z) * inv_distance
-    tl.store(grad_means + 3 * i, m_x.to(tl.float32), mask=here)
-    tl.store(grad_means + 3 * i + 1, m_y.to(tl.float32), mask=here)
-    tl.store(grad_means + 3 * i + 2, m_z.to(tl.float32), mask=here)
+    store3(grad_means, i, m_x.to(tl.float32), m_y.to(tl.float32), m_z.to(tl.float32), here)
