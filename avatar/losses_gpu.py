@@ -16,8 +16,9 @@ from avatar.kernels.reduce import finish
 from avatar.kernels.ssim import WINDOW, compare, smooth_rows, spread_columns, spread_rows
 from avatar.kernels.start import start
 
-LANES = 1024  # values of a program
+LANES = 256  # values of a program
 WARPS = 4
+ROWS = 1024  # of the programs' shares that are added up at a time
 
 
 def huber_gpu(
@@ -45,7 +46,7 @@ class _Huber(torch.autograd.Function):
         scales = constants((1 / values, mask_weight / values), torch.float64, image.device)
         partial, sums = image.new_empty(programs, 2), image.new_empty(2)
         start(huber, programs, image, target, mask, delta, values, partial, warps=WARPS, BLOCK=LANES)
-        start(finish, 1, partial, scales, programs, sums, warps=WARPS, COLUMNS=2, BLOCK=LANES)
+        start(finish, 1, partial, scales, programs, sums, warps=WARPS, COLUMNS=2, BLOCK=ROWS)
         ctx.save_for_backward(image, target, mask)
         ctx.delta, ctx.scales = delta, scales
         return sums[0], sums[1]
@@ -102,7 +103,7 @@ class _Dssim(torch.autograd.Function):
         scale = 1 / (2 * 3 * down * across)
         scales = constants((scale,), torch.float64, image.device)
         value = image.new_empty(1)
-        start(finish, 1, partial, scales, compared, value, warps=WARPS, COLUMNS=1, BLOCK=LANES)
+        start(finish, 1, partial, scales, compared, value, warps=WARPS, COLUMNS=1, BLOCK=ROWS)
         gradient = None
         if wanted:
             spread, gradient = image.new_empty(3, height, across, 3), torch.empty_like(image)
