@@ -1,4 +1,4 @@
-# `make demo` and `make test` need nothing but Python 3.10+, make and a C++ compiler; both make the environment first.
+# `make demo` and `make test` need nothing but Python 3.11+, make and a C++ compiler; both make the environment first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -44,18 +44,18 @@ format: setup ## put the code into its standard form
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-wheel: setup ## build dist/avatar-*.whl
+wheel: setup ## build dist/hyperavatar-*.whl
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
 
-smoke: setup ## install a wheel into an empty environment and run the whole program from there
+smoke: setup ## install a wheel, made from the source distribution, elsewhere and run the whole program from there
 	PYTHON=$(PYTHON) PIP_FLAGS="$(PIP_FLAGS)" scripts/smoke_wheel.sh
 
 clean: ## remove everything that the other targets make
 	rm -rf $(VENV) build dist $(DEMO)
 
 $(VENV)/.tools: constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null \
-	  || { echo "avatar needs Python 3.10 or newer as $(PYTHON); name another one with make setup PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	  || { echo "avatar needs Python 3.11 or newer as $(PYTHON); name another one with make setup PYTHON=..."; exit 1; }
 	@command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null \
 	  || { echo "avatar needs a C++ compiler (Debian: apt install g++; macOS: xcode-select --install)"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) \

@@ -1,10 +1,29 @@
 """Animatable 3D Gaussian head avatars from one tracked video."""
 
-import os
+from __future__ import annotations
 
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from avatar.runs.trained import TrainedAvatar
+
+__all__ = ["__version__", "load"]
 __version__ = "0.1.0"
 
 # After every operation torch's OpenMP threads wait for the next one in a busy loop, for milliseconds, on the cores that the
 # splatter's own threads want; where anything else runs, that loop is what makes a step ten times slower. Torch's GNU
 # OpenMP reads this once, when torch is loaded, so it has no effect on a program that has imported torch before.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+
+def load(file: Path | str, head: Path | str | None = None) -> TrainedAvatar:
+    """Open a trained avatar: a run folder, its avatar.safetensors, or a copy of that anywhere.
+
+    `head` is the FLAME-format head model that it was trained with, a file or folder; None takes the one packed into the
+    file, or the one at $AVATAR_HEAD. Raises UserError (`avatar.errors`) with what is wrong and what to do.
+    """
+    from avatar.runs.trained import load_avatar  # imports torch; `avatar --help` must not wait for it
+
+    return load_avatar(file, head)

@@ -18,7 +18,7 @@ from typing import Any, get_type_hints
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from avatar.errors import UserError
@@ -161,16 +161,25 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
 
     Raises UserError for an unknown key or option, a wrong type or a value out of range.
     """
+    return config_from_dict(OmegaConf.to_container(_composed(overrides), resolve=True))  # type: ignore[arg-type]
+
+
+def chosen_options(overrides: Sequence[str] = ()) -> dict[str, str]:
+    """The option of each group, such as {"model": "hypergaussians", "preset": "fast"}; raises as `load_config` does."""
+    choices = _composed(overrides, hydra=True).hydra.runtime.choices
+    return {group: option for group, option in choices.items() if group in _groups()}
+
+
+def _composed(overrides: Sequence[str], hydra: bool = False) -> DictConfig:
     if long := next((override for override in overrides if len(override) > MAX_OVERRIDE), None):
         raise UserError(f"the override {long[:60]}... has {len(long)} characters; no value of a key needs that many")
     _check_overrides(overrides)
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            composed = compose("config", overrides=list(overrides))
+            return compose("config", overrides=list(overrides), return_hydra_config=hydra)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"the configuration cannot be composed: {_cause(error)}") from None
-    return config_from_dict(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
 
 
 def config_from_dict(values: dict[str, Any]) -> Config:
@@ -201,11 +210,7 @@ def _check_values(config: Config) -> None:
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
-    groups = {
-        p.name: sorted(f.stem for f in p.glob("*.yaml"))
-        for p in config_dir().iterdir()
-        if p.is_dir() and p.name != PROTOCOLS
-    }
+    groups = _groups()
     keys = _known_keys()
     for override in overrides:
         key, separator, value = override.partition("=")
@@ -216,6 +221,12 @@ def _check_overrides(overrides: Sequence[str]) -> None:
                 raise UserError(f"{key}={value}: there is no such file; configs/{key}/ has {', '.join(groups[key])}")
         elif key not in keys:
             raise UserError(f"there is no configuration key '{key}'{_nearest_hint(key, list(groups))}")
+
+
+def _groups() -> dict[str, list[str]]:
+    """The options of each group of configs/."""
+    folders = [p for p in config_dir().iterdir() if p.is_dir() and p.name != PROTOCOLS]
+    return {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in folders}
 
 
 def _known_keys(schema: type = Config, prefix: str = "") -> list[str]:

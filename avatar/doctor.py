@@ -14,25 +14,28 @@ import avatar
 from avatar.config import config_dir
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
-from avatar.lpips import load_lpips
-from avatar.run import HEAD_VARIABLE
+from avatar.losses.lpips import load_lpips
+from avatar.runs.trained import HEAD_VARIABLE
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians
 
 
-def report(say: Callable[[str], None] = print) -> int:
+def diagnose(say: Callable[[str], None] = print) -> int:
     """Print one line per finding. Returns 1 when something that every command needs does not work, else 0."""
     say(f"avatar {avatar.__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
     say(f"torch {torch.__version__}, {torch.get_num_threads()} threads, {os.cpu_count()} processors")
-    works = [check("compiled core", draw_one_splat, say), check("configuration", lambda: str(config_dir()), say)]
-    check("video encoder", find_encoder, say)
-    check("head model", find_default_head, say)
+    works = [
+        try_finding("compiled core", draw_one_splat, say),
+        try_finding("configuration", lambda: str(config_dir()), say),
+    ]
+    try_finding("video encoder", find_encoder, say)
+    try_finding("head model", find_default_head, say)
     for net in ("vgg", "alex", "squeeze"):
-        check(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
+        try_finding(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
     return 0 if all(works) else 1
 
 
-def check(name: str, finding: Callable[[], str], say: Callable[[str], None]) -> bool:
+def try_finding(name: str, finding: Callable[[], str], say: Callable[[str], None]) -> bool:
     """Say what `finding` returns or why it failed; every failure is a line, never a stack trace."""
     try:
         say(f"  {name:16} {finding()}")

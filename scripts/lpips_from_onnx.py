@@ -15,8 +15,8 @@ from pathlib import Path
 import onnx
 import torch
 
-from avatar.lpips import from_state, save_lpips
-from avatar.lpips_network import NETS
+from avatar.losses.lpips import from_state, save_lpips
+from avatar.losses.lpips_network import NETS
 
 FEATURE = re.compile(r".*net\.slice\d+\.(\d+\..+)$")
 HEAD = re.compile(r".*lins?\.?(\d+)\.model\.1\.weight$")

@@ -1,12 +1,16 @@
 #!/usr/bin/env bash
-# Build a wheel, install it into an empty environment outside the checkout, and run the whole program from there.
+# Build the source distribution, a wheel from that, install it into an empty environment outside the checkout, and run the
+# whole program from there.
 set -euo pipefail
 checkout=$(cd "$(dirname "$0")/.." && pwd)
 python=${PYTHON:-python3}
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
-"$checkout/.venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$checkout"
+"$checkout/.venv/bin/python" -m build --sdist --no-isolation --outdir "$work/dist" "$checkout"
+mkdir "$work/source"
+tar xf "$work"/dist/*.tar.gz -C "$work/source" --strip-components=1
+"$checkout/.venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$work/source"
 "$python" -m venv "$work/env"
 # shellcheck disable=SC2086
 "$work/env/bin/pip" install --quiet --disable-pip-version-check -c "$checkout/constraints.txt" ${PIP_FLAGS:-} "$work"/dist/*.whl
@@ -24,7 +28,11 @@ set -x
 "$avatar" train actor --out run --resume
 "$avatar" eval run --frames
 "$avatar" reenact run --driver driver --frame-offset 1 # 20 frames are too few to detect it
-for made in run/eval/results.json run/eval/hypergaussians/renders/00048.png run/reenact/driver-relative.mp4; do
+"$avatar" export run --with-head --out alone.safetensors
+mkdir elsewhere
+(cd elsewhere && "$avatar" drive-file ../driver --frame-offset 1 --out motion.npz &&
+  "$avatar" reenact ../alone.safetensors --driver motion.npz)
+for made in elsewhere/reenact/motion-relative.mp4 run/eval/results.json run/eval/hypergaussians/renders/00048.png run/reenact/driver-relative.mp4; do
   test -s "$made"
 done
 set +x

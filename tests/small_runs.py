@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from avatar.checkpoint import Checkpoint
-from avatar.config import Config, load_config
+from avatar.commands.opening import split_sizes
+from avatar.config import Config, chosen_options, load_config
+from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.run import Source, open_subject, start_run
+from avatar.runs.checkpoint import Checkpoint
+from avatar.runs.run import start_run
+from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
+from data_prep.open import open_subject
 
 SMALL = (
     "model.uv_size=20",
@@ -33,7 +38,7 @@ def small_config(*overrides: str) -> Config:
 
 def open_small(folder: Path, config: Config) -> tuple[Source, Subject, HeadAssets]:
     source = Source(folder, folder / "head_model", frame_offset=1)
-    subject, assets = open_subject(source, config, lambda _: None)
+    subject, assets = open_subject(source, split_sizes(config), lambda _: None)
     return source, subject, assets
 
 
@@ -49,6 +54,21 @@ def train_small(
     config = small_config(*overrides)
     source, subject, assets = open_small(folder, config)
     avatar = new_avatar(assets, subject, config)
+    perceptual = choose_perceptual(config.trainer, lambda _: None)
     if resume is None:
-        start_run(run, source, config, subject)
-    return avatar, train(avatar, subject, config, run, resume=resume, say=lambda _: None)
+        start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
+    return avatar, train(avatar, subject, config, run, perceptual, resume=resume)
+
+
+def run_info(perceptual: str) -> dict[str, Any]:
+    """What run.json holds, of a run that was never made."""
+    return {
+        "name": "someone",
+        "source": Source(Path("/x"), Path("/y")).to_dict(),
+        "data_hash": "0" * 64,
+        "head_fingerprint": "1" * 64,
+        "config": small_config().to_dict(),
+        "options": chosen_options(SMALL),
+        "perceptual": perceptual,
+        "versions": {},
+    }

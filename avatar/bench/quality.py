@@ -14,15 +14,16 @@ from tqdm import tqdm
 
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.train import Trainee, per_step, run_steps, steps_at_once, trainee
-from avatar.checkpoint import list_checkpoints, load_checkpoint, load_module
+from avatar.commands.opening import open_run
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
 from avatar.evaluation.networks import find_lpips
-from avatar.lpips_network import Lpips
-from avatar.metrics import psnr, ssim
+from avatar.losses.lpips_network import Lpips
+from avatar.losses.metrics import psnr, ssim
 from avatar.render import Renderer
-from avatar.run import Run, load_run
+from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
+from avatar.runs.run import Run
 from avatar.types import Frame
 
 
@@ -66,11 +67,11 @@ def measure(
     paths: Sequence[Path], head: Path | None, *, frames: int, repeats: int, say: Callable[[str], None] = print
 ) -> list[Curve]:
     """A curve for each run. Raises UserError for runs of different subjects: their figures cannot be compared."""
-    runs = [load_run(path, head, say) for path in paths]
+    runs = [open_run(path, head, say=say) for path in paths]
     for run in runs:
         if run.subject.data_hash != runs[0].subject.data_hash:
             raise UserError(f"{run.path} was trained on other data than {runs[0].path}; compare runs of one subject")
-    learners = [trainee(run.avatar, run.subject, run.config, lambda _: None) for run in runs]
+    learners = [trainee(run.avatar, run.subject, run.config, say, run.trained.perceptual) for run in runs]
     times = time_steps(learners, repeats)
     network, note = find_lpips("vgg")
     say(f"LPIPS: {note}")
@@ -81,7 +82,7 @@ def measure(
         held_out = held_out_frames(run, frames)
         for file in tqdm(files, desc=run.path.name, unit="checkpoint", disable=None):
             checkpoint = load_checkpoint(file)
-            load_module(run.avatar, checkpoint, run.path)
+            load_module(run.avatar, checkpoint.tensors, run.path)
             minutes = minutes_of(learner, checkpoint.step, early, late)
             points.append(Point(checkpoint.step, minutes, *figures(run, held_out)))
         iterations = run.config.trainer.iterations

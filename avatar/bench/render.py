@@ -21,9 +21,10 @@ from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import limited_to
 from avatar.bench.render_plot import write_plot
 from avatar.bench.results import leave
+from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.render import Renderer
-from avatar.run import Run, load_run
+from avatar.runs.trained import TrainedAvatar
 from avatar.splat import splat
 from avatar.types import Camera, HeadParams, Rendering
 
@@ -56,7 +57,7 @@ class Row:
 
 
 def run(request: Request) -> None:
-    trained = load_run(request.inputs[0], request.head)
+    trained = open_trained(request.inputs[0], request.head)
     rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
     for line in table(rows, describe(trained)):
         print(line)
@@ -64,10 +65,10 @@ def run(request: Request) -> None:
     leave(request.out, "bench_render", content, lambda path: write_plot(rows, path))
 
 
-def describe(trained: Run) -> dict[str, Any]:
+def describe(trained: TrainedAvatar) -> dict[str, Any]:
     model = trained.config.model
     return {
-        "subject": trained.subject.name,
+        "subject": trained.name,
         "step": trained.step,
         "gaussians": len(trained.avatar),
         "model": model.name,
@@ -77,7 +78,7 @@ def describe(trained: Run) -> dict[str, Any]:
     }
 
 
-def measure(trained: Run, sizes: Sequence[int], *, repeats: int) -> list[Row]:
+def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> list[Row]:
     """Compare, then time. Raises UserError when the renderer draws another picture: its time would say nothing."""
     renderer = Renderer(trained.avatar, torch.tensor(trained.config.data.background))
     rows = []
@@ -109,15 +110,15 @@ def measure(trained: Run, sizes: Sequence[int], *, repeats: int) -> list[Row]:
     return rows
 
 
-def inputs(trained: Run, size: int, count: int) -> list[Input]:
+def inputs(trained: TrainedAvatar, size: int, count: int) -> list[Input]:
     """Held-out frames, spread evenly over the test part, seen `size` pixels wide."""
-    subject, test = trained.subject, trained.subject.split.test
+    recording, test = trained.recording, trained.recording.split.test
     chosen = [test[i * len(test) // count] for i in range(count)]
-    return [(subject.params(i), subject.camera(i, size)) for i in chosen]
+    return [(recording.params(i), recording.camera(i, size)) for i in chosen]
 
 
 @torch.no_grad()
-def compare(trained: Run, renderer: Renderer, frames: Sequence[Input]) -> Error:
+def compare(trained: TrainedAvatar, renderer: Renderer, frames: Sequence[Input]) -> Error:
     """Raises UserError, with the figures, above the tolerances."""
     gaussians = mean = largest = 0.0
     for params, camera in frames:
@@ -150,7 +151,7 @@ def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callabl
     return calls
 
 
-def draw_unfolded(trained: Run, params: HeadParams, camera: Camera) -> Rendering:
+def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
     return splat(trained.avatar(params), camera, torch.tensor(trained.config.data.background))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avatar.bench.machine import describe_machine
-from avatar.checkpoint import write_atomically
+from avatar.files.atomic import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

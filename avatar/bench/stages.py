@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from avatar.gaussians.compose import compose_raw
-from avatar.losses import PhotometricLoss
+from avatar.losses.photometric import PhotometricLoss
 from avatar.model import Avatar
 from avatar.train.optim import schedule, set_rates
 from avatar.train.step import Objective, check_step

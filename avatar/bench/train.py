@@ -13,15 +13,17 @@ from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians, time_of
 from avatar.bench.floor import floor_ms
 from avatar.bench.stages import StagedStep
+from avatar.commands.opening import split_sizes
 from avatar.config import Config, load_config
 from avatar.data.loader import FrameLoader
+from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
-from avatar.run import Source, find_head, open_subject
 from avatar.train.optim import make_optimizer
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
+from data_prep.open import find_head, open_subject
 
 PRESETS = ("paper", "balanced", "fast")
 FRAMES = 8  # training frames that take turns; all are decoded before the clock runs
@@ -63,7 +65,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     """Time all presets in turns on the same frames. Raises UserError as `avatar train` does."""
     folder, overrides = request.inputs[0], [*(QUICK if request.quick else ()), *request.overrides]
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
-    subject, assets = open_subject(source, load_config(overrides), say)
+    subject, assets = open_subject(source, split_sizes(load_config(overrides)), say)
     trainees = {}
     for preset in PRESETS:
         config = load_config([f"preset={preset}", *overrides])
@@ -92,8 +94,13 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     ]
 
 
-def trainee(avatar: Avatar, subject: Subject, config: Config, say: Callable[[str], None]) -> Trainee:
-    """The avatar with a few decoded frames that are spread over the training split."""
+def trainee(
+    avatar: Avatar, subject: Subject, config: Config, say: Callable[[str], None], perceptual: str | None = None
+) -> Trainee:
+    """The avatar with a few decoded frames that are spread over the training split.
+
+    `perceptual` is the recorded term of a run, which its steps are timed with; None chooses as a new run would.
+    """
     train = subject.split.train
     chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
     with FrameLoader(subject, config.data.size) as loader:
@@ -101,7 +108,8 @@ def trainee(avatar: Avatar, subject: Subject, config: Config, say: Callable[[str
     meshes = PosedMeshes(avatar.head)
     for frame in frames:
         meshes.vertices(frame)
-    objective = Objective(config.trainer, torch.tensor(config.data.background), choose_perceptual(config.trainer, say))
+    term = choose_perceptual(config.trainer, say, perceptual)
+    objective = Objective(config.trainer, torch.tensor(config.data.background), term)
     return Trainee(config, avatar, make_optimizer(avatar, config.trainer), objective, cycle(frames), meshes)
 
 

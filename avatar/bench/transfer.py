@@ -18,19 +18,23 @@ from torch import Tensor
 
 from avatar.bench import Request
 from avatar.bench.results import leave
+from avatar.commands.opening import split_sizes
 from avatar.config import Config, load_config
+from avatar.data.source import Source
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer as Truth
 from avatar.demo.subject import make_subject, tracking_bias
 from avatar.head.model import HeadModel
-from avatar.metrics import psnr
+from avatar.losses.metrics import psnr
 from avatar.model import Avatar
+from avatar.motion.repertoire import learn_repertoire
+from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.render import Renderer
-from avatar.run import Source, open_subject
+from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
-from avatar.transfer import TRANSFERS, transfer_motion
 from avatar.types import Camera, HeadParams
+from data_prep.open import open_subject
 
 TARGET_SEED, DRIVER_SEED = 1, 2
 NEUTRAL_BIAS = 0.15  # standard deviation of a tracked coefficient at rest
@@ -86,22 +90,20 @@ def measure(scale: Scale, out: Path, overrides: Sequence[str] = ()) -> list[Row]
         make_subject(target_folder, scale.target_frames, scale.size, TARGET_SEED, neutral_bias=NEUTRAL_BIAS)
         make_subject(driver_folder, scale.driver_frames, scale.size, DRIVER_SEED, neutral_bias=NEUTRAL_BIAS)
         target, assets = open_subject(
-            Source(target_folder, target_folder / "head_model", frame_offset=1), config, print
+            Source(target_folder, target_folder / "head_model", frame_offset=1), split_sizes(config)
         )
-        driver, _ = open_subject(
-            Source(driver_folder, target_folder / "head_model", frame_offset=1), None, print, assets
-        )
+        driver, _ = open_subject(Source(driver_folder, target_folder / "head_model", frame_offset=1), assets=assets)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, target.identity, config.model)
-        train(avatar, target, config, Path(scratch) / "run")
+        train(avatar, target, config, Path(scratch) / "run", choose_perceptual(config.trainer, print))
         tracked = [driver.params(i) for i in range(len(driver))]
-        training = [target.params(i) for i in target.split.train]
-        heads = HeadModel(assets, driver.identity), avatar.head
+        repertoire = learn_repertoire(target.recording.motion(target.split.train), avatar.head)
+        driver_head = HeadModel(assets, driver.identity)
     own = tracking_bias(TARGET_SEED, NEUTRAL_BIAS).expression
     performance = perform(DRIVER_SEED, scale.driver_frames, "speech")
     true = [frame_params(performance, i) for i in range(scale.driver_frames)]
     cameras = [frame_camera(performance, i, scale.size) for i in range(scale.driver_frames)]
-    motions = {mode: transfer_motion(tracked, training, mode, *heads).motion for mode in TRANSFERS}
+    motions = {mode: transfer_motion(tracked, repertoire, mode, driver_head).motion for mode in TRANSFERS}
     motions[CEILING] = [replace(params, expression=params.expression + own) for params in true]
     truth = true_pictures(true, cameras, config)
     renderer = Renderer(avatar, torch.tensor(config.data.background))

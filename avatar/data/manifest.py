@@ -92,13 +92,13 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         tracking=_of(raw, "tracking", str),
         width=_of(raw, "width", int),
         height=_of(raw, "height", int),
-        fps=_number(raw["fps"], "fps"),
-        intrinsics=_four(_of(raw, "intrinsics", list)),
+        fps=parse_number(raw["fps"], "fps"),
+        intrinsics=parse_intrinsics(raw["intrinsics"]),
         frame_offset=_of(raw, "frame_offset", int),
         offset_evidence=_of(raw, "offset_evidence", str),
         frames=frames,
-        train=_indices(raw, "train", count),
-        test=_indices(raw, "test", count),
+        train=parse_positions(raw["train"], "train", count),
+        test=parse_positions(raw["test"], "test", count),
         left_out={str(k): str(v) for k, v in _of(raw, "left_out", dict).items()},
         notes=tuple(str(note) for note in _of(raw, "notes", list)),
         head_masks=_of(raw, "head_masks", str),
@@ -140,21 +140,27 @@ def _of(raw: dict[str, Any], key: str, kind: type) -> Any:
     return value
 
 
-def _number(value: Any, name: str) -> float:
+def parse_number(value: Any, name: str) -> float:
+    """A finite number. Raises ValueError naming it."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise ValueError(f"{name} is not a finite number")
     return float(value)
 
 
-def _four(values: list[Any]) -> tuple[float, float, float, float]:
+def parse_intrinsics(values: Any) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy. Raises TypeError or ValueError."""
+    if not isinstance(values, list):
+        raise TypeError(f"intrinsics is a {type(values).__name__}, not a list")
     if len(values) != 4:
         raise ValueError(f"intrinsics has {len(values)} values, not 4")
-    fx, fy, cx, cy = (_number(v, "intrinsics") for v in values)
+    fx, fy, cx, cy = (parse_number(v, "intrinsics") for v in values)
     return fx, fy, cx, cy
 
 
-def _indices(raw: dict[str, Any], key: str, count: int) -> tuple[int, ...]:
-    values = _of(raw, key, list)
+def parse_positions(values: Any, key: str, count: int) -> tuple[int, ...]:
+    """A list of positions among `count` frames, not empty. Raises TypeError or ValueError naming `key`."""
+    if not isinstance(values, list):
+        raise TypeError(f"{key} is a {type(values).__name__}, not a list")
     if not values or not all(isinstance(v, int) and not isinstance(v, bool) and 0 <= v < count for v in values):
         raise ValueError(f"{key} is empty or names frames outside the {count} of the subject")
     return tuple(values)

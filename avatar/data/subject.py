@@ -14,24 +14,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from avatar.check import check_finite, check_shapes
 from avatar.data.images import read_image, read_mask
 from avatar.data.manifest import TRACKS_FILE, FrameRecord, Manifest, read_manifest
+from avatar.data.recording import Recording, checked_tracks
 from avatar.data.split import Split
 from avatar.errors import UserError
 from avatar.types import Camera, Frame, HeadParams
 
 FAINTEST_MATTE = 10  # of 255: below it a JPEG matte is noise, not foreground
-_TRACK_SHAPES = {
-    "expression": "N E",
-    "jaw": "N 6",
-    "eyes": "N 12",
-    "eyelids": "N 2",
-    "neck": "N 6",
-    "R": "N 3 3",
-    "t": "N 3",
-    "shape": "S",
-}
 
 
 class FramePixels(NamedTuple):
@@ -53,69 +43,73 @@ class Subject:
 
     folder: Path  # the prepared subject
     manifest: Manifest
-    tracks: dict[str, Tensor]
+    recording: Recording
 
     @classmethod
     def open(cls, prepared: Path | str) -> Subject:
         """Read manifest and tracks, no images. Raises UserError when something is missing, damaged or too old."""
         prepared = Path(prepared)
         manifest = read_manifest(prepared)
-        return cls(prepared, manifest, _read_tracks(prepared / TRACKS_FILE, len(manifest.frames)))
+        recording = Recording(
+            name=manifest.name,
+            fps=manifest.fps,
+            width=manifest.width,
+            height=manifest.height,
+            intrinsics=manifest.intrinsics,
+            names=tuple(record.name for record in manifest.frames),
+            split=Split(manifest.train, manifest.test),
+            tracks=_read_tracks(prepared / TRACKS_FILE, len(manifest.frames)),
+            data_hash=manifest.data_hash,
+            head_fingerprint=manifest.head_fingerprint,
+        )
+        return cls(prepared, manifest, recording)
 
     def __len__(self) -> int:
-        return len(self.manifest.frames)
+        return len(self.recording)
 
     @property
     def name(self) -> str:
-        return self.manifest.name
+        return self.recording.name
 
     @property
     def fps(self) -> float:
-        return self.manifest.fps
+        return self.recording.fps
 
     @property
     def width(self) -> int:
-        return self.manifest.width
+        return self.recording.width
 
     @property
     def height(self) -> int:
-        return self.manifest.height
+        return self.recording.height
 
     @property
     def split(self) -> Split:
-        return Split(self.manifest.train, self.manifest.test)
+        return self.recording.split
 
     @property
-    def identity(self) -> Float[Tensor, 300]:
+    def identity(self) -> Float[Tensor, " S"]:
         """Identity coefficients of the head model."""
-        return self.tracks["shape"]
+        return self.recording.identity
 
     @property
     def data_hash(self) -> str:
-        return self.manifest.data_hash
+        return self.recording.data_hash
 
     @property
     def head_fingerprint(self) -> str:
-        return self.manifest.head_fingerprint
+        return self.recording.head_fingerprint
 
     def image_size(self, size: int | None = None) -> tuple[int, int]:
         """(width, height) of the frames when the width is resized to `size` pixels; None keeps the files' size."""
-        if size is None:
-            return self.width, self.height
-        if size < 1:
-            raise ValueError(f"size must be at least 1 pixel, got {size}")
-        return size, max(1, round(size * self.height / self.width))
+        return self.recording.image_size(size)
 
     def camera(self, index: int, size: int | None = None) -> Camera:
         """The camera of a frame; it holds the head's pose."""
-        index = self._checked(index)
-        fx, fy, cx, cy = self.manifest.intrinsics
-        camera = Camera(self.tracks["R"][index], self.tracks["t"][index], fx, fy, cx, cy, self.width, self.height)
-        return camera if size is None else camera.resized(*self.image_size(size))
+        return self.recording.camera(index, size)
 
     def params(self, index: int) -> HeadParams:
-        index = self._checked(index)
-        return HeadParams(**{name: self.tracks[name][index] for name in HeadParams.__dataclass_fields__})
+        return self.recording.params(index)
 
     def frame(self, index: int, size: int | None = None) -> Frame:
         """Decode one frame; its width is resized to `size` pixels, the height and the camera follow.
@@ -126,7 +120,7 @@ class Subject:
 
     def pixels(self, index: int, size: int | None = None) -> FramePixels:
         """The frame's images, uint8; what a cache holds. Raises as `frame` does."""
-        record = self.manifest.frames[self._checked(index)]
+        record = self.manifest.frames[self.recording.checked(index)]
         source = Path(self.manifest.source)
         shape = (self.height, self.width)
         if not source.is_dir():
@@ -148,7 +142,7 @@ class Subject:
 
     def assemble(self, index: int, pixels: FramePixels, size: int | None = None) -> Frame:
         """The frame of pixels that were decoded at `size`."""
-        record: FrameRecord = self.manifest.frames[self._checked(index)]
+        record: FrameRecord = self.manifest.frames[self.recording.checked(index)]
         image, alpha, head_mask, mouth_mask = (torch.from_numpy(p).float() / 255.0 for p in pixels)
         return Frame(
             index=index,
@@ -160,11 +154,6 @@ class Subject:
             head_mask=head_mask,
             mouth_mask=mouth_mask,
         )
-
-    def _checked(self, index: int) -> int:
-        if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of subject {self.name}, which has frames 0 to {len(self) - 1}")
-        return index
 
     def _mask(self, root: Path, path: str | None, shape: tuple[int, int], default: int) -> np.ndarray:
         if path is None:
@@ -188,14 +177,7 @@ def _read_tracks(file: Path, count: int) -> dict[str, Tensor]:
         raise UserError(f"{file} is missing; prepare the subject again") from None
     except (SafetensorError, OSError, ValueError) as error:
         raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None
-    missing = _TRACK_SHAPES.keys() - tracks.keys()
-    if missing:
-        raise UserError(f"{file} lacks {', '.join(sorted(missing))}; prepare the subject again")
     try:
-        sizes = check_shapes(**{name: (tracks[name], shape) for name, shape in _TRACK_SHAPES.items()})
-        check_finite(**{name: tracks[name] for name in _TRACK_SHAPES})
+        return checked_tracks(tracks, count)
     except (ValueError, TypeError) as error:
         raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None
-    if sizes["N"] != count:
-        raise UserError(f"{file} has {sizes['N']} frames but the manifest has {count}; prepare the subject again")
-    return {name: tracks[name].float() for name in _TRACK_SHAPES}

@@ -10,71 +10,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial import Delaunay, KDTree
 
+from avatar.demo.chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
 from avatar.demo.features import Rings, ear_rings, eye_rings, mouth_rings
-from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, RAY_ORIGIN, cast, cast_front
+from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, RAY_ORIGIN, cast
 
-V_RIM, V_CROWN = 0.008, 0.992
 EYE_DISC_CENTRE, EYE_DISC_RADIUS = np.array([0.932, 0.932]), 0.062  # left eyeball; u is mirrored for the right
 EYEBALL_RINGS, EYEBALL_SECTORS, EYEBALL_REACH = 11, 24, np.radians(112.0)
 LLOYD_STEPS = 40
 NECK_STRETCH = 1.6
-_U_OF_DEGREES = PchipInterpolator((0, 20, 45, 70, 90, 130, 180), (0.0, 0.25, 0.53, 0.745, 0.835, 0.92, 1.0))
-_HALF_WIDTH = PchipInterpolator((0.0, 0.70, 0.80, 0.88, 1.0), (0.492, 0.492, 0.45, 0.365, 0.2))
-
-
-class SkinChart:
-    """The one-to-one map between directions from `RAY_ORIGIN` and the UV square."""
-
-    def __init__(self) -> None:
-        longitude = np.radians(np.linspace(0.0, 180.0, 37))
-        latitude = np.radians(np.linspace(-84.0, -35.0, 90))
-        grid = cast(RAY_ORIGIN, _directions(*np.meshgrid(longitude, latitude, indexing="ij")).reshape(-1, 3))
-        grid = grid.reshape(37, 90, 3)
-        above_rim = grid[..., 1] + 155.0 + 0.27 * grid[..., 2]  # the neck ends in this plane
-        lowest = np.array([np.interp(0.0, row, latitude) for row in above_rim])
-        # A few cosines: an open end without the waves of the neck's tendons.
-        order = np.arange(4)
-        self._lowest_cosines = np.linalg.lstsq(np.cos(longitude[:, None] * order), lowest, rcond=None)[0]
-        marks = cast_front(np.stack((np.zeros(6), (-88.0, -47.5, -27.0, 22.0, 42.0, 92.0)), -1)) - RAY_ORIGIN
-        height = self._height(np.zeros(6), np.arctan2(marks[:, 1], marks[:, 2]))
-        self._v_of_height = PchipInterpolator(
-            (0.0, 0.065, *height, 1.0), (V_RIM, 0.08, 0.145, 0.315, 0.42, 0.625, 0.715, 0.86, V_CROWN)
-        )
-
-    def _lowest(self, longitude: np.ndarray) -> np.ndarray:
-        return np.cos(longitude[..., None] * np.arange(4)) @ self._lowest_cosines
-
-    def _height(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
-        lowest = self._lowest(longitude)
-        return (latitude - lowest) / (np.pi / 2 - lowest)
-
-    def uv(self, points: np.ndarray) -> np.ndarray:
-        """UV [..., 2] of points [..., 3] in millimetres on the smooth head surface."""
-        d = points - RAY_ORIGIN
-        longitude = np.arctan2(d[..., 0], d[..., 2])
-        v = self._v_of_height(self._height(longitude, np.arctan2(d[..., 1], np.hypot(d[..., 0], d[..., 2]))))
-        across = np.sign(longitude) * _U_OF_DEGREES(np.degrees(np.abs(longitude)))
-        return np.stack((0.5 + across * _HALF_WIDTH(v), v), -1)
-
-    def neck_share(self, uv: np.ndarray) -> np.ndarray:
-        """0 above the jaw, 1 at the open end of the neck, for UV [..., 2]."""
-        return np.clip(1.0 - uv[..., 1] / 0.12, 0.0, 1.0)
-
-    def directions(self, uv: np.ndarray) -> np.ndarray:
-        """Unit directions [..., 3] from `RAY_ORIGIN` of UV [..., 2]."""
-        table = np.linspace(0.0, 1.0, 4001)
-        height = np.interp(uv[..., 1], self._v_of_height(table), table)
-        across = np.clip((uv[..., 0] - 0.5) / _HALF_WIDTH(uv[..., 1]), -1.0, 1.0)
-        longitude = np.radians(np.interp(np.abs(across), _U_OF_DEGREES(table * 180.0), table * 180.0))
-        lowest = self._lowest(longitude)
-        return _directions(np.sign(across) * longitude, lowest + height * (np.pi / 2 - lowest))
-
-
-def _directions(longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
-    return np.stack((np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)), -1)
 
 
 class HeadMesh(NamedTuple):
@@ -121,7 +66,7 @@ def _edge(chart: SkinChart, start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
     def at(t: np.ndarray) -> np.ndarray:
         line = start + t[:, None] * (end - start)
-        return np.stack((0.5 + line[:, 0] * _HALF_WIDTH(line[:, 1]), line[:, 1]), -1)
+        return np.stack((0.5 + line[:, 0] * HALF_WIDTH(line[:, 1]), line[:, 1]), -1)
 
     dense = cast(RAY_ORIGIN, chart.directions(at(np.linspace(0.0, 1.0, 160))))
     return at(_along(dense))
@@ -140,7 +85,7 @@ def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) ->
     """Vertices [N, 2] between the fixed ones: Lloyd's algorithm on surface samples weighted by the wanted density."""
     side = np.linspace(0.0, 1.0, 190)
     across, v = np.meshgrid(side, V_RIM + side * (V_CROWN - V_RIM))
-    uv = np.stack((0.5 + across * _HALF_WIDTH(v), v), -1)
+    uv = np.stack((0.5 + across * HALF_WIDTH(v), v), -1)
     points = cast(RAY_ORIGIN, chart.directions(uv.reshape(-1, 2))).reshape(*v.shape, 3)
     centre = points[:-1, :-1] + points[1:, 1:] + points[:-1, 1:] + points[1:, :-1]
     area = np.linalg.norm(np.cross(points[1:, 1:] - points[:-1, :-1], points[:-1, 1:] - points[1:, :-1]), axis=-1) / 2
@@ -157,7 +102,7 @@ def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) ->
     sites = samples[generator.choice(len(samples), count, replace=False, p=weight / weight.sum())]
     for _ in range(LLOYD_STEPS):
         _, nearest = KDTree(np.concatenate((fixed, sites))).query(samples)
-        nearest = nearest - len(fixed)
+        nearest = np.asarray(nearest) - len(fixed)
         own = nearest >= 0
         mass = np.bincount(nearest[own], weight[own], count)
         moved = [np.bincount(nearest[own], weight[own] * samples[own, k], count) for k in range(3)]
@@ -242,7 +187,7 @@ def _triangulate(chart: SkinChart, uv: np.ndarray, rings: list[tuple[np.ndarray,
     latitude = np.arcsin(np.clip(d[:, 1], -1.0, 1.0))
     mercator = np.arcsinh(np.tan(np.clip(latitude, -1.55, 1.55))) - NECK_STRETCH * chart.neck_share(uv)
     stretched = np.where(chart.neck_share(uv) > 0, np.arctan(np.sinh(mercator)), latitude)
-    d = _directions(np.arctan2(d[:, 0], d[:, 2]), stretched)
+    d = directions(np.arctan2(d[:, 0], d[:, 2]), stretched)
     disc = d[:, 1:] / (1.0 + d[:, :1])
     guards = []  # a point inside each ring edge makes the edge Delaunay
     for ring, closed in rings:
@@ -265,7 +210,7 @@ def _assemble(uv: np.ndarray, half: np.ndarray, triangles: np.ndarray, rings: li
     """Mirror the left half, join it along the midline and the back seam, give the crown its UVs, add the eyeballs."""
     n = len(half)
     on_midline = uv[:, 0] == 0.5
-    on_seam = np.abs(uv[:, 0] - 0.5 - _HALF_WIDTH(uv[:, 1])) < 1e-9
+    on_seam = np.abs(uv[:, 0] - 0.5 - HALF_WIDTH(uv[:, 1])) < 1e-9
     half[on_seam, 0] = 0.0
     right = np.where(on_midline | on_seam, np.arange(n), n + np.arange(n))
     right_uv = np.where(on_midline, np.arange(n), n + np.arange(n))
@@ -275,9 +220,9 @@ def _assemble(uv: np.ndarray, half: np.ndarray, triangles: np.ndarray, rings: li
     uv_triangles, extra = triangles.copy(), []
     for f in np.flatnonzero((triangles == crown).any(1)):
         others = uv[triangles[f][triangles[f] != crown]]
-        across = ((others[:, 0] - 0.5) / _HALF_WIDTH(others[:, 1])).mean()
+        across = ((others[:, 0] - 0.5) / HALF_WIDTH(others[:, 1])).mean()
         uv_triangles[f][triangles[f] == crown] = 2 * n + len(extra)
-        extra.append((0.5 + across * float(_HALF_WIDTH(V_CROWN)), V_CROWN))
+        extra.append((0.5 + across * float(HALF_WIDTH(V_CROWN)), V_CROWN))
     extra_uv = np.array(extra)
     right_uv = np.concatenate((right_uv, np.full(n, -1), 2 * n + len(extra) + np.arange(len(extra))))
 

@@ -80,7 +80,7 @@ class Comparison:
     notes: Sequence[str]  # for people: what was left out, and why
 
 
-def compare(runs: Sequence[Path], protocols: Sequence[str] | None = None) -> Comparison:
+def compare_runs(runs: Sequence[Path], protocols: Sequence[str] | None = None) -> Comparison:
     """The runs by each protocol that all of them have, or by those named.
 
     Raises UserError for less than two runs, a run that was not evaluated, runs of other data, head model or image size

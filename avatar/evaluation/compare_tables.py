@@ -7,9 +7,9 @@ import io
 from collections.abc import Callable
 from pathlib import Path
 
-from avatar.checkpoint import write_atomically
 from avatar.evaluation.bootstrap import LEVEL
 from avatar.evaluation.compare import Cell, Comparison, ProtocolComparison
+from avatar.files.atomic import write_atomically
 
 UNITS = {"psnr": "dB", "jitter": "levels"}
 HIGHER_IS_BETTER = ("psnr", "ssim")

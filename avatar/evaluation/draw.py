@@ -14,11 +14,11 @@ from jaxtyping import UInt8
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import Colour, Look
+from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
 from avatar.splat import splat
 from avatar.splat.cpu import thread_count
 from avatar.types import Frame
-from avatar.video import error_map, side_by_side
 
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 SHEET_COLUMNS = 2

@@ -21,7 +21,6 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from avatar.checkpoint import write_atomically
 from avatar.data.loader import FrameLoader
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
@@ -34,10 +33,11 @@ from avatar.evaluation.protocol import SHARED_CHOICES, Protocol, choose_protocol
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import colour_name, frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
-from avatar.lpips_network import Lpips, Net
+from avatar.files.atomic import write_atomically
+from avatar.files.video import video_writer
+from avatar.losses.lpips_network import Lpips, Net
 from avatar.render import Renderer
-from avatar.run import Run, versions
-from avatar.video import video_writer
+from avatar.runs.run import Run, versions
 
 RESULTS_FORMAT = 2
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.evaluation.measure import Pair
-from avatar.metrics import weighted_mean
+from avatar.losses.metrics import weighted_mean
 
 
 class _Moment(NamedTuple):

@@ -10,8 +10,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.evaluation.protocol import MEASURES, Levels, Look, Protocol, Region, column
-from avatar.lpips_network import MIN_SIZE, Lpips, Net
-from avatar.metrics import SSIM_RADIUS, bounding_box, squared_error, ssim_map, weighted_mean
+from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
+from avatar.losses.metrics import SSIM_RADIUS, bounding_box, squared_error, ssim_map, weighted_mean
 
 LPIPS_CROP = 64  # pixels; a region is given at least so much context
 INSIDE = slice(SSIM_RADIUS, -SSIM_RADIUS)  # where SSIM's windows have their centres

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from avatar.lpips import MissingWeights, load_lpips
-from avatar.lpips_network import NETS, Lpips, Net
+from avatar.losses.lpips import MissingWeights, load_lpips
+from avatar.losses.lpips_network import NETS, Lpips, Net
 
 
 class ChosenLpips(NamedTuple):

@@ -19,7 +19,7 @@ import yaml
 from avatar.config import config_dir
 from avatar.data.split import Split
 from avatar.errors import UserError
-from avatar.lpips_network import Net
+from avatar.losses.lpips_network import Net
 
 Region = str  # one of REGIONS
 Mask = Literal["multiply", "none", "only"]

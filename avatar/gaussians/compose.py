@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.check import check_shapes
 from avatar.gaussians.compose_cpu import compose_cpu
+from avatar.tensors import check_shapes
 from avatar.types import Gaussians, Offsets
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar import _core
-from avatar.native import instruction_set, thread_count
+from avatar.compute.native import instruction_set, thread_count
 from avatar.types import Gaussians
 
 _COMPOSED = Gaussians._fields[:4]  # all but sh

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar import _core
-from avatar.check import check_shapes
-from avatar.native import instruction_set, thread_count
+from avatar.compute.native import instruction_set, thread_count
+from avatar.tensors import check_shapes
 
 HEADS = {"position": 3, "rotation": 4, "scale": 3}  # and the number of values of each
 OFFSETS = sum(HEADS.values())

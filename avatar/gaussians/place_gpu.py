@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avatar.check import check_shapes
 from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
 from avatar.kernels.place import place
 from avatar.kernels.place_backward import gather_nodes, place_backward
 from avatar.kernels.start import start
+from avatar.tensors import check_shapes
 from avatar.types import Gaussians
 
 LANES = 128  # Gaussians of a program; a multiple of the 16 that lie side by side in the heads' parameters
@@ -55,15 +55,16 @@ def place_gpu(
         raise ValueError(f"packed must have shape {list(packed_shape(N, n))}, got {list(packed.shape)}")
     if packed is None and bound.interpolation is not None:
         raise ValueError("offsets are not smooth over the map: there is no grid without HyperGaussians")
-    placed = _Place.apply(vertices, values, packed, quats, log_scales, opacity_logits, bound)  # pyright: ignore
-    return Gaussians(*placed, sh)
+    placed: Any = _Place.apply(vertices, values, packed, quats, log_scales, opacity_logits, bound)
+    means, turned, scales, opacities = placed
+    return Gaussians(means, turned, scales, opacities, sh)
 
 
 class _Place(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *given, bound = arguments
-        tensors = [None if t is None else t.detach().contiguous() for t in given]
+        tensors: list[Any] = [None if t is None else t.detach().contiguous() for t in given]
         vertices, values, packed, quats, log_scales, opacity_logits = tensors
         N, n = len(quats), values.shape[1]
         is_hyper, grid = packed is not None, bound.interpolation
@@ -101,7 +102,8 @@ class _Place(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        values, packed, raw, quats, log_scales, scales, opacities = ctx.saved_tensors
+        saved: tuple[Any, ...] = ctx.saved_tensors
+        values, packed, raw, quats, log_scales, scales, opacities = saved
         grid: Interpolation | None = ctx.bound.interpolation
         by_means, by_quats, by_scales, by_opacities = (gradient.contiguous() for gradient in upstream)
         N, n, is_hyper = len(quats), values.shape[1], packed is not None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.data_prep.safe_pickle import load_npy, load_npz, load_pickle
 from avatar.errors import UserError
+from avatar.files.pickles import load_npy, load_npz, load_pickle
+from avatar.head.expression_names import ExpressionNames, load_expression_names
 from avatar.head.uv_obj import read_uv_obj
 
 IDENTITY_COEFFICIENTS = 300  # FLAME's shapedirs: 300 identity directions, then the expression directions
@@ -44,6 +45,7 @@ class HeadAssets:
     uv_faces: Int[Tensor, "F 3"]  # rows of `uvs` for the corners of `faces`
     regions: Mapping[str, Int[Tensor, " R"]]  # name -> vertex indices
     fingerprint: str  # SHA-256 over all of the above
+    names: ExpressionNames = field(default_factory=ExpressionNames)  # of the expression coefficients
 
     @property
     def num_vertices(self) -> int:
@@ -112,7 +114,13 @@ def load_head_assets(path: Path) -> HeadAssets:
         "uv_faces": torch.from_numpy(uv_faces),
     }
     regions = _read_regions(folder, V)
-    return HeadAssets(**tensors, parents=parents, regions=regions, fingerprint=_fingerprint(tensors, parents, regions))
+    return HeadAssets(
+        **tensors,
+        parents=parents,
+        regions=regions,
+        fingerprint=fingerprint_of(tensors, parents, regions),
+        names=load_expression_names(folder, directions.shape[2] - IDENTITY_COEFFICIENTS),
+    )
 
 
 def find_model_file(path: Path) -> Path:
@@ -205,7 +213,8 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
     return {}
 
 
-def _fingerprint(tensors: Mapping[str, Tensor], parents: tuple[int, ...], regions: Mapping[str, Tensor]) -> str:
+def fingerprint_of(tensors: Mapping[str, Tensor], parents: tuple[int, ...], regions: Mapping[str, Tensor]) -> str:
+    """SHA-256 over everything that a head model consists of."""
     digest = hashlib.sha256(repr(parents).encode())
     update: Callable[[bytes], None] = digest.update
     for name, tensor in sorted({**tensors, **{f"region {k}": v for k, v in regions.items()}}.items()):

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from avatar.errors import UserError
-from avatar.head.assets import find_model_file
 
 NAMES_FILE = "expression_names.json"
 JAW_TARGETS = ("jaw_x", "jaw_y", "jaw_z")
@@ -31,6 +30,10 @@ _MAX_BYTES = 2**24
 class ExpressionNames:
     names: tuple[str | None, ...] = ()  # of the coefficients
     arkit: dict[str, dict[str, float]] = field(default_factory=dict)  # plain blendshape name -> coefficient -> weight
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `parse_expression_names` reads."""
+        return {"names": list(self.names), "arkit": self.arkit}
 
     def index(self, name: str) -> int | None:
         """The coefficient of a name, whatever its style of writing."""
@@ -59,12 +62,12 @@ def plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def load_expression_names(head: Path, num_expressions: int) -> ExpressionNames:
-    """The names that lie beside a head model (file or folder); none where there is no such file.
+def load_expression_names(folder: Path, num_expressions: int) -> ExpressionNames:
+    """The names that lie in a head model's folder; none where there is no such file.
 
     Raises UserError for a file that is not of the form above, or that names coefficients that do not exist.
     """
-    path = find_model_file(head).parent / NAMES_FILE
+    path = folder / NAMES_FILE
     if not path.is_file():
         return ExpressionNames()
     try:
@@ -73,6 +76,11 @@ def load_expression_names(head: Path, num_expressions: int) -> ExpressionNames:
         raw = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read as JSON ({error})") from None
+    return parse_expression_names(raw, num_expressions, path)
+
+
+def parse_expression_names(raw: Any, num_expressions: int, path: Path | str) -> ExpressionNames:
+    """The names of a parsed file; `path` is for messages. Raises UserError as `load_expression_names` does."""
     raw = {"names": raw} if isinstance(raw, list) else raw
     names = raw.get("names") if isinstance(raw, dict) else None
     if not isinstance(names, list) or not all(name is None or isinstance(name, str) for name in names):
@@ -83,7 +91,9 @@ def load_expression_names(head: Path, num_expressions: int) -> ExpressionNames:
     return ExpressionNames(known.names, _read_arkit(path, raw.get("arkit", {}), known, num_expressions))
 
 
-def _read_arkit(path: Path, raw: Any, known: ExpressionNames, num_expressions: int) -> dict[str, dict[str, float]]:
+def _read_arkit(
+    path: Path | str, raw: Any, known: ExpressionNames, num_expressions: int
+) -> dict[str, dict[str, float]]:
     if not isinstance(raw, dict) or not all(isinstance(weights, dict) for weights in raw.values()):
         raise UserError(f'{path}: "arkit" must hold, for each blendshape, an object of weights')
     for blendshape, weights in raw.items():

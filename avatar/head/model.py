@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.check import check_shapes
 from avatar.head.assets import HeadAssets
+from avatar.tensors import check_shapes
 from avatar.types import HeadParams
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)

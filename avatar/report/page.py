@@ -10,13 +10,13 @@ from typing import Any
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from avatar.checkpoint import write_atomically
 from avatar.config import flatten
 from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
 from avatar.report.pictures import frame_panels, uncertainty_map
-from avatar.run import Run, versions
+from avatar.runs.run import Run, versions
 
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
 BINNINGS = (  # key of results.json, what it is binned by, decimals of the edges and their column's name

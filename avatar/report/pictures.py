@@ -10,7 +10,7 @@ from avatar.data.loader import FrameLoader
 from avatar.evaluation.draw import panel
 from avatar.evaluation.measure import Pair
 from avatar.render import Renderer
-from avatar.run import Run
+from avatar.runs.run import Run
 
 MAX_FRAMES = 40
 MAX_PANEL_WIDTH = 1080  # pixels of truth, render and error side by side; 40 of them stay under 5 MB

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.check import check_finite, check_shapes
 from avatar.compute.device import on_gpu
 from avatar.splat.counters import Counters
 from avatar.splat.cpu import count_cpu, splat_cpu
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
+from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
 __all__ = ["Counters", "counters", "splat"]

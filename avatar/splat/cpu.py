@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar import _core
-from avatar.check import check_finite
-from avatar.native import instruction_set, thread_count
+from avatar.compute.native import instruction_set, thread_count
 from avatar.splat.counters import Counters
 from avatar.splat.region import Region
+from avatar.tensors import check_finite
 from avatar.types import Camera, Gaussians, Rendering
 
 

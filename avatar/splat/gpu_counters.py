@@ -10,9 +10,10 @@ from torch import Tensor
 
 from avatar.kernels.composite import NEVER_STOPS
 from avatar.kernels.project import VISIBLE
-from avatar.splat import gpu
+from avatar.splat import gpu_draw
 from avatar.splat.counters import Counters
-from avatar.splat.gpu import Counted, Drawing, Settings, draw, settings_of, tile_grid
+from avatar.splat.gpu import settings_of
+from avatar.splat.gpu_draw import Counted, Drawing, Settings, draw, tile_grid
 from avatar.types import Camera, Gaussians, Rendering
 
 HALF_LOG2E = 0.72134752044448170368
@@ -29,7 +30,7 @@ def count_gpu(
     settings = settings_of(camera, gaussians.means.device, **options, everywhere=everywhere)
     background = background.detach().contiguous()
     if len(gaussians.means) == 0:
-        tiles = tile_grid(settings.region, gpu.TUNING.tile).tiles
+        tiles = tile_grid(settings.region, gpu_draw.TUNING.tile).tiles
         image = background.repeat(camera.height, camera.width, 1)
         counts = dict.fromkeys(Counters._fields, 0) | {"tiles": tiles, "blocks": tiles}
         return Rendering(image, torch.zeros_like(image[..., 0])), Counters(**counts)

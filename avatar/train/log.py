@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from avatar.losses import PhotometricLoss
-from avatar.metrics import psnr
+from avatar.losses.metrics import psnr
+from avatar.losses.photometric import PhotometricLoss
 
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
 

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.check import describe_non_finite
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.losses import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
-from avatar.lpips import Net, load_lpips
+from avatar.losses.lpips import Net, load_lpips
+from avatar.losses.photometric import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
 from avatar.model import Avatar
 from avatar.splat import splat
+from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
 from avatar.types import Frame, Gaussians
 
@@ -106,21 +106,25 @@ def training_step(
     return Outcome(loss, image.detach(), target)
 
 
-def choose_perceptual(config: TrainerConfig, say: Callable[[str], None]) -> PerceptualTerm:
+def choose_perceptual(config: TrainerConfig, say: Callable[[str], None], recorded: str | None = None) -> PerceptualTerm:
     """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
 
-    Raises UserError when LPIPS is asked for by name and cannot be had.
+    `recorded` is the name of what a run began with, which it keeps whatever this machine has. Raises UserError when LPIPS
+    is asked for by name, or recorded, and cannot be had.
     """
     if config.perceptual == "none":
         return PerceptualTerm("none")
     in_its_place = Weighted(dssim, config.dssim_weight)
-    if config.perceptual in ("lpips", "auto"):
+    lpips_name = f"lpips-{config.lpips_net}"
+    if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
         try:
             lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
             function = masked_lpips(lpips) if config.lpips_region == "frame" else on_head(masked_lpips(lpips))
             term = Weighted(function, config.perceptual_weight)
-            return PerceptualTerm(f"lpips-{config.lpips_net}", term, config.lpips_every, in_its_place)
+            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place)
         except UserError as error:
+            if recorded is not None:
+                raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
             if config.perceptual == "lpips":
                 raise
             say(f"Training with D-SSIM in place of LPIPS: {error}")

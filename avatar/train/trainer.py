@@ -13,18 +13,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.config import Config
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.model import Avatar
+from avatar.motion.rest import find_neutral
+from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
+from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import splat
 from avatar.train.colours import colour_from_frames
 from avatar.train.log import TrainingLog
 from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.posed import PosedMeshes
-from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.train.step import Objective, PerceptualTerm, training_step
 
 
 def train(
@@ -32,22 +34,21 @@ def train(
     subject: Subject,
     config: Config,
     run: Path,
+    perceptual: PerceptualTerm,
     *,
     resume: Checkpoint | None = None,
-    say: Callable[[str], None] = print,
 ) -> int:
-    """Train `avatar` on the subject's training frames and write checkpoints, curves and previews into `run`.
+    """Train `avatar` on the subject's training frames and write checkpoints, avatar file, curves and previews into `run`.
 
     Returns the number of steps done when it ends, which is less than `trainer.iterations` after an interruption (Ctrl-C
     or SIGTERM; the state is saved first). Raises UserError, leaving the last good checkpoint, when a loss or gradient is
     not finite.
     """
     trainer = config.trainer
-    perceptual = choose_perceptual(trainer, say)
     optimizer = make_optimizer(avatar, trainer)
     start = 0
     if resume is not None:
-        load_module(avatar, resume, run)
+        load_module(avatar, resume.tensors, run)
         load_optimizer(optimizer, avatar, resume.tensors)
         start = resume.step
     elif trainer.initial_colours == "frames":
@@ -63,11 +64,15 @@ def train(
         "threads": torch.get_num_threads(),
     }
 
+    recording = subject.recording
+    neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
+
     def save(step: int) -> None:
         tensors = {**module_tensors(avatar), **optimizer_tensors(optimizer, avatar)}
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
+        write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
-    order = list(frame_order(subject.split.train, trainer.seed, start, trainer.iterations))
+    order = frame_order(subject.split.train, trainer.seed, start, trainer.iterations)
     step = saved = start
     with (
         FrameLoader(subject, config.data.size, config.data.cache_mb << 20, config.data.workers) as loader,
@@ -88,6 +93,16 @@ def train(
         if step > saved:
             save(step)
     return step
+
+
+def leave_avatar(
+    run: Path, avatar: Avatar, checkpoint: Checkpoint, subject: Subject, config: Config, perceptual: str
+) -> None:
+    """Write the avatar file of a checkpoint, as training does with each that it saves."""
+    load_module(avatar, checkpoint.tensors, run)
+    recording = subject.recording
+    neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
+    write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, checkpoint.step, perceptual)
 
 
 @torch.no_grad()

@@ -12,11 +12,11 @@ from avatar.bench import Request
 from avatar.bench.clock import Time
 from avatar.bench.quality import Curve, Point, measure, pareto
 from avatar.bench.quality_report import run, table
+from avatar.commands.opening import open_run
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
-from avatar.lpips import save_lpips
-from avatar.lpips_network import Lpips
-from avatar.run import load_run
+from avatar.losses.lpips import save_lpips
+from avatar.losses.lpips_network import Lpips
 
 ANY = Time(1.0, 1.0, 1)
 
@@ -62,7 +62,7 @@ def test_figures_are_those_of_the_evaluation(
     train_small(tracked_folder, tmp_path / "run")
     (found,) = measure([tmp_path / "run"], None, frames=10_000, repeats=1)
     assert "squeeze, not to be compared with figures of vgg" in capsys.readouterr().out
-    written = evaluate(load_run(tmp_path / "run"), ["hypergaussians"], say=lambda _: None)
+    written = evaluate(open_run(tmp_path / "run"), ["hypergaussians"], say=lambda _: None)
     means = json.loads(written.read_text())["protocols"]["hypergaussians"]["means"]
     assert found.last.psnr == pytest.approx(means["psnr_head"], abs=1e-6)
     assert found.last.ssim == pytest.approx(means["ssim_head"], abs=1e-6)

@@ -10,9 +10,10 @@ from small_runs import train_small
 
 from avatar.bench.render import STEPS, compare, inputs, measure, next_of
 from avatar.cli import main
+from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.render import Renderer
-from avatar.run import Run, load_run
+from avatar.runs.trained import TrainedAvatar
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
 
 
 def test_a_renderer_that_draws_another_picture_is_not_timed(trained: Path) -> None:
-    run = load_run(trained, say=lambda _: None)
+    run = open_trained(trained)
     frames = inputs(run, 32, count=2)
     background = torch.tensor(run.config.data.background)
     compare(run, Renderer(run.avatar, background), frames)
@@ -52,12 +53,13 @@ def test_a_renderer_that_draws_another_picture_is_not_timed(trained: Path) -> No
 
 
 def test_the_frames_are_held_out_and_of_the_size_that_is_asked_for(trained: Path) -> None:
-    run: Run = load_run(trained, say=lambda _: None)
+    run: TrainedAvatar = open_trained(trained)
     frames = inputs(run, 24, count=4)
     assert len(frames) == 4 and {camera.width for _, camera in frames} == {24}
-    first = run.subject.split.test[0]
-    assert torch.equal(frames[0][0].expression, run.subject.params(first).expression)
-    one_frame = replace(run, subject=replace(run.subject, manifest=replace(run.subject.manifest, test=(first,))))
+    first = run.recording.split.test[0]
+    assert torch.equal(frames[0][0].expression, run.recording.params(first).expression)
+    split = run.recording.split._replace(test=(first,))
+    one_frame = replace(run, recording=replace(run.recording, split=split))
     assert len(measure(one_frame, (16,), repeats=2)) == 1
 
 

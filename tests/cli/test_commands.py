@@ -21,8 +21,8 @@ import torch
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
-from avatar.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.cli import main
+from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 
 QUICK = [*SMALL, "trainer.iterations=16"]
 
@@ -74,7 +74,8 @@ def test_doctor_says_what_works() -> None:
 
 def test_what_training_was_made_from_is_recorded(trained: Path, tracked_folder: Path) -> None:
     info = json.loads((trained / "run.json").read_text())
-    assert info["folder"] == str(tracked_folder) and info["frame_offset"] == 1
+    assert info["source"]["folder"] == str(tracked_folder) and info["source"]["frame_offset"] == 1
+    assert info["perceptual"] == "dssim" and info["options"]["preset"] == "fast"
     assert info["config"]["data"]["size"] == 40 and info["config"]["trainer"]["seed"] == 3
     assert len(info["data_hash"]) == len(info["head_fingerprint"]) == 64
 
@@ -130,7 +131,7 @@ def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, dr
     video = tmp_path / "out.mp4"
     options = ("--strength", 0.5, "--smoothing", 1.5, "--intrinsics", "target", "--frame-offset", 1, "--out", video)
     avatar("reenact", trained, "--driver", driver, *options)
-    recorded = json.loads(video.with_suffix(".json").read_text())
+    recorded = json.loads((tmp_path / "out.choices.json").read_text())
     assert recorded["choices"] == {
         "transfer": "relative",
         "strength": 0.5,
@@ -140,7 +141,7 @@ def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, dr
     }
     assert recorded["driver"] == {"name": "driver", "frames": 8, "fps": 25.0, "has_cameras": True}
     assert recorded["intrinsics"]["shown"]["fx"] == recorded["intrinsics"]["avatar"]["fx"]
-    rows = list(csv.DictReader(video.with_suffix(".csv").open()))
+    rows = list(csv.DictReader((tmp_path / "out.distances.csv").open()))
     assert [row["name"] for row in rows] == [f"{i:05d}" for i in range(1, 9)]
     far = sum(float(row["distance"]) > 1.0 for row in rows)
     assert recorded["distance"]["frames_above_1"] == far
@@ -161,7 +162,7 @@ def test_a_drive_file_drives_like_the_folder_that_it_was_made_from(trained: Path
     a, b = from_file[:, 16:56], from_folder[:, 16:56, width:]
     # The encoder makes of the same pictures slightly different ones; other frames differ by far more.
     assert 2 * abs(a - b).mean() < abs(a - np.roll(b, 4, axis=0)).mean()
-    files = [video.with_suffix(".csv"), tmp_path / "folder.csv"]
+    files = [tmp_path / "file.distances.csv", tmp_path / "folder.distances.csv"]
     assert files[0].read_text() == files[1].read_text()
     assert "is written as .npz" in avatar("drive-file", driver, "--out", tmp_path / "x.csv", status=1)
 
@@ -171,7 +172,7 @@ def test_a_csv_without_cameras_shows_the_avatars_own(trained: Path, tmp_path: Pa
     file.write_text("time,expression_0,jaw_x,jaw_y,jaw_z\n0,0,0,0,0\n0.1,0.5,0.1,0,0\n0.2,1,0.2,0,0\n")
     output = avatar("reenact", trained, "--driver", file)
     assert "has 1 of 10 expression coefficients; the rest are zero" in output
-    recorded = json.loads((trained / "reenact" / "talk-relative.json").read_text())
+    recorded = json.loads((trained / "reenact" / "talk-relative.choices.json").read_text())
     assert recorded["driver"] == {"name": "talk", "frames": 3, "fps": pytest.approx(10.0), "has_cameras": False}
     assert recorded["intrinsics"]["shown"] == recorded["intrinsics"]["avatar"]
     assert len(iio.imread(trained / "reenact" / "talk-relative.mp4")) == 3
@@ -240,13 +241,18 @@ MISTAKES = {
     "bad size": (["train", "{data}", "--size", "3"], "data.size=3 is out of range"),
     "no iterations": (["train", "{data}", "--iterations", "0"], "trainer.iterations=0 is out of range"),
     "run exists": (["train", "{data}", "--out", "{run}"], "holds a run already: add --resume"),
-    "nothing to resume": (["train", "{data}", "--out", "{tmp}/new", "--resume"], "holds no checkpoint"),
+    "nothing to resume": (["train", "{data}", "--out", "{tmp}/new", "--resume"], "is not a run folder"),
     "resume with another key": (
         ["train", "{data}", "--out", "{run}", "--resume", "model.latent_dim=4"],
         "began with model.latent_dim=8, not 4",
     ),
-    "resume of other data": (["train", "{tmp}", "--out", "{run}", "--resume"], "choose another --out"),
+    "resume of other data": (
+        ["train", "{twin}", "--out", "{run}", "--resume"],
+        "the data of twin is not what {run} was trained on",
+    ),
     "eval of no run": (["eval", "{tmp}"], "is not a run folder: it has no run.json"),
+    "reenactment of no avatar": (["reenact", "{tmp}", "--driver", "{data}"], "is neither a run nor an avatar file"),
+    "reenactment of a missing avatar": (["reenact", "{tmp}/x", "--driver", "{data}"], "there is no avatar file"),
     "eval with another head": (["eval", "{run}", "--head", "{other}/head_model"], "trained with another head model"),
     "unknown protocol": (["eval", "{run}", "--protocol", "paper"], "paper"),
     "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody is not a folder"),
@@ -267,17 +273,24 @@ def other_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tracked_folder(tmp_path_factory.mktemp("other") / "other", frames=6, size=48, expressions=12)
 
 
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another video of the same head model."""
+    return write_tracked_folder(tmp_path_factory.mktemp("twin") / "twin", frames=30, size=48, seed=9)
+
+
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_gets_one_sentence_and_a_status(
     mistake: str,
     trained: Path,
     tracked_folder: Path,
     other_head: Path,
+    twin: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     arguments, sentence = MISTAKES[mistake]
-    places = {"tmp": tmp_path, "data": tracked_folder, "run": trained, "other": other_head}
+    places = {"tmp": tmp_path, "data": tracked_folder, "run": trained, "other": other_head, "twin": twin}
     monkeypatch.setattr("urllib.request.urlopen", _no_network)
     output = avatar(*(a.format(**places) for a in arguments), status=1)
     assert sentence.format(**places) in output
@@ -286,17 +299,30 @@ def test_a_mistake_gets_one_sentence_and_a_status(
 
 def test_a_run_without_a_checkpoint_is_not_evaluated(trained: Path, tmp_path: Path) -> None:
     run = fresh_copy(trained, tmp_path)
-    shutil.rmtree(run / "checkpoints")
-    assert "holds no checkpoint; train first" in avatar("eval", run, status=1)
+    (run / "avatar.safetensors").unlink()
+    assert "no checkpoint has been written yet" in avatar("eval", run, status=1)
 
 
-def test_a_damaged_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_named(trained: Path, tracked_folder: Path, tmp_path: Path) -> None:
     run = fresh_copy(trained, tmp_path)
     newest = list_checkpoints(run / "checkpoints")[-1]
     newest.write_bytes(newest.read_bytes()[:1000])
-    assert f"{newest.name} is damaged" in avatar("eval", run, status=1)
+    assert f"{newest.name} is damaged" in avatar("train", tracked_folder, "--out", run, "--resume", status=1)
     newest.unlink()
-    assert "hypergaussians" in avatar("eval", run)  # the one before is whole
+    output = avatar("train", tracked_folder, "--out", run, "--resume")  # the one before is whole
+    assert "Resuming" in output and "at step 12 of 16" in output
+
+
+def test_a_damaged_avatar_file_is_named_and_resuming_writes_it_again(
+    trained: Path, tracked_folder: Path, tmp_path: Path
+) -> None:
+    run = fresh_copy(trained, tmp_path)
+    file = run / "avatar.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:1000])
+    assert "avatar.safetensors is damaged" in avatar("eval", run, status=1)
+    assert "is complete (16 steps)" in avatar("train", tracked_folder, "--out", run, "--resume")
+    assert file.read_bytes() == whole
 
 
 def test_data_that_changed_since_training_is_noticed(tmp_path: Path) -> None:
@@ -305,7 +331,7 @@ def test_data_that_changed_since_training_is_noticed(tmp_path: Path) -> None:
     avatar("train", folder, "--out", run, "--frame-offset", 1, *SMALL, "trainer.iterations=2")
     image = folder / "imgs" / "00003.jpg"
     image.write_bytes((folder / "imgs" / "00004.jpg").read_bytes())
-    assert "data of someone has changed since" in avatar("eval", run, status=1)
+    assert "the data of someone is not what" in avatar("eval", run, status=1)
 
 
 def test_prepare_says_what_it_found(tracked_folder: Path, tmp_path: Path) -> None:

@@ -11,10 +11,11 @@ import torch
 from tracked_folder import write_tracked_folder
 
 from avatar.data.loader import FrameLoader, cache_estimate
+from avatar.data.source import Source
 from avatar.data.subject import FramePixels, Subject
-from avatar.data_prep.prepare import prepare
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
+from data_prep.prepare import prepare
 
 ORDER = [3, 0, 0, 7, 3, 11, 1, 2, 3, 0, 5, 11]
 FRAME_BYTES = 64 * 64 * 6
@@ -25,7 +26,7 @@ def subject(tmp_path: Path) -> Subject:
     folder = write_tracked_folder(tmp_path / "subject", frames=12)
     head_path = folder / "head_model"
     return Subject.open(
-        prepare(folder, load_head_assets(head_path), head_path, out=tmp_path / "out", frame_offset=1, say=str)
+        prepare(Source(folder, head_path, frame_offset=1), load_head_assets(head_path), out=tmp_path / "out", say=str)
     )
 
 

@@ -15,10 +15,11 @@ import torch
 from safetensors.torch import load_file, save_file
 from tracked_folder import write_tracked_folder
 
+from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.data_prep.prepare import prepare
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
+from data_prep.prepare import prepare
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("prepared")
     folder = write_tracked_folder(root / "subject", frames=10, size=64, height=48, suffix=".png")
     head_path = folder / "head_model"
-    return prepare(folder, load_head_assets(head_path), head_path, out=root / "out", frame_offset=1, say=str)
+    return prepare(Source(folder, head_path, frame_offset=1), load_head_assets(head_path), out=root / "out", say=str)
 
 
 @pytest.fixture
@@ -110,13 +111,16 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (f / "tracks.safetensors").write_bytes((f / "tracks.safetensors").read_bytes()[:-9]),
         r"tracks\.safetensors is damaged",
     ),
-    "tracks of another kind": (lambda f: edit_tracks(f, jaw=lambda _: None), r"tracks\.safetensors lacks jaw"),
+    "tracks of another kind": (
+        lambda f: edit_tracks(f, jaw=lambda _: None),
+        r"tracks\.safetensors is damaged \(it lacks jaw\)",
+    ),
     "tracks too short": (lambda f: edit_tracks(f, jaw=lambda t: t[:5]), r"N = "),
     "tracks of the wrong width": (lambda f: edit_tracks(f, eyes=lambda t: t[:, :6]), r"eyes must have shape \[N, 12\]"),
     "tracks not finite": (lambda f: edit_tracks(f, t=lambda t: t / 0), r"t has 30 non-finite of 30 values"),
     "fewer frames than tracks": (
         lambda f: edit_manifest(f, frames=lambda frames: frames[:9], train=[0], test=[1]),
-        r"tracks\.safetensors has 10 frames but the manifest has 9",
+        r"tracks\.safetensors is damaged \(it has 10 frames where 9 are listed\)",
     ),
 }
 

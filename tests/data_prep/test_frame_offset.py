@@ -13,12 +13,12 @@ import torch
 from tracked_folder import write_tracked_folder
 
 from avatar.data.images import read_mask
-from avatar.data_prep.frame_files import FrameFiles, find_frame_files
-from avatar.data_prep.frame_offset import OffsetEstimate, detect_offset
-from avatar.data_prep.metrical_tracker import FrameTrack, read_tracking
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
+from data_prep.frame_files import FrameFiles, find_frame_files
+from data_prep.frame_offset import OffsetEstimate, detect_offset
+from data_prep.metrical_tracker import FrameTrack, read_tracking
 
 Paths = Mapping[int, Path]
 

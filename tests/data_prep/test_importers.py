@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,13 +15,14 @@ import torch
 from exports import write_imavatar, write_insta, write_vhap
 from tracked_folder import write_tracked_folder
 
+from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
-from avatar.data_prep.prepare import prepare
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
+from data_prep.prepare import prepare
 
 FRAMES, SIZE, HEIGHT = 24, 64, 56
 PIXELS = 1e-3  # of the projected vertices; the parameters are float32
@@ -43,10 +45,12 @@ def original(tracked: Path, tmp_path_factory: pytest.TempPathFactory) -> Subject
     return import_folder(tracked, tracked, tmp_path_factory.mktemp("prepared") / "out")[0]
 
 
-def import_folder(folder: Path, tracked: Path, out: Path, **options) -> tuple[Subject, list[str]]:
+def import_folder(
+    folder: Path, tracked: Path, out: Path, split: SplitSizes | None = None, **options: Any
+) -> tuple[Subject, list[str]]:
     said: list[str] = []
     head = load_head_assets(tracked / "head_model")
-    prepared = prepare(folder, head, tracked / "head_model", out=out, say=said.append, **options)
+    prepared = prepare(Source(folder, tracked / "head_model", **options), head, out=out, split=split, say=said.append)
     return Subject.open(prepared), said
 
 
@@ -82,7 +86,7 @@ def test_vhap(tracked: Path, original: Subject, tmp_path: Path) -> None:
         in said
     )
     assert "note: there are no head masks: the foreground matte is taken as the head" in said
-    assert subject.manifest.frames[3].image == "images/00003_00.png" and not subject.tracks["eyelids"].any()
+    assert subject.manifest.frames[3].image == "images/00003_00.png" and not subject.recording.tracks["eyelids"].any()
 
 
 def test_vhap_with_one_listing_an_angle_of_view_and_no_masks(tracked: Path, original: Subject, tmp_path: Path) -> None:
@@ -100,7 +104,7 @@ def test_the_neck_is_kept(tracked: Path, tmp_path: Path) -> None:
     )
     subject, _ = import_folder(folder, tracked, tmp_path / "out")
     expected = torch.from_numpy(cv2.Rodrigues(np.array([0.1, 0, 0]))[0][:2].ravel()).float()
-    torch.testing.assert_close(subject.tracks["neck"], expected.expand(FRAMES, 6), atol=1e-6, rtol=0)
+    torch.testing.assert_close(subject.recording.tracks["neck"], expected.expand(FRAMES, 6), atol=1e-6, rtol=0)
 
 
 def test_the_frontal_one_of_several_cameras_is_used(tracked: Path, original: Subject, tmp_path: Path) -> None:
@@ -322,7 +326,7 @@ def test_more_coefficients_than_directions_are_an_error_unless_zero(tracked: Pat
     assert (
         "note: the tracking has 50 expression coefficients, the head model 10; the others are zero and left out" in said
     )
-    assert subject.tracks["expression"].shape == (FRAMES, 10)
+    assert subject.recording.tracks["expression"].shape == (FRAMES, 10)
     spoiled = write_vhap(tracked, tmp_path / "vhap", edit=lambda n, values: values["expr"].__setitem__((0, 50), 0.5))
     with pytest.raises(
         UserError, match="has 100 expression coefficients but the head model has 10 expression directions"

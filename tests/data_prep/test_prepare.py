@@ -6,6 +6,7 @@ import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,20 +16,24 @@ from tracked_folder import write_tracked_folder
 
 from avatar.data.images import read_mask
 from avatar.data.manifest import read_manifest
+from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
-from avatar.data_prep.prepare import prepare
-from avatar.data_prep.projection import filled_lips
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
+from data_prep.prepare import prepare
+from data_prep.projection import filled_lips
 
 
-def prepare_folder(folder: Path, out: Path, **options) -> tuple[Subject, list[str]]:
+def prepare_folder(
+    folder: Path, out: Path, split: SplitSizes | None = None, **options: Any
+) -> tuple[Subject, list[str]]:
     said: list[str] = []
     head_path = folder / "head_model"
-    prepared = prepare(folder, load_head_assets(head_path), head_path, out=out, say=said.append, **options)
+    source = Source(folder, head_path, **options)
+    prepared = prepare(source, load_head_assets(head_path), out=out, split=split, say=said.append)
     return Subject.open(prepared), said
 
 
@@ -141,7 +146,7 @@ def test_a_slightly_inexact_rotation_is_made_orthonormal(tmp_path: Path) -> None
     for file in (folder / "checkpoint").iterdir():
         edit(file, "opencv", R=torch.load(file, weights_only=False)["opencv"]["R"] * 1.004)
     subject, _ = prepare_folder(folder, tmp_path / "out")
-    R = subject.tracks["R"]
+    R = subject.recording.tracks["R"]
     torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-6, rtol=0)
 
 
@@ -239,9 +244,9 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     head_path = folder / "head_model"
     head = load_head_assets(head_path)
 
-    def run(**options) -> tuple[Path, str, bool]:
+    def run(split: SplitSizes | None = None) -> tuple[Path, str, bool]:
         said: list[str] = []
-        prepared = prepare(folder, head, head_path, say=said.append, **options)
+        prepared = prepare(Source(folder, head_path), head, split=split, say=said.append)
         assert prepared.is_relative_to(tmp_path / "cache" / "subjects")
         return prepared, read_manifest(prepared).data_hash, said == [f"using the prepared subject {prepared}"]
 
@@ -285,7 +290,7 @@ def test_several_at_once_all_succeed(offsets: tuple[int, int], tmp_path: Path) -
     head = load_head_assets(head_path)
 
     def run(offset: int) -> Path:
-        return prepare(folder, head, head_path, out=tmp_path / "out", frame_offset=offset, say=str)
+        return prepare(Source(folder, head_path, frame_offset=offset), head, out=tmp_path / "out", say=str)
 
     with ThreadPoolExecutor(max_workers=4) as pool:
         assert list(pool.map(run, offsets * 6)) == [tmp_path / "out"] * 12
@@ -307,9 +312,8 @@ def test_the_data_hash_does_not_depend_on_the_place(tmp_path: Path) -> None:
 def test_development_subjects(name: str, count: int, shared_dir: Path, tmp_path: Path) -> None:
     said: list[str] = []
     head_path = shared_dir / "subjects" / "head_model"
-    prepared = prepare(
-        shared_dir / "subjects" / name, load_head_assets(head_path), head_path, out=tmp_path / "out", say=said.append
-    )
+    source = Source(shared_dir / "subjects" / name, head_path)
+    prepared = prepare(source, load_head_assets(head_path), out=tmp_path / "out", say=said.append)
     subject = Subject.open(prepared)
     assert len(subject) == count and subject.manifest.frame_offset == 1
     assert len(subject.split.test) == count // 5 and subject.manifest.notes == ()

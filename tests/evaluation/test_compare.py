@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from avatar.errors import UserError
-from avatar.evaluation.compare import compare
+from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import as_csv, latex, markdown, text, write_tables
 
 FRAMES = [f"{number:05d}" for number in range(40)]
@@ -53,7 +53,7 @@ def smooth(seed: int) -> np.ndarray:
 def test_paired_differences_are_clear_where_the_means_overlap(tmp_path: Path) -> None:
     """A quarter of a decibel under frames that differ by six."""
     a, b = write_run(tmp_path / "a", {"psnr": smooth(1)}), write_run(tmp_path / "b", {"psnr": smooth(2) + 0.25})
-    comparison = compare([a, b])
+    comparison = compare_runs([a, b])
     (each,) = comparison.protocols
     first, second = each.rows["psnr"]
     assert (each.frames, each.block) == (40, 10) and comparison.labels == ["a", "b"]
@@ -62,7 +62,7 @@ def test_paired_differences_are_clear_where_the_means_overlap(tmp_path: Path) ->
     assert second.interval is not None
     low, high = second.interval
     assert 0.1 < low < second.difference < high < 0.4 and second.is_clear
-    (twin,) = compare([a, write_run(tmp_path / "c", {"psnr": smooth(1)})]).protocols
+    (twin,) = compare_runs([a, write_run(tmp_path / "c", {"psnr": smooth(1)})]).protocols
     assert twin.rows["psnr"][1][1:] == (0.0, (0.0, 0.0)) and not twin.rows["psnr"][1].is_clear
 
 
@@ -71,7 +71,7 @@ def test_only_frames_that_all_runs_have_count(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a", {"psnr": values})
     b = write_run(tmp_path / "b", {"psnr": values[10:] + 1.0}, FRAMES[10:])
     c = write_run(tmp_path / "c", {"psnr": values[:30] + 2.0}, FRAMES[:30])
-    comparison = compare([a, b, c])
+    comparison = compare_runs([a, b, c])
     (each,) = comparison.protocols
     assert each.frames == 20 and each.block == 5
     assert [cell.mean for cell in each.rows["psnr"]] == pytest.approx(values[10:30].mean() + np.arange(3), abs=1e-6)
@@ -80,7 +80,7 @@ def test_only_frames_that_all_runs_have_count(tmp_path: Path) -> None:
     with pytest.raises(
         UserError, match="b and d cannot be compared: strict was measured on frames of which none is in"
     ):
-        compare([b, d])
+        compare_runs([b, d])
 
 
 def test_frames_without_a_figure_in_one_run_count_in_none(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_frames_without_a_figure_in_one_run_count_in_none(tmp_path: Path) -> Non
     never = np.full(40, np.nan)
     a = write_run(tmp_path / "a", {"psnr": values, "lpips": never})
     b = write_run(tmp_path / "b", {"psnr": holes, "lpips": never})
-    comparison = compare([a, b])
+    comparison = compare_runs([a, b])
     (each,) = comparison.protocols
     assert each.rows["psnr"][0].mean == pytest.approx(np.delete(values, (3, 5)).mean(), abs=1e-6)
     assert each.rows["psnr"][1].difference == 0.0
@@ -114,37 +114,37 @@ def test_what_cannot_be_compared_is_refused_with_a_sentence(
     a = write_run(tmp_path / "a", {"psnr": smooth(1)})
     b = write_run(tmp_path / "b", {"psnr": smooth(2)}, **changes)
     with pytest.raises(UserError) as caught:
-        compare([a, b])
+        compare_runs([a, b])
     assert sentence in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_damaged_and_missing_results_are_named(tmp_path: Path) -> None:
     a, b = (write_run(tmp_path / name, {"psnr": smooth(1)}) for name in "ab")
     with pytest.raises(UserError, match="give at least two runs"):
-        compare([a])
+        compare_runs([a])
     with pytest.raises(UserError, match=r"none was not evaluated .*: run avatar eval .*none first"):
-        compare([a, tmp_path / "none"])
+        compare_runs([a, tmp_path / "none"])
     with pytest.raises(UserError, match="insta350 was not measured for a, b"):
-        compare([a, b], ["insta350"])
+        compare_runs([a, b], ["insta350"])
     with (b / "eval" / "strict" / "frames.csv").open("a") as file:
         file.write("0,00000,99.0,0.0\n")
     with pytest.raises(UserError, match=r"frames\.csv is not the file that results\.json was written with"):
-        compare([a, b])
+        compare_runs([a, b])
     (b / "eval" / "results.json").write_text('{"format": 2}')
     with pytest.raises(
         UserError, match=r"results\.json is damaged \(data_hash, head_fingerprint, image_size, protocols"
     ):
-        compare([a, b])
+        compare_runs([a, b])
     (b / "eval" / "results.json").write_text("{")
     with pytest.raises(UserError, match=r"results\.json cannot be read"):
-        compare([a, b])
+        compare_runs([a, b])
 
 
 def test_lpips_of_different_networks_is_not_compared(tmp_path: Path) -> None:
     figures = {"psnr": smooth(1), "lpips": smooth(2), "lpips_head": smooth(3)}
     a = write_run(tmp_path / "a", figures, network="11")
     b = write_run(tmp_path / "b", figures, network="22")
-    comparison = compare([a, b])
+    comparison = compare_runs([a, b])
     assert list(comparison.protocols[0].rows) == ["psnr"]
     assert comparison.notes == ["strict: LPIPS is left out, because the runs were measured with different networks"]
 
@@ -156,7 +156,7 @@ def test_tables(tmp_path: Path) -> None:
     b = write_run(
         tmp_path / "b|2", {"psnr": np.full(40, 31.5), "ssim_head": np.full(40, 0.9), "jitter": np.full(40, 1.5)}
     )
-    comparison = compare([a, b])
+    comparison = compare_runs([a, b])
     caption = "strict: 40 frames, differences to {} with 95% intervals (blocks of 10 frames)"
     legend = "*: the interval leaves out 0. Higher is better for PSNR and SSIM, lower for LPIPS and jitter."
     lines = text(comparison).splitlines()

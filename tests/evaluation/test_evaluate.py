@@ -24,8 +24,8 @@ from avatar.evaluation import evaluate as evaluate_module
 from avatar.evaluation import measure as measure_module
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import MEASURES, builtin_protocols, choose_protocols
-from avatar.lpips import lpips_folder, save_lpips
-from avatar.lpips_network import Lpips
+from avatar.losses.lpips import lpips_folder, save_lpips
+from avatar.losses.lpips_network import Lpips
 from avatar.splat import splat
 from avatar.types import Camera, Frame, Gaussians, HeadParams, Rendering
 

@@ -13,7 +13,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from avatar.evaluation.measure import LPIPS_CROP, Figures, FrameMeasurer, Pair, as_seen, lpips_crop, to_8_bit
 from avatar.evaluation.protocol import Look, Protocol, choose_protocols
-from avatar.lpips_network import Lpips
+from avatar.losses.lpips_network import Lpips
 
 PROTOCOLS = {protocol.name: protocol for protocol in choose_protocols(None)}
 SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255, "channel_axis": 2}

@@ -21,22 +21,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_runs import run_info
 from tracked_folder import write_tracked_folder
 
-from avatar.checkpoint import (
+from avatar.data.source import Source
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.files.video import write_video
+from avatar.head.assets import load_head_assets
+from avatar.runs.checkpoint import (
     Checkpoint,
     load_checkpoint,
     newest_checkpoint,
-    read_run_info,
     save_checkpoint,
-    write_atomically,
-    write_run_info,
 )
-from avatar.data.subject import Subject
-from avatar.data_prep.prepare import prepare
-from avatar.errors import UserError
-from avatar.head.assets import load_head_assets
-from avatar.video import write_video
+from avatar.runs.run import read_run_info, write_run_info
+from data_prep.prepare import prepare
 
 DONE, REFUSED, KILLED, BROKEN = 0, 3, 9, 4
 STEPS = (
@@ -140,10 +141,10 @@ def test_checkpoints(fault: int | None, tmp_path: Path) -> None:
 
 @FAULTS
 def test_run_json(fault: int | None, tmp_path: Path) -> None:
-    write_run_info(tmp_path, {"name": "old"})
-    work = lambda: write_run_info(tmp_path, {"name": "new"})  # noqa: E731
-    assert stop_at_every_step(work, fault, lambda: read_run_info(tmp_path)["name"] in ("old", "new") or 1 / 0) >= 2
-    write_run_info(tmp_path, {"name": "newest"})
+    write_run_info(tmp_path, run_info("old"))
+    work = lambda: write_run_info(tmp_path, run_info("new"))  # noqa: E731
+    assert stop_at_every_step(work, fault, lambda: read_run_info(tmp_path).perceptual in ("old", "new") or 1 / 0) >= 2
+    write_run_info(tmp_path, run_info("newest"))
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"], "what a killed writer left is written over"
 
 
@@ -164,7 +165,8 @@ def test_prepared_subjects(fault: int | None, tmp_path: Path) -> None:
     target = tmp_path / "out" / "prepared"
 
     def work(offset: int = 1) -> None:
-        prepare(folder, head, folder / "head_model", frame_offset=offset, out=target, say=lambda _: None)
+        source = Source(folder, folder / "head_model", frame_offset=offset)
+        prepare(source, head, out=target, say=lambda _: None)
 
     work(0)
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from valid_calls import BINDINGS, Arguments, Shapes
 
 from avatar import _core
-from avatar.check import check_shapes
+from avatar.tensors import check_shapes
 
 OPTIONAL = {"counts", "solved", "grad_latents", "grad_image", "grad_alpha", "gradient"}
 EVIL = [None, "text", b"", object(), [], {}, 1.5, math.nan, -1, 0, 2**31, 2**70]

@@ -7,7 +7,7 @@ import pickle
 import shutil
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,23 +15,26 @@ import numpy as np
 import torch
 from exports import write_imavatar, write_insta, write_vhap
 from scipy import sparse
+from small_runs import run_info
 from tracked_folder import write_tracked_folder
 
-from avatar.checkpoint import Checkpoint, load_checkpoint, read_run_info, save_checkpoint, write_run_info
 from avatar.config import load_config
 from avatar.data.images import decode_image, decode_mask
+from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.data_prep.formats import open_tracked_folder
-from avatar.data_prep.metrical_tracker import read_tracking
-from avatar.data_prep.prepare import prepare
-from avatar.data_prep.safe_pickle import load_npz, load_pickle, load_torch_pickle
-from avatar.drive import subject_drive
-from avatar.drive_file import read_drive, write_drive
 from avatar.errors import refuse
 from avatar.evaluation.protocol import read_protocol
+from avatar.files.pickles import load_npz, load_pickle, load_torch_pickle
 from avatar.head.assets import load_head_assets
 from avatar.head.expression_names import ExpressionNames
 from avatar.head.uv_obj import read_uv_obj
+from avatar.motion.drive import subject_drive
+from avatar.motion.drive_file import read_drive, write_drive
+from avatar.runs.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from avatar.runs.run import read_run_info, write_run_info
+from data_prep.formats import open_tracked_folder
+from data_prep.metrical_tracker import read_tracking
+from data_prep.prepare import prepare
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
 
@@ -64,9 +67,8 @@ def make_targets(place: Path) -> dict[str, Target]:
     """`place` is an empty folder for the files that readers open."""
     tracked = write_tracked_folder(place / "tracked", 6, 24)
     head = load_head_assets(tracked / "head_model")
-    prepared = prepare(
-        tracked, head, tracked / "head_model", frame_offset=1, out=place / "prepared", say=lambda _: None
-    )
+    source = Source(tracked, tracked / "head_model", frame_offset=1)
+    prepared = prepare(source, head, out=place / "prepared", say=lambda _: None)
     folders = {
         "vhap": write_vhap(tracked, place / "vhap", divided=False) / "transforms.json",
         "insta": write_insta(tracked, place / "insta") / "transforms_train.json",
@@ -75,7 +77,7 @@ def make_targets(place: Path) -> dict[str, Target]:
     frame = (tracked / "checkpoint" / "00003.frame").read_bytes()
     tensors = {"model.weight": torch.arange(6.0).reshape(2, 3), "optimizer.step": torch.ones(())}
     checkpoint = save_checkpoint(place / "run" / "checkpoints", Checkpoint(7, tensors, {"data_hash": "ab"}), 1)
-    write_run_info(place / "run", {"folder": "x", "head": "y", "tracking": None, "frame_offset": None, "config": {}})
+    write_run_info(place / "run", run_info("dssim"))
     picture = cv2.imread(str(tracked / "imgs" / "00002.jpg"))
     assert picture is not None
 
@@ -126,12 +128,12 @@ def make_targets(place: Path) -> dict[str, Target]:
     def in_frame(data: bytes) -> bytes:
         return _with_member(frame, "data.pkl", data)
 
-    expressions = ExpressionNames(("smile_left", "smile_right"))
+    named = replace(head, names=ExpressionNames(("smile_left", "smile_right")))
     write_drive(place / "drive.npz", subject_drive(Subject.open(prepared), None), head.fingerprint)
     drive = (place / "drive.npz").read_bytes()
 
     def driven(name: str) -> Reader:
-        return on_disk(place / name, lambda path: read_drive(path, head, expressions, 24, say=lambda _: None))
+        return on_disk(place / name, lambda path: read_drive(path, named, 24, say=lambda _: None))
 
     def in_drive(data: bytes) -> bytes:
         return _with_member(drive, "R.npy", data)

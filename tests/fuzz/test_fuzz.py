@@ -26,8 +26,8 @@ from targets import Target, make_targets
 from watch import Forbidden, memory_cap, watched
 
 from avatar.data.images import MAX_PIXELS, decode_image, decode_mask
-from avatar.data_prep.safe_pickle import load_npy, load_npz, load_pickle
 from avatar.errors import UserError
+from avatar.files.pickles import load_npy, load_npz, load_pickle
 
 CASES = int(os.environ.get("AVATAR_FUZZ_CASES", "600"))
 SECONDS = 5.0  # for one file of a few kilobytes, on a busy machine

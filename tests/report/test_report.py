@@ -13,10 +13,10 @@ from small_runs import train_small
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
+from avatar.commands.opening import open_run
 from avatar.errors import UserError
 from avatar.report.page import bins_tables, means_table, read_curves, read_results
 from avatar.report.pictures import uncertainty_map
-from avatar.run import load_run
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 MOVE_SLIDER = """
@@ -61,7 +61,7 @@ def test_curves_are_those_that_training_recorded(run: Path) -> None:
 
 
 def test_uncertainty_is_grey_before_training_and_lies_where_the_gaussians_are(run: Path) -> None:
-    opened = load_run(run)
+    opened = open_run(run)
     assert opened.avatar.hyper is not None
     opened.avatar.hyper.packed.data.zero_()
     image = uncertainty_map(opened)

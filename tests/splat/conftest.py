@@ -16,9 +16,9 @@ def _wide_steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     if not interpreted():
         yield
         return
-    from avatar.splat import gpu
+    from avatar.splat import gpu_draw
 
-    wide = gpu.Tuning(tile=16, step=32, backward_step=32, lanes=1024, backward_lanes=1024)
-    monkeypatch.setattr(gpu, "TUNING", wide)
+    wide = gpu_draw.Tuning(tile=16, step=32, backward_step=32, lanes=1024, backward_lanes=1024)
+    monkeypatch.setattr(gpu_draw, "TUNING", wide)
     with np.errstate(all="ignore"):  # lanes that are masked out later may overflow
         yield

@@ -9,10 +9,10 @@ import pytest
 import torch
 from small_runs import new_avatar, open_small, small_config, train_small
 
-from avatar.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.errors import UserError
-from avatar.losses import dssim
-from avatar.metrics import psnr
+from avatar.losses.metrics import psnr
+from avatar.losses.photometric import dssim
+from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import PerceptualTerm, Weighted, choose_perceptual
@@ -33,6 +33,7 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
     assert done == 240
     assert sum(scores[-20:]) / 20 > sum(scores[:20]) / 20 + 3.0
     assert [p.name for p in sorted((tmp_path / "run").iterdir())] == [
+        "avatar.safetensors",
         "checkpoints",
         "previews",
         "run.json",
@@ -145,7 +146,7 @@ def test_a_gradient_that_is_not_finite_stops_and_leaves_the_last_checkpoint(
 
     avatar.opacity_logits.register_hook(poison)
     with pytest.raises(UserError) as caught:
-        train(avatar, subject, config, tmp_path / "run", say=lambda _: None)
+        train(avatar, subject, config, tmp_path / "run", PerceptualTerm("none"))
     message = str(caught.value)
     assert "stopped at step 7, frame " in message
     assert "the gradient of opacity_logits has 1 non-finite of" in message and "the first at [3] (nan)" in message

@@ -1,0 +1,30 @@
+"""What each command does, on top of the library. A command's module is imported when it is called, and not before."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from importlib import import_module
+
+OK, INTERRUPTED = 0, 130
+
+MODULES = {
+    "train": "training",
+    "eval": "measuring",
+    "report": "measuring",
+    "compare": "measuring",
+    "reenact": "driving",
+    "drive-file": "driving",
+    "export": "exporting",
+    "prepare": "preparing",
+    "check": "preparing",
+    "demo-data": "demonstrating",
+    "demo": "demonstrating",
+    "bench": "benchmarking",
+    "doctor": "diagnosing",
+}
+
+
+def run_command(arguments: Namespace) -> int:
+    """The exit status of `arguments.command`."""
+    module = import_module(f"{__name__}.{MODULES[arguments.command]}")
+    return getattr(module, f"run_{arguments.command.replace('-', '_')}")(arguments)

@@ -1,0 +1,47 @@
+"""avatar reenact and drive-file: motion onto an avatar, and motion as a file."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from avatar.commands import OK
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, open_trained, source_of
+from avatar.commands.outputs import check_outputs
+from avatar.errors import UserError
+from avatar.motion.drive import subject_drive
+from avatar.motion.drive_file import write_drive
+from avatar.motion.reenact import Choices, reenact, sidecars
+from avatar.runs.run import RUN_FILE
+from data_prep.open import open_subject
+
+
+def run_reenact(arguments: Namespace) -> int:
+    trained = open_trained(arguments.run, arguments.head)
+    choices = Choices(
+        arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
+    )
+    driver: Path = arguments.driver
+    out = arguments.out or default_video(arguments.run, driver, choices)
+    check_outputs([out, *sidecars(out)], [driver, arguments.run, arguments.head, trained.source])
+    if driver.suffix.lower() in DRIVE_SUFFIXES:
+        reenact(trained, open_drive_file(driver, trained), out, choices)
+    else:
+        reenact(trained, open_driver(driver, trained, arguments), out, choices)
+    return OK
+
+
+def default_video(avatar: Path, driver: Path, choices: Choices) -> Path:
+    """RUN/reenact/DRIVER-TRANSFER.mp4; reenact/... in the current folder for an avatar that is a file alone."""
+    folder = avatar if (avatar / RUN_FILE).is_file() else Path()
+    return folder / "reenact" / f"{driver.resolve().stem}-{choices.transfer}.mp4"
+
+
+def run_drive_file(arguments: Namespace) -> int:
+    if arguments.out.suffix.lower() != ".npz":
+        raise UserError(f"a drive file is written as .npz, not as {arguments.out}")
+    check_outputs([arguments.out], [arguments.folder, arguments.head])
+    subject, assets = open_subject(source_of(arguments))
+    write_drive(arguments.out, subject_drive(subject, None), assets.fingerprint)
+    print(f"{len(subject)} frames written to {arguments.out}")
+    return OK

@@ -1,0 +1,38 @@
+"""avatar eval, report and compare: figures of trained avatars."""
+
+from __future__ import annotations
+
+import sys
+from argparse import Namespace
+
+from avatar.commands import OK
+from avatar.commands.opening import open_run
+from avatar.commands.outputs import check_outputs
+from avatar.evaluation.compare import compare_runs
+from avatar.evaluation.compare_tables import FORMATS, write_tables
+from avatar.evaluation.evaluate import evaluate
+
+
+def run_eval(arguments: Namespace) -> int:
+    run = open_run(arguments.run, arguments.head, arguments.folder)
+    evaluate(run, arguments.protocol, write_frames=arguments.frames)
+    return OK
+
+
+def run_report(arguments: Namespace) -> int:
+    from avatar.report.page import write_report  # imports matplotlib and tensorboard, which take a second
+
+    print(f"Report {write_report(open_run(arguments.run, arguments.head, arguments.folder))}")
+    return OK
+
+
+def run_compare(arguments: Namespace) -> int:
+    if arguments.out is not None:
+        check_outputs([arguments.out], [])
+    comparison = compare_runs(arguments.runs, arguments.protocol)
+    if arguments.out is not None:
+        write_tables(arguments.out, comparison)
+        print(f"Written to {arguments.out}", file=sys.stderr)  # the table may be piped
+    _, table = FORMATS[arguments.format]
+    print(table(comparison), end="")
+    return OK

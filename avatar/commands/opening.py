@@ -1,0 +1,109 @@
+"""Runs, avatars, subjects and drivers, as commands name them."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from avatar.config import Config
+from avatar.data.source import Source
+from avatar.data.split import SplitSizes
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.motion.drive import Drive
+from avatar.motion.drive_file import read_drive
+from avatar.runs.run import RUN_FILE, Run, RunInfo, read_run_info
+from avatar.runs.trained import TrainedAvatar, load_avatar
+from data_prep.open import check_folder, find_head, open_subject
+
+DRIVE_SUFFIXES = (".npz", ".csv")
+
+
+def source_of(arguments: Namespace) -> Source:
+    """What the options of `add_source` say."""
+    return Source(
+        folder=arguments.folder,
+        head=find_head(arguments.folder, arguments.head),
+        tracking=arguments.tracking,
+        frame_offset=arguments.frame_offset,
+        format=arguments.format,
+        fps=arguments.fps,
+        max_left_out=Source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
+        ignore_misfit=arguments.ignore_misfit,
+    )
+
+
+def split_sizes(config: Config) -> SplitSizes:
+    return SplitSizes(config.data.train_frames, config.data.test_frames)
+
+
+def open_trained(path: Path, head: Path | None = None) -> TrainedAvatar:
+    """An avatar from a run or a file; a run knows where its head model was."""
+    recorded = read_run_info(path).source.head if (path / RUN_FILE).is_file() else None
+    return load_avatar(path, head, recorded_head=recorded)
+
+
+def open_run(
+    path: Path, head: Path | None = None, folder: Path | None = None, say: Callable[[str], None] = print
+) -> Run:
+    """A run with its video; `folder` is where the video is now, if it has moved. Raises UserError when it has changed."""
+    info = read_run_info(path)
+    trained = open_trained(path, head)
+    source = moved_source(path, info, head, folder)
+    subject, _ = open_subject(source, split_sizes(trained.config), say, trained.assets)
+    check_data(path, info, subject)
+    return Run(path, trained, subject)
+
+
+def moved_source(path: Path, info: RunInfo, head: Path | None, folder: Path | None) -> Source:
+    """The run's source, with what has moved at its new place."""
+    source = info.source
+    if folder is not None:
+        check_folder(folder)
+        source = replace(source, folder=folder, tracking=_moved(source.tracking, source.folder, folder))
+    elif not source.folder.is_dir():
+        raise UserError(f"{source.folder}, on which {path} was trained, is gone: give its new place with --folder")
+    return source if head is None else replace(source, head=head)
+
+
+def _moved(path: Path | None, old: Path, new: Path) -> Path | None:
+    """A path inside the old folder, inside the new one."""
+    return new / path.relative_to(old) if path is not None and path.is_relative_to(old) else path
+
+
+def check_data(path: Path, info: RunInfo, subject: Subject) -> None:
+    if subject.data_hash != info.data_hash:
+        raise UserError(
+            f"the data of {subject.name} is not what {path} was trained on: it has changed, or is another video; restore "
+            "it, or train again"
+        )
+
+
+def open_driver(folder: Path, trained: TrainedAvatar, arguments: Namespace | None = None) -> Subject:
+    """A tracked folder as driver: with its own head model where it has one, so that another one is noticed."""
+    check_folder(folder)
+    own = folder / "head_model"
+    options = {} if arguments is None else driver_options(arguments)
+    if not own.is_dir() or (arguments is not None and arguments.head is not None):
+        return open_subject(Source(folder, trained.source, **options), None, print, trained.assets)[0]
+    return open_subject(Source(folder, own, **options), None, print)[0]
+
+
+def driver_options(arguments: Namespace) -> dict[str, Any]:
+    """The options of `add_driver` as fields of a Source."""
+    options = {
+        "tracking": arguments.driver_tracking,
+        "frame_offset": arguments.frame_offset,
+        "format": arguments.format,
+        "fps": arguments.fps,
+        "ignore_misfit": arguments.ignore_misfit,
+    }
+    left_out = arguments.max_left_out
+    return options if left_out is None else {**options, "max_left_out": left_out}
+
+
+def open_drive_file(path: Path, trained: TrainedAvatar) -> Drive:
+    return read_drive(path, trained.assets, trained.recording.image_size(trained.config.data.size)[0])

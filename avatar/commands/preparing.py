@@ -1,0 +1,61 @@
+"""avatar prepare and check: what a tracked folder holds."""
+
+from __future__ import annotations
+
+import json
+import sys
+from argparse import Namespace
+
+from tqdm import tqdm
+
+from avatar.commands import OK
+from avatar.commands.opening import source_of
+from avatar.commands.outputs import check_outputs
+from avatar.config import load_config
+from avatar.data.subject import Subject
+from avatar.head.assets import load_head_assets
+from avatar.train.cost import measure_cost
+from data_prep.check.folder import as_text, check_tracked_folder
+from data_prep.check.frame import first_training_frame
+from data_prep.open import find_head
+from data_prep.prepare import prepare
+
+
+def run_prepare(arguments: Namespace) -> int:
+    source = source_of(arguments)
+    if arguments.out is not None:
+        check_outputs([arguments.out], [source.folder, source.head])
+    prepared = prepare(source, load_head_assets(source.head), out=arguments.out)
+    subject = Subject.open(prepared)
+    print(
+        f"{subject.name}: {len(subject)} frames of {subject.width}x{subject.height}, "
+        f"{len(subject.split.train)} to train, {len(subject.split.test)} to test"
+    )
+    print(f"Prepared in {prepared}")
+    return OK
+
+
+def run_check(arguments: Namespace) -> int:
+    """Exit status 0: fine, 1: warnings, 2: errors."""
+    if arguments.out is not None:
+        check_outputs([arguments.out], [arguments.folder, arguments.head])
+    outcome = check_tracked_folder(
+        arguments.folder,
+        lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
+        tracking=arguments.tracking,
+        frame_offset=arguments.frame_offset,
+        format=arguments.format,
+        progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False),
+    )
+    print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))
+    if arguments.out is not None:
+        from data_prep.check.page import write_page  # imports matplotlib, which takes half a second
+
+        cost = None
+        if outcome.clip is not None and outcome.clip.head is not None and outcome.coverage is not None:
+            frame, identity = first_training_frame(outcome.clip, outcome.coverage)
+            frames = len(outcome.coverage.images)
+            cost = measure_cost(frame, outcome.clip.head.assets, identity, frames, load_config())
+        page = write_page(outcome, None if cost is None else cost.facts(), arguments.out)
+        print(f"Page   {page}", file=sys.stderr if arguments.json else sys.stdout)
+    return outcome.status

@@ -1,0 +1,157 @@
+"""avatar train: a tracked folder in, a run out; and going on with one."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from avatar.commands import INTERRUPTED, OK
+from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
+from avatar.config import Config, chosen_options, flatten, load_config
+from avatar.data.source import Source
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.head.assets import HeadAssets
+from avatar.model import Avatar
+from avatar.runs.avatar_file import check_head
+from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
+from avatar.runs.lock import locked
+from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
+from avatar.train.step import PerceptualTerm, choose_perceptual
+from avatar.train.trainer import leave_avatar, train
+from data_prep.open import open_subject
+
+
+def run_train(arguments: Namespace) -> int:
+    run = arguments.out or default_run(arguments.folder)
+    overrides = config_overrides(arguments)
+    if arguments.resume:
+        refuse_changes(run, read_run_info(run), arguments, overrides)
+        return resume_run(run, arguments.head, arguments.folder)
+    load_config(overrides)  # a mistake in it before one in the folder
+    return train_new(source_of(arguments), overrides, run)
+
+
+def default_run(folder: Path | None) -> Path:
+    if folder is None:
+        raise UserError("say which run to go on with: avatar train --resume --out RUN")
+    return Path("runs") / folder.resolve().name
+
+
+def train_new(source: Source, overrides: list[str], run: Path) -> int:
+    config = load_config(overrides)
+    with locked(run):
+        refuse_trained(run)
+        subject, assets = open_subject(source, split_sizes(config))
+        perceptual = choose_perceptual(config.trainer, print)
+        torch.manual_seed(config.trainer.seed)
+        avatar = Avatar(assets, subject.identity, config.model)
+        start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
+        return finish_training(avatar, subject, config, run, perceptual)
+
+
+def resume_run(run: Path, head: Path | None = None, folder: Path | None = None) -> int:
+    """Go on from the newest checkpoint, with the decisions that the run began with."""
+    with locked(run):
+        info, checkpoint = read_run_info(run), newest_checkpoint(run)
+        source = moved_source(run, info, head, folder)
+        subject, assets = open_subject(source, split_sizes(info.config))
+        check_head(info.head_fingerprint, assets, run)
+        check_data(run, info, subject)
+        return go_on(run, info, checkpoint, subject, assets)
+
+
+def go_on(run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets) -> int:
+    config = info.config
+    if checkpoint.meta.get("threads") != torch.get_num_threads():
+        print(
+            f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
+            f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
+        )
+    avatar = Avatar(assets, subject.identity, config.model)
+    if checkpoint.step >= config.trainer.iterations:
+        leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
+        print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
+        return OK
+    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual)
+    print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
+    return finish_training(avatar, subject, config, run, perceptual, checkpoint)
+
+
+def finish_training(
+    avatar: Avatar,
+    subject: Subject,
+    config: Config,
+    run: Path,
+    perceptual: PerceptualTerm,
+    checkpoint: Checkpoint | None = None,
+) -> int:
+    split = subject.split
+    print(
+        f"Training {len(avatar):,} Gaussians ({config.model.name}) on {len(split.train)} frames of {subject.name}, "
+        f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
+    )
+    begin = time.monotonic()
+    done = train(avatar, subject, config, run, perceptual, resume=checkpoint)
+    first = checkpoint.step if checkpoint else 0
+    seconds = time.monotonic() - begin
+    rate = f"{seconds / max(done - first, 1):.3f} s per step"
+    if done < config.trainer.iterations:
+        print(f"\nInterrupted at step {done} ({rate}); everything up to there is saved in {run}.")
+        print("Add --resume to the same command to go on.")
+        return INTERRUPTED
+    print(f"Trained in {seconds:.0f} s ({rate}).")
+    print(f"Avatar       {run / 'avatar.safetensors'}")
+    print(f"Previews     {run / 'previews'}")
+    print(f"Curves       tensorboard --logdir {run / 'tensorboard'}")
+    print(f"Next         avatar eval {run}")
+    return OK
+
+
+def config_overrides(arguments: Namespace) -> list[str]:
+    """The options that are short forms of configuration keys, before the overrides, so that those win."""
+    short = {"data.size": arguments.size, "trainer.iterations": arguments.iterations, "trainer.seed": arguments.seed}
+    groups = [o for o in arguments.overrides if "." not in o.partition("=")[0]]
+    keys = [o for o in arguments.overrides if o not in groups]
+    return [*groups, *(f"{key}={value}" for key, value in short.items() if value is not None), *keys]
+
+
+def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: list[str]) -> None:
+    """A resumed run keeps its decisions; naming another value for one is an error, not a silent choice."""
+    if overrides:
+        recorded = {**flatten(info.config.to_dict()), **info.options}
+        asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
+        for key in (override.partition("=")[0] for override in overrides):
+            if recorded[key] != asked[key]:
+                raise UserError(
+                    f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
+                    "start a new run"
+                )
+    source = info.source
+    given = replace(
+        source,
+        tracking=source.tracking if arguments.tracking is None else arguments.tracking.resolve(),
+        frame_offset=source.frame_offset if arguments.frame_offset is None else arguments.frame_offset,
+        format=arguments.format or source.format,
+        fps=source.fps if arguments.fps is None else arguments.fps,
+        max_left_out=source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
+        ignore_misfit=source.ignore_misfit or arguments.ignore_misfit,
+    )
+    for field, option in (
+        ("tracking", "--tracking"),
+        ("frame_offset", "--frame-offset"),
+        ("format", "--format"),
+        ("fps", "--fps"),
+        ("max_left_out", "--max-left-out"),
+        ("ignore_misfit", "--ignore-misfit"),
+    ):
+        was, now = getattr(source, field), getattr(given, field)
+        if was != now:
+            raise UserError(
+                f"{run} began {f'with {option} {was}' if was not in (None, False) else f'without {option}'}, not with "
+                f"{option} {now}: leave it out to resume, or start a new run"
+            )

@@ -1,0 +1,52 @@
+"""What a person says about a tracked folder: where it is, and what is known about it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avatar.errors import UserError
+
+DEFAULT_LEFT_OUT = 0.05  # of the frames: if more cannot be used, something is wrong with the whole, not with a frame
+
+
+@dataclass(frozen=True)
+class Source:
+    """A tracked folder with its head model; None leaves a choice to the folder."""
+
+    folder: Path
+    head: Path
+    tracking: Path | None = None  # folder of the .frame files, where it is another one
+    frame_offset: int | None = None  # image number minus tracking number
+    format: str | None = None  # one of data_prep.formats.FORMATS
+    fps: float | None = None  # of the video
+    max_left_out: float = DEFAULT_LEFT_OUT  # share of the frames that may be unusable
+    ignore_misfit: bool = False  # go on where the projected head does not lie on the masks
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file: absolute paths as text."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {key: str(value.resolve()) if isinstance(value, Path) else value for key, value in values.items()}
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Source:
+        """What `to_dict` gave. Raises UserError naming what is missing or of the wrong type."""
+        kinds: dict[str, tuple[type, ...]] = {
+            "folder": (str,),
+            "head": (str,),
+            "tracking": (str, type(None)),
+            "frame_offset": (int, type(None)),
+            "format": (str, type(None)),
+            "fps": (int, float, type(None)),
+            "max_left_out": (int, float),
+            "ignore_misfit": (bool,),
+        }
+        if not isinstance(values, dict):
+            raise UserError("source is missing or not an object")
+        for key, kind in kinds.items():
+            if key not in values or not isinstance(values[key], kind):
+                raise UserError(f"source.{key} is missing or of the wrong type")
+        paths = {key: Path(values[key]) if values[key] is not None else None for key in ("folder", "head", "tracking")}
+        return cls(**{**{key: values[key] for key in kinds}, **paths})

@@ -1,0 +1,136 @@
+"""The training loss of FlashAvatar and HyperGaussians, as functions of one rendered and one true image.
+
+    loss = huber(image) + 40 * huber(image * mouth_mask) + 0.05 * LPIPS(image * head_mask)
+
+The last term counts from the middle of training (step 15,000 of 30,000). Every mean is over all pixels and channels of
+the frame, so the weight of the mouth term grows with the mouth's area. Where there are no LPIPS weights, D-SSIM takes
+the place of LPIPS. Source: FlashAvatar; HyperGaussians, section on training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.losses.dssim_cpu import dssim_cpu
+from avatar.losses.metrics import SSIM_RADIUS, SSIM_WINDOW, bounding_box, ssim_map
+from avatar.tensors import check_shapes
+
+HUBER_DELTA = 0.1
+MOUTH_WEIGHT = 40.0
+LPIPS_WEIGHT = 0.05
+# Ours, for D-SSIM in place of LPIPS: near the end of training (mean square error 1e-3, SSIM 0.95) the term is then
+# about as large as the Huber terms, the balance that 3D Gaussian Splatting has with its 0.8 L1 + 0.2 (1 - SSIM).
+DSSIM_WEIGHT = 0.05
+
+# (image [H, W, 3], target [H, W, 3], mask [H, W]) -> a dissimilarity of the two images times the mask, scalar
+Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+class PhotometricLoss(NamedTuple):
+    """The weighted terms, scalars; `total` is their sum and the one to differentiate."""
+
+    total: Float[Tensor, ""]
+    frame: Float[Tensor, ""]
+    mouth: Float[Tensor, ""]
+    perceptual: Float[Tensor, ""]
+
+
+def photometric_loss(
+    image: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"],
+    mouth_mask: Float[Tensor, "H W"],
+    head_mask: Float[Tensor, "H W"],
+    *,
+    perceptual: Perceptual | None = None,
+    perceptual_weight: float = LPIPS_WEIGHT,
+    mouth_weight: float = MOUTH_WEIGHT,
+    delta: float = HUBER_DELTA,
+) -> PhotometricLoss:
+    """The loss of one frame. `perceptual` is None until the step from which that term counts, then `dssim` or
+    `masked_lpips(...)` with its weight. Raises ValueError for tensors whose sizes disagree."""
+    check_shapes(
+        image=(image, "H W 3"), target=(target, "H W 3"), mouth_mask=(mouth_mask, "H W"), head_mask=(head_mask, "H W")
+    )
+    frame = F.huber_loss(image, target, delta=delta)
+    mouth = mouth_weight * masked_huber(image, target, mouth_mask, delta=delta)
+    if perceptual is None:
+        third = torch.zeros((), dtype=image.dtype, device=image.device)
+    else:
+        third = perceptual_weight * perceptual(image, target, head_mask)
+    return PhotometricLoss(total=frame + mouth + third, frame=frame, mouth=mouth, perceptual=third)
+
+
+def masked_huber(
+    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W"], *, delta: float
+) -> Float[Tensor, ""]:
+    """Huber loss of `image * mask` against `target * mask`, mean over the WHOLE frame.
+
+    0.5 d^2 for |d| < delta, else delta (|d| - delta / 2). Zero outside the mask's bounding box, so evaluated in it.
+    """
+    box = bounding_box(mask)
+    if box is None:
+        return (image * 0.0).sum()  # keeps the graph: a frame whose mouth is hidden has a zero gradient, not none
+    weight = mask[box].unsqueeze(-1)
+    loss = F.huber_loss(image[box] * weight, target[box] * weight, delta=delta, reduction="sum")
+    return loss / image.numel()
+
+
+def dssim(
+    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W"]
+) -> Float[Tensor, ""]:
+    """Structural dissimilarity (1 - SSIM) / 2 of `image * mask` against `target * mask`; SSIM as `metrics.ssim`.
+
+    Windows without a masked pixel see two black images and add nothing, so only the others are evaluated. Float32
+    tensors on the CPU, differentiated by the image alone, take the compiled kernel, which computes in double precision.
+    """
+    height, width = mask.shape
+    plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in (image, target, mask))
+    if plain and min(height, width) >= SSIM_WINDOW and not (target.requires_grad or mask.requires_grad):
+        return dssim_cpu(image, target, mask)
+    box = bounding_box(mask)
+    if box is None:
+        return (image * 0.0).sum()
+    # A window centred up to one radius outside the box touches it, and reads up to two radii outside.
+    rows, columns = (slice(max(side.start - 2 * SSIM_RADIUS, 0), side.stop + 2 * SSIM_RADIUS) for side in box)
+    weight = mask[rows, columns].unsqueeze(-1)
+    similarity = ssim_map(image[rows, columns] * weight, target[rows, columns] * weight)
+    windows = (height - 2 * SSIM_RADIUS) * (width - 2 * SSIM_RADIUS)
+    return (1.0 - similarity).sum() / (2.0 * similarity.shape[-1] * windows)
+
+
+def on_head(perceptual: Perceptual, margin: int = 16) -> Perceptual:
+    """`perceptual` of the mask's bounding box, grown by `margin` pixels, in place of the whole frame.
+
+    The value is scaled by the box's share of the frame, so it weighs what the mean over the whole frame does: both images
+    are black outside the mask. Only networks that see the frame's border where the box ends can tell.
+    """
+
+    def cropped(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+        box = bounding_box(mask)
+        if box is None:
+            return (image * 0.0).sum()
+        rows, columns = (
+            slice(max(side.start - margin, 0), min(side.stop + margin, length))
+            for side, length in zip(box, mask.shape, strict=True)
+        )
+        inside = mask[rows, columns]
+        share = inside.numel() / mask.numel()
+        return share * perceptual(image[rows, columns], target[rows, columns], inside)
+
+    return cropped
+
+
+def masked_lpips(lpips: Callable[[Tensor, Tensor], Tensor]) -> Perceptual:
+    """The perceptual term of the paper out of an `avatar.losses.lpips.Lpips`: the distance of `image * mask`, unscaled."""
+
+    def distance(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+        weight = mask.unsqueeze(-1)
+        return lpips(image * weight, target * weight)
+
+    return distance

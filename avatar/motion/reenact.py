@@ -1,0 +1,199 @@
+"""Driving one person's avatar with another person's motion.
+
+NAME.mp4               the driver's picture, where there is one, beside the render; under them each frame's distance from
+                       the training expressions
+NAME.distances.csv     those distances
+NAME.choices.json      every choice that made the video
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from tqdm import tqdm
+
+from avatar.data.loader import FrameLoader
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.files.video import side_by_side, write_video
+from avatar.head.model import HeadModel
+from avatar.motion.distance_strip import DistanceStrip, distances_csv
+from avatar.motion.drive import Drive, Whose, choose_cameras, smoothed, subject_drive
+from avatar.motion.transfer import RestPose, Transfer, transfer_motion
+from avatar.runs.run import versions
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import Camera
+
+FOCAL_TOLERANCE = 0.1  # relative difference of the field of view from which a warning is worth its line
+SIDECAR_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How a driver's motion becomes the avatar's."""
+
+    transfer: Transfer = "relative"
+    strength: float = 1.0  # scales the departure from rest
+    smoothing: float = 0.0  # standard deviation in frames; 0 is off
+    camera: Whose = "driver"  # whose head pose is shown
+    intrinsics: Whose = "driver"  # through whose lens, where the driver's head pose is shown
+
+
+DEFAULT_CHOICES = Choices()
+
+
+def reenact(
+    trained: TrainedAvatar,
+    driver: Subject | Drive,
+    out: Path,
+    choices: Choices = DEFAULT_CHOICES,
+    *,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture.
+
+    Returns the video's path. Raises UserError for choices out of range and for a driver tracked with another head model.
+    """
+    check_choices(choices)
+    data = trained.config.data
+    if isinstance(driver, Subject):
+        check_same_head(driver, trained)
+    drive = smoothed(subject_drive(driver, data.size) if isinstance(driver, Subject) else driver, choices.smoothing)
+    moved, source, goal = transfer_motion(
+        drive.params,
+        trained.repertoire,
+        choices.transfer,
+        HeadModel(trained.assets, drive.identity),
+        strength=choices.strength,
+    )
+    recording = trained.recording
+    training_names = [recording.names[i] for i in recording.split.train]
+    neutral = {
+        drive.name: frame_name(source, drive.names),
+        trained.name: frame_name(goal, training_names),
+    }
+    if all(neutral.values()):
+        say("Neutral expression: " + ", ".join(f"frame {frame} of {name}" for name, frame in neutral.items()))
+
+    distances = trained.repertoire.expressions.distances(moved)
+    say_distances(distances, say)
+    own = trained.rest_camera()
+    cameras = choose_cameras(drive, own, choices.camera, choices.intrinsics)
+    if choices.camera == "driver" and choices.intrinsics == "driver":
+        warn_of_other_intrinsics(cameras[0], own, say)
+    renders = (rendering.image for rendering in trained.stream(zip(moved, cameras, strict=True)))
+    loader = FrameLoader(driver, data.size, data.cache_mb << 20, data.workers) if isinstance(driver, Subject) else None
+    with loader or nullcontext():
+        pictures = (frame.image for frame in loader.frames(range(len(drive)))) if loader else None
+        frames = panels(renders, pictures, trained.name, distances.tolist())
+        write_video(out, tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True), drive.fps)
+    table, record = sidecars(out)
+    write_atomically(table, distances_csv(drive.names, distances.tolist()).encode())
+    described = describe(trained, drive, choices, neutral, cameras, own, distances)
+    write_atomically(record, json.dumps(described, indent=2, allow_nan=False).encode())
+    say(f"{len(drive)} frames written to {out}; its choices in {record.name}, each frame's distance in {table.name}")
+    return out
+
+
+def sidecars(video: Path) -> tuple[Path, Path]:
+    """The table of distances and the record of choices that go with a video."""
+    return video.with_name(f"{video.stem}.distances.csv"), video.with_name(f"{video.stem}.choices.json")
+
+
+def check_choices(choices: Choices) -> None:
+    for name, value, high in (("strength", choices.strength, 10.0), ("smoothing", choices.smoothing, 1000.0)):
+        if not 0.0 <= value <= high:  # a NaN is refused too
+            raise UserError(f"--{name} must be from 0 to {high:g}, not {value}")
+
+
+def check_same_head(driver: Subject, trained: TrainedAvatar) -> None:
+    if driver.head_fingerprint != trained.recording.head_fingerprint:
+        raise UserError(
+            f"the driver {driver.name} was tracked with another head model than the avatar {trained.name} "
+            f"({driver.head_fingerprint[:12]} and {trained.recording.head_fingerprint[:12]}): the same coefficients mean "
+            "other expressions there; track the driver again with the avatar's head model"
+        )
+
+
+def frame_name(rest: RestPose | None, names: Sequence[str]) -> str | None:
+    return names[rest.frame] if rest is not None and rest.frame is not None else None
+
+
+def say_distances(distances: Float[Tensor, " T"], say: Callable[[str], None]) -> None:
+    far = int((distances > 1.0).sum())
+    if far:
+        say(
+            f"{far} of {len(distances)} frames are farther from the training expressions than 99% of those are (at most "
+            f"{float(distances.max()):.1f} times as far): the avatar guesses there; --transfer pca keeps to what it knows"
+        )
+
+
+def panels(
+    renders: Iterator[Float[Tensor, "H W 3"]],
+    pictures: Iterator[Float[Tensor, "H W 3"]] | None,
+    name: str,
+    distances: Sequence[float],
+) -> Iterator[UInt8[np.ndarray, "H_panel W_panel 3"]]:
+    """The driver's picture, if any, beside the render, over the strip of distances."""
+    strip: DistanceStrip | None = None
+    for index, render in enumerate(renders):
+        images = [render] if pictures is None else [next(pictures), render]
+        panel = side_by_side(images, [name] if pictures is None else ["driver", name])
+        strip = strip or DistanceStrip(distances, panel.shape[1], panel.shape[0])
+        yield np.concatenate((panel, strip.frame(index)))
+
+
+def describe(
+    trained: TrainedAvatar,
+    drive: Drive,
+    choices: Choices,
+    neutral: dict[str, str | None],
+    cameras: Sequence[Camera],
+    own: Camera,
+    distances: Float[Tensor, " T"],
+) -> dict[str, Any]:
+    """What the sidecar holds."""
+    return {
+        "format": SIDECAR_FORMAT,
+        "avatar": {"file": str(trained.source.resolve()), "subject": trained.name, "step": trained.step},
+        "driver": {
+            "name": drive.name,
+            "frames": len(drive),
+            "fps": drive.fps,
+            "has_cameras": drive.cameras is not None,
+        },
+        "choices": asdict(choices),
+        "neutral_frames": neutral,
+        "intrinsics": {"shown": intrinsics(cameras[0]), "avatar": intrinsics(own)},
+        "distance": {
+            "measured": "Mahalanobis distance of the moved expression and jaw in the principal components of the training "
+            "frames, divided by the 99th percentile of their own",
+            "frames_above_1": int((distances > 1.0).sum()),
+            "median": round(float(distances.median()), 4),
+            "largest": round(float(distances.max()), 4),
+        },
+        "versions": versions(),
+    }
+
+
+def intrinsics(camera: Camera) -> dict[str, float]:
+    return {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+
+
+def warn_of_other_intrinsics(driver: Camera, target: Camera, say: Callable[[str], None]) -> None:
+    """Say when the two videos were taken through lenses that differ: the perspective of the face is then another."""
+    fields = [2 * np.degrees(np.arctan(c.height / (2 * c.fy))) for c in (driver, target)]
+    if abs(driver.fy / driver.height - target.fy / target.height) > FOCAL_TOLERANCE * target.fy / target.height:
+        say(
+            f"Warning: the driver's camera sees {fields[0]:.1f} degrees, the avatar's {fields[1]:.1f}: shown from the "
+            "driver's camera the head has another perspective than in training; --intrinsics target keeps its own lens"
+        )

@@ -1,0 +1,30 @@
+"""What an avatar has been shown of its person: the rests, and the range of expressions. Other motion is measured by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from avatar.head.model import HeadModel
+from avatar.motion.expression_space import ExpressionSpace, fit_expressions
+from avatar.motion.rest import RestPose, find_mean, find_neutral
+from avatar.types import HeadParams
+
+
+@dataclass(frozen=True)
+class Repertoire:
+    """Of the training frames."""
+
+    neutral: RestPose
+    mean: RestPose
+    expressions: ExpressionSpace
+
+
+def learn_repertoire(training: Sequence[HeadParams], head: HeadModel, neutral: RestPose | None = None) -> Repertoire:
+    """The repertoire of the frames that an avatar is trained on; `head` has their person's identity.
+
+    The neutral face is searched for among the frames where it is not given. Raises ValueError when there is no frame.
+    """
+    if not training:
+        raise ValueError("a repertoire needs training frames, got none")
+    return Repertoire(neutral or find_neutral(training, head), find_mean(training), fit_expressions(training))

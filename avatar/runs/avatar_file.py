@@ -1,0 +1,193 @@
+"""A trained avatar as one file, which is all that drawing it needs beside the head model; docs/format.md is its definition.
+
+    RUN/avatar.safetensors    parameters, configuration, the recording that it was trained on without its pictures, the
+                              neutral face, fingerprints of data and head model; perhaps the head model itself
+
+Written with every checkpoint. Reading one cannot execute code.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as serialize
+from torch import Tensor
+
+import avatar
+from avatar.config import Config, config_from_dict
+from avatar.data.manifest import parse_intrinsics, parse_number, parse_positions
+from avatar.data.recording import TRACK_SHAPES, Recording, checked_tracks
+from avatar.data.split import Split
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.head.assets import HeadAssets
+from avatar.head.expression_names import ExpressionNames, parse_expression_names
+from avatar.head.packed import head_from_tensors, head_tensors
+from avatar.model import Avatar
+from avatar.motion.rest import RestPose
+from avatar.runs.checkpoint import load_module, module_tensors
+
+AVATAR_FILE = "avatar.safetensors"
+AVATAR_FORMAT = 1
+_RECORDING, _NEUTRAL, _HEAD = "recording.", "neutral.", "head."
+
+
+@dataclass(frozen=True)
+class Portrait:
+    """What an avatar file holds, without the head model; enough to build the avatar once that is there."""
+
+    config: Config
+    step: int
+    recording: Recording
+    neutral: RestPose
+    perceptual: str  # what the third term of the loss was
+    names: ExpressionNames  # of the head model's coefficients
+    parameters: Mapping[str, Tensor]  # "model.*"
+    head: HeadAssets | None  # packed into the file
+
+
+def write_avatar(
+    path: Path, model: Avatar, config: Config, recording: Recording, neutral: RestPose, step: int, perceptual: str
+) -> None:
+    """Write the avatar after `step` steps. Raises UserError when the disk refuses."""
+    names = model.head.assets.names
+    write_portrait(path, Portrait(config, step, recording, neutral, perceptual, names, module_tensors(model), None))
+
+
+def write_portrait(path: Path, portrait: Portrait, licence: str | None = None) -> None:
+    """Write what `read_portrait` gives back; `licence` is a sentence about the head model, where one is packed."""
+    recording = portrait.recording
+    tensors = {name: value.detach().cpu().contiguous() for name, value in portrait.parameters.items()}
+    tensors |= {f"{_RECORDING}{name}": recording.tracks[name].contiguous() for name in TRACK_SHAPES}
+    tensors |= {
+        f"{_NEUTRAL}expression": portrait.neutral.expression.contiguous(),
+        f"{_NEUTRAL}jaw": portrait.neutral.jaw.contiguous(),
+    }
+    if portrait.head is not None:
+        tensors |= {f"{_HEAD}{name}": value for name, value in head_tensors(portrait.head).items()}
+    header = {
+        "format": AVATAR_FORMAT,
+        "program": avatar.__version__,
+        "step": portrait.step,
+        "config": portrait.config.to_dict(),
+        "perceptual": portrait.perceptual,
+        "name": recording.name,
+        "fps": recording.fps,
+        "size": [recording.width, recording.height],
+        "intrinsics": list(recording.intrinsics),
+        "frames": list(recording.names),
+        "train": list(recording.split.train),
+        "test": list(recording.split.test),
+        "neutral_frame": portrait.neutral.frame,
+        "data_hash": recording.data_hash,
+        "head_fingerprint": recording.head_fingerprint,
+        "expression_names": portrait.names.to_dict(),
+        "head_licence": licence,
+    }
+    write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(header)}))
+
+
+def read_portrait(path: Path) -> Portrait:
+    """Read an avatar file. Raises UserError, naming the file, when it is missing, damaged or of another format."""
+    header, tensors = _read(path)
+    try:
+        return _parse(header, tensors)
+    except UserError as error:
+        raise UserError(f"{path} cannot be used: {error}") from None
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise UserError(f"{path} is damaged ({reason}); copy it again, or export it again") from None
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    if not path.is_file():
+        raise UserError(f"there is no avatar file {path}; give the folder that avatar train wrote, or a file of it")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("avatar", "null"))
+            if not isinstance(header, dict) or header.get("format") != AVATAR_FORMAT or "frames" not in header:
+                found = header.get("format") if isinstance(header, dict) else "none"
+                raise UserError(f"{path} is not an avatar of this program (format {found}, expected {AVATAR_FORMAT})")
+            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} is damaged or no avatar file ({error}); copy it again, or export it again") from None
+
+
+def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> Portrait:
+    config = config_from_dict(header["config"])
+    names = header["frames"]
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise ValueError("frames is not a list of names")
+    count = len(names)
+    width, height = header["size"]
+    fps = parse_number(header["fps"], "fps")
+    for value in (width, height):
+        if not isinstance(value, int) or not 1 <= value < 2**16:
+            raise ValueError(f"an image size of {width}x{height} is impossible")
+    intrinsics = parse_intrinsics(header["intrinsics"])
+    if fps <= 0 or min(intrinsics[:2]) <= 0:
+        raise ValueError("fps and focal lengths must be positive")
+    for key, kind in (("name", str), ("data_hash", str), ("head_fingerprint", str), ("perceptual", str), ("step", int)):
+        if not isinstance(header[key], kind):
+            raise TypeError(f"{key} is a {type(header[key]).__name__}, not a {kind.__name__}")
+    recording = Recording(
+        name=header["name"],
+        fps=fps,
+        width=width,
+        height=height,
+        intrinsics=intrinsics,
+        names=tuple(names),
+        split=Split(parse_positions(header["train"], "train", count), parse_positions(header["test"], "test", count)),
+        tracks=checked_tracks(_under(_RECORDING, tensors), count),
+        data_hash=header["data_hash"],
+        head_fingerprint=header["head_fingerprint"],
+    )
+    coefficients = recording.tracks["expression"].shape[1]
+    head = _under(_HEAD, tensors)
+    return Portrait(
+        config=config,
+        step=header["step"],
+        recording=recording,
+        neutral=_parse_neutral(header["neutral_frame"], _under(_NEUTRAL, tensors), recording),
+        perceptual=header["perceptual"],
+        names=parse_expression_names(header["expression_names"], coefficients, "expression_names"),
+        parameters={name: value for name, value in tensors.items() if name.startswith("model.")},
+        head=head_from_tensors(head) if head else None,
+    )
+
+
+def _parse_neutral(frame: Any, tensors: Mapping[str, Tensor], recording: Recording) -> RestPose:
+    expression, jaw = tensors["expression"].float(), tensors["jaw"].float()
+    if expression.shape != recording.tracks["expression"].shape[1:] or jaw.shape != (3, 3):
+        raise ValueError(f"the neutral face has shapes {list(expression.shape)} and {list(jaw.shape)}")
+    if not bool(torch.isfinite(expression).all() and torch.isfinite(jaw).all()):
+        raise ValueError("the neutral face is not finite")
+    if frame is not None and (not isinstance(frame, int) or not 0 <= frame < len(recording.split.train)):
+        raise ValueError(f"neutral_frame is {frame!r}")
+    return RestPose(expression, jaw, frame)
+
+
+def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def build_avatar(portrait: Portrait, assets: HeadAssets, source: Path | str) -> Avatar:
+    """The avatar with its parameters, ready to draw. Raises UserError for another head model than it was trained with."""
+    check_head(portrait.recording.head_fingerprint, assets, source)
+    model = Avatar(assets, portrait.recording.identity, portrait.config.model)
+    load_module(model, portrait.parameters, source)
+    return model.eval()
+
+
+def check_head(fingerprint: str, assets: HeadAssets, source: Path | str) -> None:
+    if fingerprint != assets.fingerprint:
+        raise UserError(
+            f"the avatar in {source} was trained with another head model (fingerprint {fingerprint[:12]}, this one "
+            f"{assets.fingerprint[:12]}); give its own with --head"
+        )

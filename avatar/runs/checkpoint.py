@@ -1,0 +1,129 @@
+"""Run folders on disk: what a run was made from (run.json) and its checkpoints.
+
+    RUN/run.json                                  input, head model, configuration, versions
+    RUN/checkpoints/step_00001000.safetensors     parameters and optimizer state; step and hashes in its header
+
+A checkpoint is one file, written to a temporary name, flushed to the disk and renamed, so that it is there whole or not
+at all; its JSON is the header of the same file, so the two cannot disagree. Reading one cannot execute code.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as serialize
+from torch import Tensor
+
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.tensors import describe_non_finite
+
+CHECKPOINT_FORMAT = 1
+RUN_FORMAT = 1
+_NAME = re.compile(r"step_(\d{8})\.safetensors")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The state after `step` optimizer steps."""
+
+    step: int
+    tensors: Mapping[str, Tensor]  # "model.*" and "optimizer.*"
+    meta: Mapping[str, Any]  # head_fingerprint, data_hash, config
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
+    """Write RUN/checkpoints/step_N.safetensors and delete all but the newest `keep`.
+
+    Raises UserError, and writes nothing, when a tensor holds a value that is not finite.
+    """
+    for name, tensor in checkpoint.tensors.items():
+        if message := describe_non_finite(name, tensor):
+            raise UserError(
+                f"step {checkpoint.step}: {message}; the checkpoint was not written, the last good one stays"
+            )
+    meta = {"format": CHECKPOINT_FORMAT, "step": checkpoint.step, **checkpoint.meta}
+    tensors = {name: tensor.detach().contiguous() for name, tensor in checkpoint.tensors.items()}
+    path = folder / f"step_{checkpoint.step:08d}.safetensors"
+    write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(meta)}))
+    for old in list_checkpoints(folder)[:-keep]:
+        with suppress(OSError):  # an old checkpoint too many is no reason to stop a run
+            old.unlink()
+    return path
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a run, oldest first."""
+    return sorted(p for p in folder.glob("step_*.safetensors") if _NAME.fullmatch(p.name))
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read one checkpoint; UserError when it is damaged or of another format."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {}).get("avatar", "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"the checkpoint {path} is damaged ({error}); delete it to use the one before") from None
+    if not isinstance(meta, dict) or meta.get("format") != CHECKPOINT_FORMAT or not isinstance(meta.get("step"), int):
+        found = meta.get("format") if isinstance(meta, dict) else "none"
+        raise UserError(f"{path} is not a checkpoint of this program (format {found}, expected {CHECKPOINT_FORMAT})")
+    return Checkpoint(meta["step"], tensors, meta)
+
+
+def newest_checkpoint(run: Path) -> Checkpoint:
+    """The last checkpoint of a run; UserError when there is none: an untrained model is never used silently."""
+    files = list_checkpoints(run / "checkpoints")
+    if not files:
+        raise UserError(f"{run} holds no checkpoint; train first (avatar train FOLDER --out {run})")
+    return load_checkpoint(files[-1])
+
+
+def write_run_info(run: Path, info: Mapping[str, Any]) -> None:
+    """Write RUN/run.json: where the data and the head model are, the configuration, versions."""
+    write_atomically(run / "run.json", json.dumps({"format": RUN_FORMAT, **info}, indent=2).encode())
+
+
+def read_run_info(run: Path) -> dict[str, Any]:
+    """RUN/run.json; UserError when the folder is not a run."""
+    path = run / "run.json"
+    if not path.is_file():
+        raise UserError(
+            f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out)"
+        )
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({error})") from None
+    if not isinstance(info, dict) or info.get("format") != RUN_FORMAT:
+        raise UserError(f"{path} is not of format {RUN_FORMAT}; it was written by another version of the program")
+    return info
+
+
+def module_tensors(module: torch.nn.Module) -> dict[str, Tensor]:
+    """The parameters of a module under the names that checkpoints give them."""
+    return {f"model.{name}": value for name, value in module.state_dict().items()}
+
+
+def load_module(module: torch.nn.Module, tensors: Mapping[str, Tensor], source: Path | str) -> None:
+    """Put the parameters among a file's tensors into a module; UserError naming the first that does not fit."""
+    own = module_tensors(module)
+    given = {name: value for name, value in tensors.items() if name.startswith("model.")}
+    for name in own.keys() | given.keys():
+        if name not in given or name not in own:
+            where = "lacks" if name not in given else "has, but this model lacks,"
+            raise UserError(f"the avatar in {source} {where} {name}; it belongs to another model")
+        if own[name].shape != given[name].shape:
+            raise UserError(
+                f"the avatar in {source} has {name} of shape {list(given[name].shape)}, this model needs "
+                f"{list(own[name].shape)}; it belongs to another model or head model"
+            )
+    module.load_state_dict({name.removeprefix("model."): value for name, value in given.items()})

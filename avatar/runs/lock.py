@@ -1,0 +1,82 @@
+"""One writer for each run folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from avatar.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there the file itself cannot be deleted while it is open, and that is the lock
+    fcntl = None
+
+LOCK_FILE = ".lock"
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock; the system lets go of it when the process ends, however it ends.
+
+    Raises UserError naming the process that holds it, and when the folder cannot be written.
+    """
+    path = folder / LOCK_FILE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = _acquire(path)
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written ({error.strerror}); choose another --out") from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
+        os.close(file)
+
+
+def _acquire(path: Path) -> int:
+    while True:
+        if fcntl is None:
+            with suppress(OSError):
+                path.unlink()
+            try:
+                file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+            except FileExistsError:
+                raise _held(path) from None
+        else:
+            file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(file)
+                raise _held(path) from None
+            if not _is_same(file, path):  # its holder deleted it between our opening and locking it
+                os.close(file)
+                continue
+        os.truncate(file, 0)
+        os.write(file, json.dumps({"process": os.getpid(), "machine": platform.node()}).encode())
+        return file
+
+
+def _held(path: Path) -> UserError:
+    return UserError(f"{path.parent} is being written by {_holder(path)}; wait for it, or choose another --out")
+
+
+def _is_same(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _holder(path: Path) -> str:
+    try:
+        holder = json.loads(path.read_text(encoding="utf-8"))
+        return f"process {holder['process']} on {holder['machine']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process"

@@ -1,0 +1,144 @@
+"""Run folders: what a run was made from, and who is working in it.
+
+RUN/run.json              input, head model, configuration, the perceptual term, versions
+RUN/.lock                 the process that trains into the folder, while it does
+RUN/avatar.safetensors    the avatar of the newest checkpoint (runs/avatar_file.py)
+RUN/checkpoints/          to go on from (runs/checkpoint.py)
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import avatar
+from avatar.config import Config, config_from_dict
+from avatar.data.source import Source
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.model import Avatar
+from avatar.runs.checkpoint import list_checkpoints
+from avatar.runs.trained import TrainedAvatar
+
+RUN_FILE = "run.json"
+RUN_FORMAT = 2
+VERSIONED = ("torch", "numpy", "opencv-contrib-python-headless", "kornia")
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What run.json holds of the decisions that a run keeps."""
+
+    source: Source
+    config: Config
+    options: Mapping[str, str]  # that were chosen in the configuration's groups
+    perceptual: str  # what the third term of the loss came to, as `choose_perceptual` names it
+    data_hash: str
+    head_fingerprint: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run with the video that it was trained on."""
+
+    path: Path
+    trained: TrainedAvatar
+    subject: Subject
+
+    @property
+    def avatar(self) -> Avatar:
+        return self.trained.avatar
+
+    @property
+    def config(self) -> Config:
+        return self.trained.config
+
+    @property
+    def step(self) -> int:
+        return self.trained.step
+
+
+def start_run(
+    path: Path,
+    source: Source,
+    config: Config,
+    subject: Subject,
+    perceptual: str,
+    options: Mapping[str, str],
+) -> None:
+    """Write RUN/run.json; the caller holds the folder's lock.
+
+    Raises UserError when the folder holds a trained run already: nothing is overwritten.
+    """
+    refuse_trained(path)
+    write_run_info(
+        path,
+        {
+            "name": subject.name,
+            "source": source.to_dict(),
+            "data_hash": subject.data_hash,
+            "head_fingerprint": subject.head_fingerprint,
+            "config": config.to_dict(),
+            "options": dict(options),
+            "perceptual": perceptual,
+            "versions": versions(),
+        },
+    )
+
+
+def refuse_trained(path: Path) -> None:
+    """Raise UserError when the folder holds checkpoints."""
+    if list_checkpoints(path / "checkpoints"):
+        raise UserError(f"{path} holds a run already: add --resume to go on with it, or choose another --out")
+
+
+def write_run_info(run: Path, info: Mapping[str, Any]) -> None:
+    write_atomically(run / RUN_FILE, json.dumps({"format": RUN_FORMAT, **info}, indent=2).encode())
+
+
+def read_run_info(run: Path) -> RunInfo:
+    """RUN/run.json. Raises UserError when the folder is not a run, or one of another version of the program."""
+    path = run / RUN_FILE
+    if not path.is_file():
+        raise UserError(
+            f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out)"
+        )
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({error})") from None
+    if not isinstance(info, dict) or info.get("format") != RUN_FORMAT:
+        found = info.get("format") if isinstance(info, dict) else "none"
+        raise UserError(
+            f"{path} is of format {found}, and this program reads {RUN_FORMAT}; train again with this version"
+        )
+    try:
+        texts = {key: info[key] for key in ("perceptual", "data_hash", "head_fingerprint")}
+        if wrong := [key for key, value in texts.items() if not isinstance(value, str)]:
+            raise UserError(f"{wrong[0]} is not text")
+        options = info["options"]
+        if not isinstance(options, dict) or not all(isinstance(option, str) for option in options.values()):
+            raise UserError("options is not an object of texts")
+        return RunInfo(Source.from_dict(info.get("source")), config_from_dict(info["config"]), options, **texts)
+    except (KeyError, UserError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise UserError(f"{path} is damaged ({reason})") from None
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on besides the configuration."""
+    return {
+        "avatar": avatar.__version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "threads": str(torch.get_num_threads()),
+        **{name: version(name) for name in VERSIONED},
+    }

@@ -1,0 +1,241 @@
+"""Findings about files: missing, extra, unreadable, of the wrong size, without partner."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from pathlib import Path
+
+from avatar.data.images import IMAGE_SUFFIXES
+from avatar.data.source import DEFAULT_LEFT_OUT
+from data_prep.check.clip import Clip
+from data_prep.check.findings import Finding, loss_severity
+from data_prep.check.view import HEAD, IMAGE
+from data_prep.frame_files import describe_numbers, gaps
+from data_prep.frame_offset import RADIUS
+from data_prep.pairing import describe_reasons
+
+_SHOWN = 6  # file names in a sentence
+
+
+def check_files(clip: Clip) -> list[Finding]:
+    return [
+        *(from_sentence(check, sentence) for check, sentence in clip.complaints),
+        *_unreadable(clip),
+        *_sizes(clip),
+        *_mask_values(clip),
+        *_missing_masks(clip),
+        *_partners(clip),
+        *_extra(clip),
+    ]
+
+
+def from_sentence(check: str, sentence: str) -> Finding:
+    """An error from a UserError's sentence, `what is wrong; what to do`."""
+    problem, _, advice = sentence.rpartition("; ")
+    return Finding("error", check, problem or sentence, advice if problem else "mend that, then check again")
+
+
+def _unreadable(clip: Clip) -> list[Finding]:
+    findings = []
+    for kind in clip.files.of_kind():
+        reasons = {n: view.problems[kind] for n, view in clip.views.items() if kind in view.problems}
+        if not reasons:
+            continue
+        shown = [reason.partition("; ")[0] for reason in list(reasons.values())[:_SHOWN]]
+        rest = f" and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
+        findings.append(
+            Finding(
+                loss_severity(len(reasons), len(clip.views)),
+                "unreadable",
+                f"{len(reasons)} of {len(clip.views)} files of {clip.files.title(kind)} cannot be read: "
+                f"{', '.join(shown)}{rest}",
+                "write or copy them again; frames without them are left out of training",
+                clip.names(reasons),
+            )
+        )
+    return findings
+
+
+def _sizes(clip: Clip) -> list[Finding]:
+    counts = Counter(view.sizes[IMAGE] for view in clip.views.values() if IMAGE in view.sizes)
+    if not counts:
+        return []
+    usual = counts.most_common(1)[0][0]
+    findings = []
+    for kind, paths in clip.files.of_kind().items():
+        odd = [n for n, view in clip.views.items() if view.sizes.get(kind, usual) != usual]
+        if odd:
+            width, height = clip.views[odd[0]].sizes[kind]
+            findings.append(
+                Finding(
+                    "error",
+                    "sizes",
+                    f"{len(odd)} files of {clip.files.title(kind)} are not {usual[0]}x{usual[1]} pixels as most images "
+                    f"are: {describe_numbers(odd, name=clip.name)} ({paths[odd[0]].name} is {width}x{height})",
+                    "bring all images and masks of the clip to one size",
+                    clip.names(odd),
+                )
+            )
+    tracked = next(iter(clip.tracking.frames.values()), None)
+    if tracked is not None and tracked.size != usual:
+        findings.append(
+            Finding(
+                "error",
+                "sizes",
+                f"the tracking was made on {tracked.size[0]}x{tracked.size[1]} images, but those in "
+                f"{clip.files.title(IMAGE)} are {usual[0]}x{usual[1]}",
+                "resize the images to the size of the tracking, or track them again",
+            )
+        )
+    return findings
+
+
+def _mask_values(clip: Clip) -> list[Finding]:
+    findings = []
+    kinds = {kind for view in clip.views.values() for kind in view.brightest}
+    for kind in sorted(kinds):
+        values = {n: view.brightest[kind] for n, view in clip.views.items() if kind in view.brightest}
+        if max(values.values()) == 1:
+            findings.append(
+                Finding(
+                    "error",
+                    "mask-range",
+                    f"the files of {clip.files.title(kind)} hold 0 and 1, not 0 to 255",
+                    "multiply them by 255",
+                )
+            )
+        elif kind == HEAD and (empty := [n for n, value in values.items() if value == 0]):
+            findings.append(
+                Finding(
+                    loss_severity(len(empty), len(clip.views)),
+                    "empty-mask",
+                    f"the head mask is empty in {clip.phrase(empty)}: no head was found there",
+                    "segment them again, or accept that they are left out of training",
+                    clip.names(empty),
+                )
+            )
+    return findings
+
+
+def _missing_masks(clip: Clip) -> list[Finding]:
+    findings = []
+    for kind, found in clip.files.of_kind().items():
+        missing = sorted(clip.files.images.keys() - found.keys())
+        if kind in (IMAGE, "checkpoint") or not found or not missing:
+            continue
+        findings.append(
+            Finding(
+                loss_severity(len(missing), len(clip.files.images)),
+                "missing",
+                f"{clip.files.title(kind)} has no file for {len(missing)} of {len(clip.files.images)} images: "
+                f"{describe_numbers(missing, name=clip.name)}",
+                "make the masks of these images; without them the frames are left out of training",
+                clip.names(missing),
+            )
+        )
+    return findings
+
+
+def _partners(clip: Clip) -> list[Finding]:
+    """Images without tracking and tracking without images, under the offset; numbers that both skip."""
+    if clip.offset is None:
+        return []
+    images, tracking = clip.files.images, {n + clip.offset: path for n, path in clip.files.tracking.items()}
+    findings = []
+    for what, have, other in (
+        ("images have no tracking", images, tracking),
+        ("tracking frames have no image", tracking, images),
+    ):
+        alone = sorted(have.keys() - other.keys())
+        if not alone:
+            continue
+        # An offset leaves a few without partner at the ends; `prepare` refuses more.
+        at_ends = not other or all(n < min(other) or n > max(other) for n in alone)
+        is_refused = len(alone) > max(DEFAULT_LEFT_OUT * len(have), RADIUS)
+        severity = "error" if is_refused else "note" if at_ends else "warning"
+        shown = ", ".join(have[n].name for n in alone[:_SHOWN]) + (
+            f" and {len(alone) - _SHOWN} more" if len(alone) > _SHOWN else ""
+        )
+        findings.append(
+            Finding(
+                severity,
+                "unpaired",
+                f"{len(alone)} {what} under the offset {clip.offset}: {shown}",
+                "are both of the same video? Track it again, or extract its frames again"
+                if severity != "note"
+                else "nothing: a few at the ends are usual, and are left out",
+                clip.names(alone),
+            )
+        )
+    skipped = sorted(set(gaps(images)) & set(gaps(tracking)))
+    if skipped:
+        findings.append(
+            Finding(
+                "note",
+                "gaps",
+                f"images and tracking both skip the numbers {describe_numbers(skipped, name=clip.name)}",
+                "nothing, if frames were removed on purpose: training does not need them to be consecutive",
+                clip.names(skipped),
+            )
+        )
+    return findings
+
+
+def _extra(clip: Clip) -> list[Finding]:
+    findings = []
+    for kind, found in clip.files.of_kind().items():
+        extra = sorted(found.keys() - clip.files.images.keys())
+        if kind not in (IMAGE, "checkpoint") and extra and clip.files.images:
+            findings.append(
+                Finding(
+                    "note",
+                    "extra",
+                    f"{clip.files.title(kind)} has files without an image: {describe_numbers(extra, name=clip.name)}",
+                    "nothing, if images were removed on purpose: these masks are not used",
+                    clip.names(extra),
+                )
+            )
+    strangers = [
+        path.relative_to(clip.files.folder).as_posix()
+        for name, suffixes in (("imgs", IMAGE_SUFFIXES), ("alpha", IMAGE_SUFFIXES), ("checkpoint", (".frame",)))
+        for path in _entries(clip.files.folder / name)
+        if not clip.source.is_paired  # a listing names its files, whatever lies beside them
+        if path.suffix.lower() not in suffixes
+    ]
+    if strangers:
+        more = f" and {len(strangers) - _SHOWN} more" if len(strangers) > _SHOWN else ""
+        findings.append(
+            Finding(
+                "note",
+                "extra",
+                f"files of another kind lie among the frames: {', '.join(strangers[:_SHOWN])}{more}",
+                "nothing, unless a frame was meant: they are not read",
+                tuple(strangers),
+            )
+        )
+    return findings
+
+
+def _entries(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        return sorted(Path(entry.path) for entry in entries if not entry.name.startswith("."))
+
+
+def lost_frames(clip: Clip, reasons: dict[int, str]) -> list[Finding]:
+    """An error where many small losses together are more than `prepare` accepts; `reasons` by image number."""
+    total = len(clip.pairs())
+    if total == 0 or len(reasons) <= DEFAULT_LEFT_OUT * total:
+        return []
+    return [
+        Finding(
+            "error",
+            "left-out",
+            f"{len(reasons)} of {total} frames cannot be used, more than {DEFAULT_LEFT_OUT:.0%}: "
+            f"{describe_reasons(reasons, clip.name)}",
+            "mend what is named; training does not start before",
+            clip.names(reasons),
+        )
+    ]

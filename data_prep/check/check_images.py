@@ -1,0 +1,217 @@
+"""Findings about what the images and masks show: repeated frames, light that changes, mattes that leak."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+
+from data_prep.check.clip import Clip
+from data_prep.check.findings import Finding
+from data_prep.inspect_images import composited_background
+from data_prep.overlap import MIN_OVERLAP
+
+# Neighbours differ by at least half of the clip's median difference in clips without repeats; an encoder that repeats a
+# frame leaves far less.
+REPEAT = 0.15  # of the median difference
+MIN_REPEATS_FOR_PERIOD = 4
+EXPOSURE = 0.15  # stops, 11%; an untouched camera stays within 0.02 on the background
+HEAD_EXPOSURE = 0.3  # stops; a turning head alone changes by up to 0.15
+_STEADY = 25  # frames (one second) that are averaged before comparing
+MAX_HAZE, MAX_HOLES, MAX_SPECKS = 0.02, 0.02, 0.02  # good mattes have 0.000
+MASK_CHANGE = 1.25  # the head mask's area against the projected head's varies by 7% in good clips
+MAX_COVERED = 0.95  # of the image
+MAX_MASK_RATIO = 4.0  # head masks with hair have 1.2 to 1.4 times the projected head's area
+
+
+def check_images(clip: Clip) -> list[Finding]:
+    return [*_repeated(clip), *_composited(clip), *_matte(clip), *_mask_area(clip), *_exposure(clip)]
+
+
+def repeated_images(clip: Clip) -> list[int]:
+    """Images that show what the one before shows: the same file, or a difference far below the usual one."""
+    usual = float(np.median(list(clip.steps.values()))) if clip.steps else 0.0
+    return [
+        n for n, step in clip.steps.items() if clip.views[n].digest == clip.views[n - 1].digest or step < REPEAT * usual
+    ]
+
+
+def _repeated(clip: Clip) -> list[Finding]:
+    repeated = repeated_images(clip)
+    if not repeated:
+        return []
+    spacing, times = Counter(np.diff(repeated).tolist()).most_common(1)[0] if len(repeated) > 1 else (0, 0)
+    every = ""
+    if spacing > 1 and times >= max(MIN_REPEATS_FOR_PERIOD - 1, 0.8 * (len(repeated) - 1)):
+        every = f", every {spacing}th: the frame rate was changed when they were extracted"
+    return [
+        Finding(
+            "warning",
+            "repeated-images",
+            f"the image repeats the one before in {clip.phrase(repeated)}{every}",
+            "extract the frames at the video's own rate (ffmpeg -fps_mode passthrough) and track those",
+            clip.names(repeated),
+        )
+    ]
+
+
+def _composited(clip: Clip) -> list[Finding]:
+    if not clip.files.alphas:
+        return []
+    bad = {n: "" for n in clip.files.images if not clip.is_whole(n)}
+    colour = composited_background(clip.files, bad)
+    if colour is None:
+        return []
+    return [
+        Finding(
+            "warning",
+            "composited",
+            f"the images seem to be composited on {colour} already: compositing them again with their matte squares "
+            "it at the edges (hair gets a rim of that colour)",
+            f"use the frames as the camera recorded them; or train with this background colour ({colour})",
+        )
+    ]
+
+
+class _MatteLimit(NamedTuple):
+    check: str
+    measure: str
+    limit: float
+    problem: str
+    advice: str
+
+
+_MATTE_LIMITS = (
+    _MatteLimit(
+        "background-leak",
+        "haze",
+        MAX_HAZE,
+        "the background shines through far from the person (mean weight up to {worst:.0%})",
+        "make the matte again, or add head masks where the format has them: they cut the background off",
+    ),
+    _MatteLimit(
+        "background-leak",
+        "specks",
+        MAX_SPECKS,
+        "pieces apart from the person count as head (up to {worst:.0%} of its area)",
+        "remove all but the largest piece from the masks, or make them again",
+    ),
+    _MatteLimit(
+        "matte-holes",
+        "holes",
+        MAX_HOLES,
+        "the matte is transparent inside the head mask (up to {worst:.0%} of it)",
+        "make the matte again: training sees the background colour in the face there",
+    ),
+)
+
+
+def _matte(clip: Clip) -> list[Finding]:
+    mattes = {n: view.matte for n, view in clip.views.items() if view.matte is not None}
+    findings = []
+    for check, measure, limit, problem, advice in _MATTE_LIMITS:
+        values = {n: getattr(matte, measure) for n, matte in mattes.items()}
+        over = [n for n, value in values.items() if value > limit]
+        if over:
+            sentence = problem.format(worst=max(values.values()))
+            findings.append(Finding("warning", check, f"{sentence} in {clip.phrase(over)}", advice, clip.names(over)))
+    whole = [n for n, matte in mattes.items() if matte.covered > MAX_COVERED]
+    if whole:
+        findings.append(
+            Finding(
+                "warning",
+                "background-leak",
+                f"matte and head mask cover the whole image in {clip.phrase(whole)}: the background is trained as head",
+                "make masks of the head alone",
+                clip.names(whole),
+            )
+        )
+    return findings
+
+
+def _mask_area(clip: Clip) -> list[Finding]:
+    ratios = {n: fit.mask_ratio for n, fit in clip.fits.items()}
+    if not ratios or np.median([fit.overlap for fit in clip.fits.values()]) < MIN_OVERLAP:
+        return []  # the mesh lies elsewhere: its area says nothing about the mask's
+    usual = float(np.median(list(ratios.values())))
+    if usual > MAX_MASK_RATIO:
+        return [
+            Finding(
+                "warning",
+                "background-leak",
+                f"the head masks are {usual:.1f} times as large as the tracked head in the median",
+                "leave clothes and background out of the head masks: they do not move with the head",
+            )
+        ]
+    findings = []
+    for is_odd, what, advice in (
+        (lambda r: r > MASK_CHANGE * usual, "larger", "background is taken for head"),
+        (lambda r: r * MASK_CHANGE < usual, "smaller", "parts of the head are missing"),
+    ):
+        odd = [n for n, ratio in ratios.items() if is_odd(ratio)]
+        if odd:
+            worst = max(odd, key=lambda n: abs(np.log(ratios[n] / usual)))
+            findings.append(
+                Finding(
+                    "warning",
+                    "mask-area",
+                    f"the head mask is much {what} than usual against the tracked head in {clip.phrase(odd)} "
+                    f"({ratios[worst] / usual:.2f} times in {clip.name(worst)})",
+                    f"make these masks again: {advice}",
+                    clip.names(odd),
+                )
+            )
+    return findings
+
+
+def exposure(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Image numbers and, in stops against the clip's median, the light of head and of background [n].
+
+    The background is NaN where there is none to see, or where it is a flat colour that was put in.
+    """
+    numbers = [n for n, view in clip.views.items() if view.head_colour is not None]
+    if not numbers:
+        return None
+
+    def stops(colours: list[np.ndarray | None]) -> np.ndarray:
+        level = np.array([np.nan if c is None else c.mean() for c in colours])
+        if np.isnan(level).mean() > 0.5 or np.nanmedian(level) < 4:
+            return np.full(len(level), np.nan)
+        return np.log2(np.maximum(level, 1) / np.nanmedian(level))
+
+    head = stops([clip.views[n].head_colour for n in numbers])
+    background = stops([clip.views[n].background_colour for n in numbers])
+    return np.array(numbers), head, background
+
+
+def _exposure(clip: Clip) -> list[Finding]:
+    """The camera's exposure changes what head and background show alike; a lamp or a turning head does not."""
+    measured = exposure(clip)
+    if measured is None:
+        return []
+    numbers, head, background = measured
+    has_background = bool(np.isfinite(background).all()) and not _composited(clip)
+    both = np.where(np.sign(head) == np.sign(background), np.sign(head), 0) * np.minimum(abs(head), abs(background))
+    change = steady(both if has_background else head)
+    low, high = int(np.argmin(change)), int(np.argmax(change))
+    span = float(change[high] - change[low])
+    if span <= (EXPOSURE if has_background else HEAD_EXPOSURE):
+        return []
+    where = "head and background together" if has_background else "the head"
+    return [
+        Finding(
+            "warning",
+            "exposure",
+            f"the brightness of {where} changes by {span:.2f} stops ({2**span - 1:.0%}) over the clip: darkest about "
+            f"{clip.name(numbers[low])}, brightest about {clip.name(numbers[high])}",
+            "record with exposure and white balance locked; the avatar has one colour and averages the two",
+            clip.names((int(numbers[low]), int(numbers[high]))),
+        )
+    ]
+
+
+def steady(values: np.ndarray) -> np.ndarray:
+    """Moving median over a second, so that one frame does not count as a change of light."""
+    half = min(_STEADY, len(values)) // 2
+    return np.array([np.nanmedian(values[max(0, i - half) : i + half + 1]) for i in range(len(values))])

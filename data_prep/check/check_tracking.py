@@ -1,0 +1,300 @@
+"""Findings about the tracking: unusable frames, the offset, the camera, jumps, and how it lies on the masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.errors import UserError
+from avatar.files.pickles import load_torch_pickle
+from data_prep.check.clip import Clip
+from data_prep.check.findings import Finding, grouped, loss_severity
+from data_prep.check.motion import suddenness
+from data_prep.check.view import TRACKING
+from data_prep.frame_files import describe_numbers
+from data_prep.overlap import MIN_OVERLAP
+
+# A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
+# neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.
+MIN_ROTATION, MIN_TRANSLATION = 3.0, 10.0  # degrees, mm
+# A jump has to stand out of the clip itself, too: a restless clip has large values everywhere.
+TIMES_USUAL = 8.0  # the clip's median
+# Speech goes from open to closed and back within three frames, which is about the spread of the clip's expressions.
+EXPRESSION_SPREADS = 2.0  # root mean square distance from the mean expression
+FOV_RANGE = 4.0, 90.0  # degrees; a head that fills the image from 4 m away; a wide-angle lens that nobody cropped
+MAX_ASPECT = 0.02  # fx against fy; cameras have square pixels
+MAX_OFF_CENTRE = 0.1  # of the image; cropping moves the principal point
+# Of the size of the projected head. On clips whose tracking error is known (0.15 degrees, 0.4 mm, 2%) lips are off by less
+# than 0.018 and the mesh sticks out of the mask by less than 0.01.
+MAX_MOUTH, MAX_OVERHANG = 0.05, 0.05
+MIN_INSIDE = 0.9  # of the mesh without neck; the same clips have 0.99
+_ROBUST_SD = 1.4826  # times the median absolute deviation: the standard deviation of a normal distribution
+_OUTLIER = 6.0  # robust standard deviations
+
+
+def check_tracking(clip: Clip) -> list[Finding]:
+    return [
+        *_unusable(clip),
+        *_repeats(clip),
+        *_offset(clip),
+        *_camera(clip),
+        *_jumps(clip),
+        *_residuals(clip),
+    ]
+
+
+def _unusable(clip: Clip) -> list[Finding]:
+    findings = []
+    for reason, numbers in grouped(clip.tracking.bad).items():
+        first = clip.tracking.paths[numbers[0]]
+        keys = [f"{key} ({what})" for key, what in non_finite_values(first).items()]
+        detail = f"not finite: {', '.join(keys)} in {first.name}" if keys else reason
+        findings.append(
+            Finding(
+                loss_severity(len(numbers), len(clip.files.tracking)),
+                "non-finite" if keys or "is not finite" in reason else "no-face" if "no face" in reason else "tracking",
+                f"the tracking cannot be used in {clip.phrase(numbers)} of {clip.files.title(TRACKING)}: {detail}",
+                "track these frames again, or accept that they are left out of training",
+                clip.names(numbers),
+            )
+        )
+    return findings
+
+
+def non_finite_values(path: Path) -> dict[str, str]:
+    """Key -> `3 of 100 values` for every array of a `.frame` file that holds NaN or infinity."""
+    try:
+        content = load_torch_pickle(path)
+    except UserError:
+        return {}
+    found: dict[str, str] = {}
+
+    def visit(value: Any, key: str) -> None:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                visit(inner, f"{key}.{name}" if key else str(name))
+        elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
+            found[key] = f"{int((~np.isfinite(value)).sum())} of {value.size} values"
+
+    visit(content, "")
+    return found
+
+
+def _repeats(clip: Clip) -> list[Finding]:
+    repeated = repeated_tracking(clip)
+    if not repeated:
+        return []
+    return [
+        Finding(
+            loss_severity(len(repeated), len(clip.pairs())),
+            "tracking-repeats",
+            f"the tracking repeats that of the frame before while the image does not, in {clip.phrase(repeated)}",
+            "the tracker lost the face there: track again, or accept that they are left out of training",
+            clip.names(repeated),
+        )
+    ]
+
+
+def repeated_tracking(clip: Clip) -> list[int]:
+    """Image numbers whose tracking equals the one before, although the image is another."""
+    tracked = dict(clip.tracked())
+    return [
+        n
+        for n, track in tracked.items()
+        if n - 1 in tracked
+        and np.array_equal(track.moving_values(), tracked[n - 1].moving_values())
+        and clip.views[n].digest != clip.views[n - 1].digest
+    ]
+
+
+def _offset(clip: Clip) -> list[Finding]:
+    findings = []
+    if clip.offset is None and clip.head is not None:
+        findings.append(
+            Finding(
+                "error",
+                "frame-offset",
+                clip.offset_evidence.partition("; ")[0].removesuffix(" Give --frame-offset to go on regardless"),
+                "look at the frames, then give --frame-offset (1 where images count from 1 and tracking from 0)",
+            )
+        )
+    if clip.part_offsets is not None and clip.part_offsets[0] != clip.part_offsets[1]:
+        first, last = clip.part_offsets
+        findings.append(
+            Finding(
+                "error",
+                "dropped-frames",
+                f"the image offset is {first} in the first third of the clip and {last} in the last: frames were dropped "
+                "or doubled in between on one side",
+                "extract the frames again without changing the frame rate (ffmpeg -fps_mode passthrough), and track those",
+            )
+        )
+    return findings
+
+
+def _camera(clip: Clip) -> list[Finding]:
+    first = next(iter(clip.tracking.frames.values()), None)
+    if first is None:
+        return []
+    fx, fy, cx, cy = first.intrinsics
+    width, height = first.size
+    findings = []
+    fov = float(np.degrees(2 * np.arctan(0.5 * width / fx)))
+    if not FOV_RANGE[0] <= fov <= FOV_RANGE[1]:
+        findings.append(
+            Finding(
+                "warning",
+                "focal-length",
+                f"a focal length of {fx:.0f} pixels in an image {width} wide is a field of view of {fov:.1f} degrees, "
+                f"outside {FOV_RANGE[0]:.0f} to {FOV_RANGE[1]:.0f}",
+                "give the tracker the camera's focal length, or let it optimise it from a plausible start",
+            )
+        )
+    if abs(fy / fx - 1) > MAX_ASPECT:
+        findings.append(
+            Finding(
+                "warning",
+                "focal-length",
+                f"fx = {fx:.1f} and fy = {fy:.1f} differ by {abs(fy / fx - 1):.0%}: the pixels would not be square",
+                "were the frames stretched after tracking? Resize both sides by one factor",
+            )
+        )
+    off = float(max(abs(cx / width - 0.5), abs(cy / height - 0.5)))
+    if off > MAX_OFF_CENTRE:
+        findings.append(
+            Finding(
+                "warning" if off > 0.5 else "note",
+                "principal-point",
+                f"the principal point ({cx:.1f}, {cy:.1f}) is {off:.0%} of the image away from the centre of "
+                f"{width}x{height}",
+                "was the tracking made before the frames were cropped? Track the cropped frames"
+                if off > 0.5
+                else "nothing, if the frames were cropped off-centre: it is used as it is",
+            )
+        )
+    return findings
+
+
+def _jumps(clip: Clip) -> list[Finding]:
+    tracked = dict(clip.tracked()) or dict(clip.tracking.frames)
+    numbers = list(tracked)
+    if not numbers:
+        return []
+    sudden = suddenness(numbers, list(tracked.values()))
+    expressions = np.stack([track.expression for track in tracked.values()])
+    spread = float(np.sqrt(((expressions - expressions.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    findings = []
+    for what, values, floor, unit in (
+        ("rotation", sudden.rotation, MIN_ROTATION, "degrees"),
+        ("position", sudden.translation, MIN_TRANSLATION, "mm"),
+        ("expression", sudden.expression, EXPRESSION_SPREADS * spread, ""),
+    ):
+        if not np.isfinite(values).any():
+            continue
+        limit = max(floor, TIMES_USUAL * float(np.nanmedian(values)))
+        jumping = [n for n, value in zip(numbers, values, strict=True) if value > limit]
+        if not jumping:
+            continue
+        worst = numbers[int(np.nanargmax(values))]
+        size = f"{np.nanmax(values):.1f} {unit}".strip()
+        findings.append(
+            Finding(
+                "warning",
+                "jumps",
+                f"the tracked {what} jumps at {clip.phrase(jumping)}: {clip.name(worst)} lies {size} from half-way between "
+                f"its neighbours, where {np.nanmedian(values):.2g} is usual",
+                "look at these frames in the tracker's output; track them again or remove them",
+                clip.names(jumping),
+            )
+        )
+    return findings
+
+
+def _residuals(clip: Clip) -> list[Finding]:
+    if not clip.fits:
+        return []
+    numbers = list(clip.fits)
+    fits = list(clip.fits.values())
+    size = np.array([fit.size for fit in fits])
+    overlap, inside = (np.array([getattr(fit, name) for fit in fits]) for name in ("overlap", "inside"))
+    overhang, mouth = np.array([f.overhang for f in fits]) / size, np.array([f.mouth for f in fits]) / size
+    findings = []
+    if np.median(overlap) < MIN_OVERLAP:
+        findings.append(
+            Finding(
+                "error",
+                "residual",
+                f"the tracked head does not lie on the head masks: their overlap (IoU) is {np.median(overlap):.2f} in the "
+                "median",
+                "is the tracking of this video, the frame offset right, and the head model the one it was made with?",
+            )
+        )
+        return findings
+    for what, values, limit, region in (
+        ("the tracked head sticks out of the head mask", overhang, MAX_OVERHANG, "head"),
+        ("the tracked lips are away from the mouth mask", mouth, MAX_MOUTH, "mouth"),
+    ):
+        if not np.isfinite(values).any():
+            continue
+        pixels = values * size
+        usual = float(np.nanmedian(values))
+        if usual > limit:
+            findings.append(
+                Finding(
+                    "warning",
+                    "residual",
+                    f"{what} by {np.nanmedian(pixels):.1f} pixels in the median over the clip ({usual:.1%} of the head's "
+                    f"size)",
+                    f"compare mesh and {region} mask on the page of --out; the tracking or its camera is off",
+                )
+            )
+            continue
+        spread = _ROBUST_SD * float(np.nanmedian(np.abs(values - usual)))
+        off = [n for n, value in zip(numbers, values, strict=True) if value > max(limit, usual + _OUTLIER * spread)]
+        if off:
+            worst = int(np.nanargmax(values))
+            findings.append(
+                Finding(
+                    "warning",
+                    "residual",
+                    f"{what} in {clip.phrase(off)}: {pixels[worst]:.1f} pixels in {clip.name(numbers[worst])}, where "
+                    f"{np.nanmedian(pixels):.1f} is usual",
+                    "look at these frames: is the mask wrong or the tracking? Redo it, or remove the frames",
+                    clip.names(off),
+                )
+            )
+    if np.median(inside) < MIN_INSIDE and not findings:
+        findings.append(
+            Finding(
+                "warning",
+                "residual",
+                f"only {np.median(inside):.0%} of the tracked head (without neck) lies on the head mask, in the median",
+                "is the mask of the whole head with hair, or of the face alone? The rest is trained to be background",
+            )
+        )
+    return findings
+
+
+def behind_camera(clip: Clip) -> list[int]:
+    """Image numbers whose tracked head lies behind the camera."""
+    if clip.head is None:
+        return []
+    centre = clip.head.neutral_vertices().mean(0).numpy()
+    return [n for n, track in clip.tracked() if (track.R @ centre + track.t)[2] <= 0]
+
+
+def check_behind_camera(clip: Clip) -> list[Finding]:
+    behind = behind_camera(clip)
+    if not behind:
+        return []
+    return [
+        Finding(
+            loss_severity(len(behind), len(clip.pairs())),
+            "behind-camera",
+            f"the tracked head is behind the camera in frames {describe_numbers(behind, name=clip.name)}",
+            "track these frames again, or accept that they are left out of training",
+            clip.names(behind),
+        )
+    ]

@@ -1,0 +1,213 @@
+"""A tracked folder, read once from end to end; what does not work is gathered instead of raised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import torch
+
+from avatar.errors import UserError
+from avatar.head.assets import HeadAssets
+from avatar.head.model import HeadModel
+from data_prep.check.findings import frames_phrase
+from data_prep.check.fit import Fit, MeshProjector, fit_of_masks
+from data_prep.check.masks import read_masks
+from data_prep.check.view import IMAGE, TRACKING, View, look_at
+from data_prep.formats import METRICAL_TRACKER, open_tracked_folder
+from data_prep.frame_files import FrameFiles
+from data_prep.frame_offset import OffsetEstimate, detect_offset
+from data_prep.metrical_tracker import read_tracking
+from data_prep.tracked_folder import TrackedFolder
+from data_prep.tracking import FrameTrack, Tracking, fit_coefficients
+
+MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
+GIVEN = "given with --frame-offset"
+T = TypeVar("T")
+
+
+class Progress(Protocol):
+    """Passes items through, of which there will be `total`, and shows how far it is."""
+
+    def __call__(self, items: Iterable[T], total: int, what: str) -> Iterable[T]: ...
+
+
+def silent(items: Iterable[T], total: int, what: str) -> Iterable[T]:
+    return items
+
+
+@dataclass(frozen=True)
+class Clip:
+    source: TrackedFolder
+    tracking: Tracking
+    complaints: tuple[tuple[str, str], ...]  # (which check, sentence): what stops `prepare` while reading
+    head: HeadModel | None
+    offset: int | None  # image number - tracking number; None where it could not be found
+    offset_evidence: str  # how it was found, or why it was not
+    part_offsets: tuple[int, int] | None  # of the first and the last third, where both are clear
+    views: dict[int, View] = field(default_factory=dict)  # by image number
+    fits: dict[int, Fit] = field(default_factory=dict)  # by image number
+    steps: dict[int, float] = field(default_factory=dict)  # image number -> mean grey-level change since the one before
+
+    @property
+    def files(self) -> FrameFiles:
+        return self.source.files
+
+    @cached_property
+    def _listed_names(self) -> dict[int, str]:
+        return self.files.frame_names() if self.source.is_paired else {}
+
+    def name(self, number: int) -> str:
+        """How the user knows a frame: by its number, or by its image's name where a listing has the frames."""
+        return self._listed_names.get(number, f"{number:05d}")
+
+    def names(self, numbers: Iterable[int]) -> tuple[str, ...]:
+        return tuple(self.name(number) for number in numbers)
+
+    def phrase(self, numbers: Sequence[int]) -> str:
+        return frames_phrase(numbers, self.name)
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """(image number, tracking number) of everything that has a partner, usable or not."""
+        if self.offset is None:
+            return []
+        numbers = {*self.tracking.frames, *self.tracking.bad}
+        return [(n + self.offset, n) for n in sorted(numbers) if n + self.offset in self.files.images]
+
+    def tracked(self) -> Iterator[tuple[int, FrameTrack]]:
+        """(image number, track) of the pairs whose tracking can be read."""
+        for image, number in self.pairs():
+            if number in self.tracking.frames:
+                yield image, self.tracking.frames[number]
+
+    def is_whole(self, image: int) -> bool:
+        """Whether the image and its masks can be read and have one size."""
+        view = self.views.get(image)
+        return view is not None and not view.problems and len(set(view.sizes.values())) == 1
+
+    def size(self) -> tuple[int, int] | None:
+        """(width, height) of the first image that can be read."""
+        return next((view.sizes[IMAGE] for view in self.views.values() if IMAGE in view.sizes), None)
+
+
+def read_clip(
+    folder: Path,
+    assets: HeadAssets | None,
+    tracking: Path | None,
+    frame_offset: int | None,
+    format: str | None = None,
+    progress: Progress = silent,
+) -> Clip:
+    """Read everything. Raises UserError only when the folder's files cannot be listed."""
+    complaints: list[tuple[str, str]] = []
+    source = open_tracked_folder(folder, tracking, format, lambda message: complaints.append(("layout", message)))
+    try:
+        source.refuse_offset(frame_offset)
+    except UserError as error:
+        complaints.append(("frame-offset", str(error)))
+    views, steps = _read_views(source.files, progress)
+    size = next((view.sizes[IMAGE] for view in views.values() if IMAGE in view.sizes), None)
+    tracks = _read_tracking(source, assets, size, lambda message: complaints.append(("tracking", message)))
+    head = None
+    if assets is not None and tracks.frames:
+        try:
+            tracks = fit_coefficients(tracks, assets)
+            head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
+        except UserError as error:
+            complaints.append(("head-model", str(error)))
+    offset, evidence = frame_offset, GIVEN
+    if source.is_paired:
+        offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
+    clip = Clip(source, tracks, tuple(complaints), head, offset, evidence, None, views, steps=steps)
+    if head is None or not clip.files.images:
+        return clip
+    if not source.is_paired:
+        clip = _with_offset(clip, head, frame_offset)
+    return replace(clip, fits=_measure_fits(clip, head, progress))
+
+
+def _read_tracking(
+    source: TrackedFolder,
+    assets: HeadAssets | None,
+    size: tuple[int, int] | None,
+    complain: Callable[[str], object],
+) -> Tracking:
+    if source.format == METRICAL_TRACKER:  # its files say it all
+        return read_tracking(source.files.tracking, complain)
+    if assets is None or size is None:
+        return Tracking({}, {}, [], source.files.tracking)
+    return source.read(assets, size, complain)
+
+
+def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View], dict[int, float]]:
+    views: dict[int, View] = {}
+    steps: dict[int, float] = {}
+    previous: tuple[int, np.ndarray] | None = None
+    numbers = list(files.images)
+    with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
+        looks = pool.map(lambda n: look_at(_files_of(files, n), files.decode_parsing), numbers)
+        for number, view in zip(numbers, progress(looks, len(numbers), "images"), strict=True):
+            views[number] = replace(view, grey=None)
+            if view.grey is None:
+                continue
+            grey = view.grey.astype(np.int16)
+            if previous is not None and previous[0] == number - 1 and previous[1].shape == grey.shape:
+                steps[number] = float(np.abs(grey - previous[1]).mean())
+            previous = number, grey
+    return views, steps
+
+
+def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, Fit]:
+    tracks = {image: track for image, track in clip.tracked() if clip.is_whole(image)}
+    project = MeshProjector(head, next(iter(clip.tracking.frames.values())).intrinsics)
+
+    def measure(number: int) -> Fit | None:
+        mask, mouth = read_masks(clip.files, number)
+        return None if mask is None else fit_of_masks(project, tracks[number], mask, mouth)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # as do matrix products
+        fits = pool.map(measure, tracks)
+        found = dict(zip(tracks, progress(fits, len(tracks), "mesh against masks"), strict=True))
+    return {number: fit for number, fit in found.items() if fit is not None}
+
+
+def _with_offset(clip: Clip, head: HeadModel, given: int | None) -> Clip:
+    """Find the offset of the whole clip, and of its first and last third: they differ where frames were dropped."""
+    numbers = list(clip.tracking.frames)
+    third = len(numbers) // 3
+    parts: tuple[int, int] | None = None
+    if third >= MIN_PART:
+        first, last = (_estimate(clip, head, part) for part in (numbers[:third], numbers[-third:]))
+        if isinstance(first, OffsetEstimate) and isinstance(last, OffsetEstimate):
+            parts = first.offset, last.offset
+    if given is not None:
+        return replace(clip, part_offsets=parts)
+    estimate = _estimate(clip, head, numbers)
+    if isinstance(estimate, OffsetEstimate):
+        return replace(clip, offset=estimate.offset, offset_evidence=estimate.sentence(), part_offsets=parts)
+    return replace(clip, offset=None, offset_evidence=estimate, part_offsets=parts)
+
+
+def _estimate(clip: Clip, head: HeadModel, numbers: list[int]) -> OffsetEstimate | str:
+    """The offset of these tracking frames, or the sentence that says why it is not clear."""
+    tracks = {n: clip.tracking.frames[n] for n in numbers}
+    images, heads, mouths = (
+        {n: path for n, path in found.items() if clip.is_whole(n)}
+        for found in (clip.files.images, clip.files.head_masks or clip.files.alphas, clip.files.mouth_masks)
+    )
+    if not images:
+        return "no image can be read"
+    try:
+        return detect_offset(head, tracks, next(iter(tracks.values())).intrinsics, images, heads, mouths)
+    except UserError as error:
+        return str(error)
+
+
+def _files_of(files: FrameFiles, number: int) -> Mapping[str, Path]:
+    kinds = {kind: found for kind, found in files.of_kind().items() if kind != TRACKING}
+    return {kind: found[number] for kind, found in kinds.items() if number in found}

@@ -1,0 +1,62 @@
+"""What a check found: how bad it is, what is wrong and where, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from avatar.data.source import DEFAULT_LEFT_OUT
+from data_prep.frame_files import describe_numbers
+
+Severity = Literal["error", "warning", "note"]
+ORDER: tuple[Severity, ...] = ("error", "warning", "note")
+FINE, WARNINGS, ERRORS = 0, 1, 2  # exit status
+
+
+@dataclass(frozen=True)
+class Finding:
+    severity: Severity  # error: training fails or is spoilt; warning: it is made worse; note: good to know
+    check: str  # which check, the same word in every release
+    problem: str  # one sentence, with the names of files and frames
+    advice: str  # one sentence
+    frames: tuple[str, ...] = ()  # all that are concerned, where the sentence has to cut the list
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def exit_status(findings: Iterable[Finding]) -> int:
+    """0 when all is fine (notes do not count), 1 with warnings, 2 with errors."""
+    severities = {finding.severity for finding in findings}
+    return ERRORS if "error" in severities else WARNINGS if "warning" in severities else FINE
+
+
+def by_severity(findings: Sequence[Finding]) -> list[Finding]:
+    """Errors first; the order within a severity stays."""
+    return sorted(findings, key=lambda finding: ORDER.index(finding.severity))
+
+
+def count_phrase(findings: Sequence[Finding]) -> str:
+    """`2 errors, 1 warning, 3 notes`."""
+    counts = [(sum(finding.severity == severity for finding in findings), severity) for severity in ORDER]
+    return ", ".join(f"{count} {severity}{'s' * (count != 1)}" for count, severity in counts)
+
+
+def loss_severity(lost: int, total: int) -> Severity:
+    """Frames that cannot be used are left out, up to the share above which `prepare` refuses the folder."""
+    return "error" if lost > DEFAULT_LEFT_OUT * total else "warning"
+
+
+def frames_phrase(numbers: Sequence[int], name: Callable[[int], str]) -> str:
+    """`frame 00003` or `5 frames (00003-00006, 00009)`, each called by `name`."""
+    listed = describe_numbers(list(numbers), name=name)
+    return f"frame {listed}" if len(numbers) == 1 else f"{len(numbers)} frames ({listed})"
+
+
+def grouped(reasons: Mapping[int, str]) -> dict[str, list[int]]:
+    """Reason -> numbers."""
+    groups: dict[str, list[int]] = {}
+    for number, reason in reasons.items():
+        groups.setdefault(reason, []).append(number)
+    return groups

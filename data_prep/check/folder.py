@@ -1,0 +1,156 @@
+"""`avatar check FOLDER`: read everything, gather all findings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.data.split import DEFAULT_SIZES, SplitSizes
+from avatar.errors import UserError
+from avatar.head.assets import HeadAssets
+from data_prep.check.check_files import check_files, from_sentence, lost_frames
+from data_prep.check.check_images import check_images
+from data_prep.check.check_tracking import behind_camera, check_behind_camera, check_tracking, repeated_tracking
+from data_prep.check.clip import Clip, Progress, read_clip, silent
+from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
+from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status
+from data_prep.check.view import HEAD, TRACKING
+from data_prep.pairing import describe_reasons
+
+VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
+
+
+@dataclass(frozen=True)
+class Check:
+    """The outcome of a check."""
+
+    folder: Path
+    findings: tuple[Finding, ...]  # errors first
+    clip: Clip | None  # None where there is no folder
+    coverage: Coverage | None
+
+    @property
+    def status(self) -> int:
+        return exit_status(self.findings)
+
+    def summary(self) -> str:
+        return f"{count_phrase(self.findings)}: {VERDICTS[self.status]}"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "folder": str(self.folder),
+            "exit_status": self.status,
+            "summary": self.summary(),
+            "facts": {} if self.clip is None else facts(self.clip, self.coverage),
+            "findings": [finding.to_dict() for finding in self.findings],
+        }
+
+
+def check_tracked_folder(
+    folder: Path,
+    load_head: Callable[[], HeadAssets],
+    *,
+    tracking: Path | None = None,
+    frame_offset: int | None = None,
+    format: str | None = None,
+    split: SplitSizes = DEFAULT_SIZES,
+    progress: Progress = silent,
+) -> Check:
+    """Check a tracked folder as `prepare` would read it. A folder that is not there or has no head model is a finding."""
+    findings: list[Finding] = []
+    assets = None
+    try:
+        assets = load_head()
+    except UserError as error:
+        findings.append(from_sentence("head-model", str(error)))
+    try:
+        clip = read_clip(folder.resolve(), assets, tracking, frame_offset, format, progress)
+    except UserError as error:
+        return Check(folder, (from_sentence("layout", str(error)),), None, None)
+    findings += check_files(clip) + check_tracking(clip) + check_behind_camera(clip) + check_images(clip)
+    findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
+    lost = left_out(clip)
+    if not any(finding.severity == "error" for finding in findings):
+        findings += lost_frames(clip, lost)
+    usable = [image for image, _ in clip.tracked() if image not in lost]
+    coverage = None
+    if clip.offset is not None:
+        measured = measure_coverage(clip, usable, split)
+        if isinstance(measured, Finding):
+            findings.append(measured)
+        else:
+            coverage = measured
+            findings += check_coverage(clip, measured)
+    return Check(folder, tuple(by_severity(findings)), clip, coverage)
+
+
+def left_out(clip: Clip) -> dict[int, str]:
+    """Image number -> why the frame cannot be used, for the pairs of the clip."""
+    reasons: dict[int, str] = {}
+    repeated, behind = set(repeated_tracking(clip)), set(behind_camera(clip))
+    for image, number in clip.pairs():
+        view = clip.views[image]
+        absent = [
+            clip.files.title(k) for k, f in clip.files.of_kind().items() if k != TRACKING and f and image not in f
+        ]
+        if number in clip.tracking.bad:
+            reasons[image] = clip.tracking.bad[number]
+        elif view.problems:
+            reasons[image] = "a file cannot be read"
+        elif absent:
+            reasons[image] = f"it has no file in {', '.join(absent)}"
+        elif view.brightest.get(HEAD) == 0:
+            reasons[image] = "its head mask is empty"
+        elif image in behind:
+            reasons[image] = "the tracked head is behind the camera"
+        elif image in repeated:
+            reasons[image] = "the tracking repeats that of the frame before, while the image does not"
+    return reasons
+
+
+def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
+    """Figures about the clip, none of which is a judgement."""
+    found: dict[str, Any] = {"format": clip.source.format}
+    for kind, paths in clip.files.of_kind().items():
+        if paths or not clip.source.is_paired:  # the other formats have no place for some kinds
+            found[f"files in {clip.files.title(kind)}"] = len(paths)
+    if (size := clip.size()) is not None:
+        found["image size"] = f"{size[0]}x{size[1]}"
+    found |= {"frame offset": clip.offset, "offset found": clip.offset_evidence}
+    first = next(iter(clip.tracking.frames.values()), None)
+    if first is not None:
+        found["intrinsics fx fy cx cy"] = [round(float(value), 3) for value in first.intrinsics]
+        fov = np.degrees(2 * np.arctan(0.5 * first.size[0] / first.intrinsics[0]))
+        found["field of view"] = f"{fov:.1f} degrees"
+    if clip.fits:
+        for name, title in (
+            ("overlap", "overlap of mesh and head mask (IoU), median"),
+            ("overhang", "mesh sticks out of the head mask, median, pixels"),
+            ("mouth", "lips to mouth mask, median, pixels"),
+        ):
+            values = np.array([getattr(fit, name) for fit in clip.fits.values()])
+            if np.isfinite(values).any():
+                found[title] = round(float(np.nanmedian(values)), 3)
+    lost = left_out(clip)
+    found["frames left out"] = describe_reasons(lost, clip.name) if lost else 0
+    if coverage is not None:
+        found["usable frames"] = len(coverage.images)
+        found["training frames"], found["held-out frames"] = len(coverage.split.train), len(coverage.split.test)
+        for name in ("yaw", "pitch", "roll"):
+            low, high = np.percentile(getattr(coverage.angles, name), [0, 100])
+            found[f"{name}"] = f"{low:.1f} to {high:.1f} degrees"
+    return found
+
+
+def as_text(check: Check) -> str:
+    """For the terminal: figures, findings, verdict."""
+    lines = [f"{check.folder}"]
+    if check.clip is not None:
+        lines += [f"  {name}: {value}" for name, value in facts(check.clip, check.coverage).items()]
+    for finding in check.findings:
+        lines += ["", f"{finding.severity.upper()} [{finding.check}] {finding.problem}", f"  -> {finding.advice}"]
+    return "\n".join([*lines, "", check.summary()])

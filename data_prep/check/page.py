@@ -1,0 +1,119 @@
+"""The page that `avatar check --out` writes."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+import avatar
+from avatar.errors import UserError
+from avatar.html import Markup, document, element, fold, join, picture, section, tiles
+from data_prep.check.clip import Clip
+from data_prep.check.findings import Finding
+from data_prep.check.folder import Check, facts
+from data_prep.check.overlay import draw_overlays
+from data_prep.check.plots import course_plots, coverage_plots
+
+PAGE, TABLE = "index.html", "frames.csv"
+_BADGES = ("fine", "warning", "error")  # by exit status
+_FIT_COLUMNS = ("overlap", "inside", "overhang", "mouth", "mask_ratio", "size")
+
+
+def write_page(check: Check, cost: Mapping[str, str] | None, out: Path) -> Path:
+    """Write OUT/index.html, which needs nothing else, and OUT/frames.csv; returns the page."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        page = out / PAGE
+        page.write_text(render_page(check, cost), encoding="utf-8")
+        if check.clip is not None:
+            write_frames(check.clip, out / TABLE)
+    except OSError as error:
+        raise UserError(f"the page cannot be written to {out} ({error.strerror}); choose another --out") from error
+    return page
+
+
+def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
+    badge = _BADGES[check.status]
+    header = element(
+        "header",
+        element("h1", f"Check of {check.folder.name or check.folder}"),
+        element("p", str(check.folder), class_="soft"),
+        element("p", element("span", badge, class_=f"badge {badge}"), f" {check.summary()}", class_="verdict"),
+    )
+    parts: list[Markup] = [header, section("Findings", *_findings(check))]
+    if check.clip is not None:
+        parts += _pictures(check.clip)
+        if check.coverage is not None:
+            plots = [*coverage_plots(check.coverage), *course_plots(check.clip)]
+            parts.append(section("Coverage and course", element("div", *plots, class_="plots")))
+        if cost is not None:
+            parts.append(section("What training will take", tiles(cost)))
+        figures = {name: _shown(value) for name, value in facts(check.clip, check.coverage).items()}
+        evidence = figures.pop("offset found")
+        parts.append(section("Figures", element("p", f"Offset: {evidence}.", class_="soft"), tiles(figures)))
+    parts.append(element("p", f"avatar {avatar.__version__} check", class_="soft"))
+    return document(f"Check of {check.folder.name}", parts)
+
+
+def write_frames(clip: Clip, path: Path) -> None:
+    """One line per image: what was measured of it; empty where it could not be."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("image", "change", "covered", "haze", "holes", "specks", *_FIT_COLUMNS))
+        for number, view in clip.views.items():
+            matte = [getattr(view.matte, name, None) for name in ("covered", "haze", "holes", "specks")]
+            fit = [getattr(clip.fits.get(number), name, None) for name in _FIT_COLUMNS]
+            values = (clip.steps.get(number), *matte, *fit)
+            cells = ("" if v is None or np.isnan(v) else f"{v:.5f}" for v in values)
+            writer.writerow((clip.files.images[number].name, *cells))
+
+
+def _findings(check: Check) -> list[Markup]:
+    if not check.findings:
+        return [element("p", "Nothing was found that could spoil training.")]
+    return [_finding(finding) for finding in check.findings]
+
+
+def _finding(finding: Finding) -> Markup:
+    listed = fold(f"{len(finding.frames)} names", element("p", ", ".join(finding.frames))) if finding.frames[1:] else ""
+    return element(
+        "div",
+        element("span", finding.severity, class_="badge"),
+        " ",
+        element("code", finding.check),
+        element("p", element("strong", f"{finding.problem[:1].upper()}{finding.problem[1:]}.")),
+        element("p", f"{finding.advice[:1].upper()}{finding.advice[1:]}.", class_="soft"),
+        listed,
+        class_=f"finding {finding.severity}",
+    )
+
+
+def _pictures(clip: Clip) -> list[Markup]:
+    overlays = draw_overlays(clip)
+    if not overlays:
+        return []
+    key = join(
+        join((element("span", class_=f"key {name}"), title))
+        for name, title in (
+            ("mesh", "tracked mesh"),
+            ("mask", "head mask"),
+            ("lips", "tracked lips"),
+            ("mouth", "mouth mask"),
+        )
+    )
+    images = [picture(overlay.image, overlay.caption) for overlay in overlays]
+    text = "Half of the frames are spread over the clip, half are those that fit worst."
+    return [
+        section("The tracked head on the frames", element("p", text, key, class_="soft"), _gallery(images)),
+    ]
+
+
+def _gallery(images: list[Markup]) -> Markup:
+    return element("div", *images, class_="gallery")
+
+
+def _shown(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else "unknown" if value is None else str(value)

@@ -1,0 +1,125 @@
+"""What one image with its masks shows: can they be read, how do they fit together, what light is in them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from avatar.data.images import decode_image, decode_mask, read_bytes
+from avatar.data.subject import FAINTEST_MATTE
+from avatar.errors import UserError
+from data_prep import face_parsing
+from data_prep.face_parsing import mask_of
+
+# As FrameFiles.of_kind names them.
+IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
+PARSING, TRACKING = "face parsing", "checkpoint"
+MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distances are given in the frame's own pixels
+FAR = 0.05  # of the image width: further from the person than soft hair reaches
+_ON = 127
+Decode = Callable[[bytes, Path], np.ndarray]
+_MIN_PIXELS = 64  # below, a mean colour says nothing
+
+
+@dataclass(frozen=True)
+class Matte:
+    """The weight that training gives each pixel: matte times head mask, as `Frame.composite` does."""
+
+    covered: float  # share of the image with a weight above one half
+    haze: float  # mean weight far from the person; 0 where the background is gone
+    holes: float  # share of the inner head mask that the matte makes transparent
+    specks: float  # area of everything but the largest piece / area of the largest piece
+
+
+@dataclass(frozen=True)
+class View:
+    problems: dict[str, str] = field(default_factory=dict)  # kind of file -> why it cannot be read
+    sizes: dict[str, tuple[int, int]] = field(default_factory=dict)  # kind -> width, height
+    brightest: dict[str, int] = field(default_factory=dict)  # kind of mask -> its largest value
+    digest: bytes = b""  # of the image file
+    grey: np.ndarray | None = None  # uint8 [h, w] at the measured size
+    head_colour: np.ndarray | None = None  # float [3], mean over the head mask
+    background_colour: np.ndarray | None = None  # float [3], mean over what the matte calls background
+    matte: Matte | None = None
+
+
+def measured_size(width: int, height: int) -> tuple[int, int]:
+    scale = min(1.0, MEASURED_WIDTH / width)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> View:
+    """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing.
+
+    `decode_parsing` gives the classes of a PARSING file, out of which the head mask is made.
+    """
+    problems: dict[str, str] = {}
+    pixels: dict[str, np.ndarray] = {}
+    digest = b""
+    for kind, path in paths.items():
+        decode: Decode = decode_image if kind == IMAGE else decode_parsing if kind == PARSING else decode_mask
+        try:
+            data = read_bytes(path)
+            pixels[kind] = decode(data, path)
+        except UserError as error:
+            problems[kind] = str(error)
+            continue
+        if kind == IMAGE:
+            digest = hashlib.blake2b(data, digest_size=16).digest()
+    sizes = {kind: (array.shape[1], array.shape[0]) for kind, array in pixels.items()}
+    if PARSING in pixels:
+        pixels[HEAD] = mask_of(pixels.pop(PARSING), face_parsing.HEAD)
+    brightest = {kind: int(array.max()) for kind, array in pixels.items() if kind != IMAGE}
+    if IMAGE not in pixels:
+        return View(problems, sizes, brightest, digest)
+    width, height = sizes[IMAGE]
+    size = measured_size(width, height)
+    small = {
+        kind: array if size == (width, height) else cv2.resize(array, size, interpolation=cv2.INTER_AREA)
+        for kind, array in pixels.items()
+        if array.shape[:2] == (height, width)
+    }
+    image, alpha, head = small[IMAGE], small.get(ALPHA), small.get(HEAD)
+    if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
+        head = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))  # as data/subject.py does
+    matte = None
+    if alpha is not None and head is not None:
+        matte = measure_matte(alpha, head)
+    elif head is not None and ALPHA not in paths:
+        matte = measure_matte(np.full_like(head, 255), head)
+    return View(
+        problems,
+        sizes,
+        brightest,
+        digest,
+        grey=cv2.cvtColor(image, cv2.COLOR_RGB2GRAY),
+        head_colour=None if head is None else _mean_colour(image, head > _ON),
+        background_colour=None if alpha is None else _mean_colour(image, alpha <= 2),
+        matte=matte,
+    )
+
+
+def measure_matte(alpha: np.ndarray, head: np.ndarray) -> Matte:
+    """From the matte and the head mask, uint8 [h, w]."""
+    weight = alpha.astype(np.float32) * head * (1 / 255**2)
+    on = (weight > 0.5).astype(np.uint8)
+    far = cv2.distanceTransform(1 - on, cv2.DIST_L2, 3) > FAR * weight.shape[1] if on.any() else on == 0
+    border = max(3, round(0.04 * weight.shape[1])) | 1
+    inner = cv2.erode((head > _ON).astype(np.uint8), np.ones((border, border), np.uint8)) > 0
+    _, _, stats, _ = cv2.connectedComponentsWithStats(on)
+    areas = np.sort(stats[1:, cv2.CC_STAT_AREA])[::-1]
+    return Matte(
+        covered=float(on.mean()),
+        haze=float(weight[far].mean()) if far.any() else 0.0,
+        holes=float((alpha[inner] <= _ON).mean()) if inner.any() else 0.0,
+        specks=float(areas[1:].sum() / areas[0]) if len(areas) else 0.0,
+    )
+
+
+def _mean_colour(image: np.ndarray, where: np.ndarray) -> np.ndarray | None:
+    return image[where].mean(axis=0) if int(where.sum()) >= _MIN_PIXELS else None

@@ -1,0 +1,63 @@
+"""Which program's layout a tracked folder has, told from its files, never from its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from avatar.errors import UserError, refuse
+from data_prep import imavatar, insta, vhap
+from data_prep.frame_files import find_frame_files
+from data_prep.metrical_tracker import read_tracking
+from data_prep.tracked_folder import TrackedFolder
+from data_prep.transforms import ListedFrame, read_listings
+
+METRICAL_TRACKER = "metrical-tracker"
+_LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}
+FORMATS = (METRICAL_TRACKER, *_LISTED)
+
+
+def open_tracked_folder(
+    folder: Path,
+    tracking: Path | None = None,
+    format: str | None = None,
+    complain: Callable[[str], object] = refuse,
+) -> TrackedFolder:
+    """The folder in the form that `prepare` works on; `format` is one of FORMATS, or None to tell it from the files.
+
+    Raises UserError when the folder is in none of the formats, or in several, or not in the one that was asked for.
+    What is wrong with the files of a metrical-tracker folder goes to `complain`, as in `find_frame_files`.
+    """
+    if format not in (None, *FORMATS):
+        raise UserError(f"--format must be one of {', '.join(FORMATS)}, not {format!r}")
+    frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
+    name = format or detect_format(folder, frames)
+    if name == METRICAL_TRACKER:
+        files = find_frame_files(folder, tracking, complain)
+        return TrackedFolder(name, files, lambda head, size, complain: read_tracking(files.tracking, complain))
+    if not _LISTED[name].recognise(frames):
+        raise UserError(f"{folder} is not a folder of {name}'s: docs/data.md says which files and values belong to it")
+    if name == insta.NAME:
+        return insta.open_folder(folder, frames, tracking)
+    if tracking is not None:
+        raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking is named by the listing")
+    return _LISTED[name].open_folder(folder, frames)
+
+
+def detect_format(folder: Path, frames: list[ListedFrame]) -> str:
+    """A folder with imgs/ is metrical-tracker's; listings are told apart by what their first frame has."""
+    found = [METRICAL_TRACKER] if (folder / "imgs").is_dir() else []
+    found += [name for name, module in _LISTED.items() if module.recognise(frames)]
+    if len(found) > 1:
+        raise UserError(f"{folder} could be a folder of {' or '.join(found)}; say which with --format")
+    if not found and frames:
+        first = frames[0]
+        hint = (
+            "its `expression` is not FLAME's, as in NeRFace's data; track the video with one of the programs below: "
+            if "expression" in first.values
+            else ""
+        )
+        raise UserError(
+            f"{first.listing} is a listing of frames, but {hint}it has no FLAME parameters of {', '.join(_LISTED)}"
+        )
+    return found[0] if found else METRICAL_TRACKER

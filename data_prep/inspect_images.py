@@ -1,0 +1,132 @@
+"""A look at every image and mask of a tracked folder: can it be decoded, and does it have the size of the others?"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from avatar.data.images import decode_image, decode_mask, read_bytes, read_image, read_mask
+from avatar.errors import UserError
+from data_prep.frame_files import FrameFiles
+
+_SAMPLES = 16
+_BACKGROUNDS = {"white": (255, 255, 255), "black": (0, 0, 0), "green": (0, 255, 0)}
+_BACKGROUND_TOLERANCE = 3.0  # of 255, mean; JPEG noise on a flat colour is below 1
+_MIN_BACKGROUND = 0.02  # of the image; with less there is nothing to judge by
+
+
+@dataclass(frozen=True)
+class Inspection:
+    width: int
+    height: int
+    digests: dict[int, bytes]  # image number -> hash of the contents of image and masks
+    image_digests: dict[int, bytes]
+    bad: dict[int, str]  # image number -> why it cannot be used
+
+
+@dataclass(frozen=True)
+class _Seen:
+    digest: bytes
+    size: tuple[int, int]  # width, height; (0, 0) where undecodable
+    maximum: int
+    problem: str | None
+
+
+def inspect_images(files: FrameFiles) -> Inspection:
+    """Decode everything once. Raises UserError when sizes differ or masks are not 0 to 255, naming both sides."""
+    images = _look_at(files.images, decode_image)
+    bad = {n: seen.problem for n, seen in images.items() if seen.problem is not None}
+    sizes = {n: seen.size for n, seen in images.items() if seen.problem is None}
+    if not sizes:
+        raise UserError(
+            f"none of the {len(images)} images in {next(iter(files.images.values())).parent} can be read: "
+            f"{next(iter(bad.values()))}"
+        )
+    first = next(iter(sizes))
+    for number, size in sizes.items():
+        if size != sizes[first]:
+            raise UserError(
+                f"{files.images[number]} is {_x(size)} pixels but {files.images[first].name} is {_x(sizes[first])}; "
+                "all frames must have one size"
+            )
+    digests = {n: [seen.digest] for n, seen in images.items()}
+    kinds = {
+        "alpha": (files.alphas, decode_mask),
+        "head mask": (files.head_masks, decode_mask),
+        "mouth mask": (files.mouth_masks, decode_mask),
+        "face parsing": (files.parsing, files.decode_parsing),
+    }
+    for kind, (paths, decode) in kinds.items():
+        if not paths:
+            continue
+        masks = _look_at({n: p for n, p in paths.items() if n in files.images}, decode)
+        for number, seen in masks.items():
+            digests[number].append(seen.digest)
+            if seen.problem is not None:
+                bad.setdefault(number, seen.problem)
+            elif seen.size != sizes[first]:
+                raise UserError(
+                    f"{paths[number]} is {_x(seen.size)} pixels but the images are {_x(sizes[first])}; "
+                    "make the masks at the size of the images"
+                )
+            elif kind in ("head mask", "face parsing") and seen.maximum == 0:
+                bad.setdefault(number, f"{paths[number].name} is empty: no head was found")
+        brightest = max((seen.maximum for seen in masks.values()), default=255)
+        if brightest == 1 and kind != "face parsing":
+            raise UserError(
+                f"the {kind} files in {next(iter(paths.values())).parent} hold 0 and 1; multiply them by 255"
+            )
+        for number in files.images.keys() - masks.keys():
+            bad.setdefault(number, f"it has no {kind}")
+    width, height = sizes[first]
+    return Inspection(
+        width=width,
+        height=height,
+        digests={n: hashlib.blake2b(b"".join(parts), digest_size=16).digest() for n, parts in digests.items()},
+        image_digests={n: seen.digest for n, seen in images.items()},
+        bad=dict(sorted(bad.items())),
+    )
+
+
+def composited_background(files: FrameFiles, bad: Mapping[int, str]) -> str | None:
+    """The name of the flat colour that lies behind the person in all sampled frames, or None.
+
+    Frames that were composited before they were matted have alpha squared at their edges when composited again.
+    """
+    usable = [n for n in files.images if n in files.alphas and n not in bad]
+    sums, count, pixels = np.zeros((len(_BACKGROUNDS),)), 0, 0
+    for number in usable[:: max(1, len(usable) // _SAMPLES)]:
+        background = read_mask(files.alphas[number]) <= 2
+        colours = read_image(files.images[number])[background].astype(np.float64)
+        for i, flat in enumerate(_BACKGROUNDS.values()):
+            sums[i] += np.abs(colours - flat).sum() / 3
+        count += len(colours)
+        pixels += background.size
+    if count < _MIN_BACKGROUND * max(pixels, 1):
+        return None
+    nearest = int(sums.argmin())
+    return list(_BACKGROUNDS)[nearest] if sums[nearest] / count <= _BACKGROUND_TOLERANCE else None
+
+
+def _look_at(paths: Mapping[int, Path], decode: Callable[[bytes, Path], np.ndarray]) -> dict[int, _Seen]:
+    def look(path: Path) -> _Seen:
+        data = b""
+        try:
+            data = read_bytes(path)
+            pixels = decode(data, path)
+        except UserError as error:
+            return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (0, 0), 0, str(error))
+        height, width = pixels.shape[:2]
+        return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (width, height), int(pixels.max()), None)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
+        return dict(zip(paths, pool.map(look, paths.values()), strict=True))
+
+
+def _x(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

@@ -1,0 +1,51 @@
+"""A tracked folder and its head model, opened as a subject."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from avatar.data.source import Source
+from avatar.data.split import SplitSizes
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.head.assets import HeadAssets, load_head_assets
+from data_prep.prepare import prepare
+
+HEAD_VARIABLE = "AVATAR_HEAD"
+
+
+def find_head(folder: Path, given: Path | None = None) -> Path:
+    """The head model of a subject: the one given, else FOLDER/head_model, else $AVATAR_HEAD; UserError otherwise."""
+    check_folder(folder)
+    if given is not None:
+        return given
+    if (folder / "head_model").is_dir():
+        return folder / "head_model"
+    if named := os.environ.get(HEAD_VARIABLE):
+        return Path(named)
+    raise UserError(
+        f"no head model for {folder}: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can be had "
+        "from https://flame.is.tue.mpg.de; put generic_model.pkl, head_template.obj and FLAME_masks.pkl into one folder"
+    )
+
+
+def check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give the tracked video folder (docs/data.md)")
+
+
+def open_subject(
+    source: Source,
+    sizes: SplitSizes | None = None,
+    say: Callable[[str], object] = print,
+    assets: HeadAssets | None = None,
+) -> tuple[Subject, HeadAssets]:
+    """Prepare the subject (from the cache when nothing changed) and open it with its head model.
+
+    `assets` spares reading the head model where it is known. Raises UserError as `prepare` does.
+    """
+    check_folder(source.folder)
+    assets = assets or load_head_assets(source.head)
+    return Subject.open(prepare(source, assets, split=sizes, say=say)), assets

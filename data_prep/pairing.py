@@ -1,0 +1,110 @@
+"""Image numbers with their tracking numbers, and what has to be left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar.errors import UserError
+from data_prep.frame_files import FrameFiles, describe_numbers, gaps
+from data_prep.frame_offset import RADIUS
+from data_prep.inspect_images import Inspection
+from data_prep.tracking import Tracking
+
+_REASONS_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Pairing:
+    pairs: tuple[tuple[int, int], ...]  # (image number, tracking number) of the usable frames, increasing
+    left_out: dict[int, str]  # image number -> reason
+    notes: list[str]
+
+
+def refuse_if_many(bad: Mapping[int, str], total: int, what: str, share: float) -> None:
+    """Raise UserError when more than `share` of `total` are bad: then something is wrong with the whole."""
+    if len(bad) > share * total:
+        raise UserError(
+            f"{len(bad)} of {total} {what} cannot be used, more than {share:.0%}: {describe_reasons(bad)}; mend them, or "
+            "allow more with --max-left-out"
+        )
+
+
+def describe_reasons(bad: Mapping[int, str], name: Callable[[int], str] = "{:05d}".format) -> str:
+    """`00002-00004 (all zero: ...), 00007 (...)`, grouped by reason."""
+    by_reason: dict[str, list[int]] = {}
+    for number, reason in bad.items():
+        by_reason.setdefault(reason, []).append(number)
+    shown = [f"{describe_numbers(numbers, name=name)} ({reason})" for reason, numbers in by_reason.items()]
+    rest = len(shown) - _REASONS_SHOWN
+    return ", ".join(shown[:_REASONS_SHOWN]) + (f" and {rest} more reasons" if rest > 0 else "")
+
+
+def pair_frames(
+    files: FrameFiles,
+    inspection: Inspection,
+    tracking: Tracking,
+    offset: int,
+    head_centre: np.ndarray,
+    max_left_out: float,
+) -> Pairing:
+    """Pair image n + offset with tracking n; leave out what is bad on either side or repeats its neighbour's tracking.
+
+    Raises UserError when the numbers do not fit together or more than that share would be left out.
+    """
+    notes = _count_notes(files)
+    numbered = [(n + offset, n) for n in files.tracking if n + offset in files.images]
+    if not numbered:
+        raise UserError(
+            f"no image belongs to a tracking frame under offset {offset}: images are {_range(files.images)}, "
+            f"tracking is {_range(files.tracking)}; give another --frame-offset"
+        )
+    _refuse_if_unpaired(files, len(numbered), offset, max_left_out)
+    left_out: dict[int, str] = {}
+    previous: tuple[int, np.ndarray] | None = None
+    for image, number in numbered:
+        if number in tracking.bad:
+            left_out[image] = tracking.bad[number]
+            continue
+        track = tracking.frames[number]
+        values = track.moving_values()
+        repeats = previous is not None and previous[0] == number - 1 and np.array_equal(previous[1], values)
+        if image in inspection.bad:
+            left_out[image] = inspection.bad[image]
+        elif (track.R @ head_centre + track.t)[2] <= 0:
+            left_out[image] = "the tracked head is behind the camera"
+        elif repeats and inspection.image_digests[image] != inspection.image_digests.get(image - 1):
+            left_out[image] = "the tracking repeats that of the frame before, while the image does not"
+        previous = number, values
+    refuse_if_many(left_out, len(numbered), "frames", max_left_out)
+    return Pairing(tuple(pair for pair in numbered if pair[0] not in left_out), left_out, notes)
+
+
+def _count_notes(files: FrameFiles) -> list[str]:
+    notes = []
+    for kind, found in files.of_kind().items():
+        missing = gaps(found)
+        if missing:
+            notes.append(f"{kind} skips the numbers {describe_numbers(missing)}")
+        if kind != "checkpoint" and found and len(found) != len(files.images):
+            notes.append(f"{kind} has {len(found)} files for {len(files.images)} images")
+    if len(files.tracking) != len(files.images):
+        notes.append(f"there are {len(files.images)} images and {len(files.tracking)} tracking frames")
+    return notes
+
+
+def _refuse_if_unpaired(files: FrameFiles, paired: int, offset: int, share: float) -> None:
+    """An offset leaves a few frames at the ends without partner; many mean that the two are not of one video."""
+    for kind, found in (("images", files.images), ("tracking frames", files.tracking)):
+        unpaired = len(found) - paired
+        if unpaired > max(share * len(found), RADIUS):
+            raise UserError(
+                f"{unpaired} of {len(found)} {kind} have no partner under offset {offset}: images are "
+                f"{_range(files.images)}, tracking is {_range(files.tracking)}; are they of the same video?"
+            )
+
+
+def _range(found: Mapping[int, object]) -> str:
+    return f"{len(found)} files numbered {min(found):05d} to {max(found):05d}"

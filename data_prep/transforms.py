@@ -1,0 +1,210 @@
+"""Listings of frames in NeRF's manner (`transforms*.json`, `flame_params.json`), read as data that may be wrong.
+
+A listing is one object with `frames`, a list of objects, and values that all frames share. Numbers that are no numbers
+spoil a frame, not the program; a path that leaves the folder is refused, because only somebody who means harm, or who
+has moved a part of a larger data set, writes one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from avatar.data.images import IMAGE_SUFFIXES
+from avatar.errors import UserError, refuse
+from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+
+SPLITS = ("train", "val", "test")
+MAX_BYTES = 2**28
+MAX_FRAMES = 200_000
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes: y up and z backward become y down and z forward
+
+
+@dataclass(frozen=True)
+class ListedFrame:
+    """One entry of `frames`, where it stands, and the values that it shares with the others of its listing."""
+
+    listing: Path
+    position: int
+    values: dict[str, Any]
+    shared: dict[str, Any]
+    split: str | None  # "train", "val", "test"; None where the folder has no such division
+    root: Path  # the folder that was given
+
+    def get(self, key: str) -> Any:
+        """The frame's own value, else the shared one. Raises BadFrame when there is neither."""
+        value = self.values.get(key, self.shared.get(key))
+        if value is None:
+            raise BadFrame(f"{key} is missing in {self.listing.name}")
+        return value
+
+    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
+        """The value as a float64 vector [count]; BadFrame when it is not that many finite numbers."""
+        return vector(self.get(key), key, count)
+
+    @property
+    def image(self) -> Path:
+        """The file of `file_path`, which may lack its suffix."""
+        path = self.path("file_path")
+        if path is None:
+            raise UserError(f"{self.listing}: frame {self.position} has no file_path; export the folder again")
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            return path
+        candidates = [path.with_name(path.name + suffix) for suffix in (".png", *IMAGE_SUFFIXES)]
+        return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+
+    def path(self, key: str) -> Path | None:
+        """The file that the entry names, relative to its listing; None where it names none.
+
+        Raises UserError for what is not a path inside the folder.
+        """
+        value = self.values.get(key)
+        if value is None:
+            return None
+        where = f"{self.listing}: {key} of frame {self.position}"
+        if not is_path(value):
+            raise UserError(f"{where} is not a path; export the folder again")
+        forms = PurePosixPath(value), PureWindowsPath(value)
+        if any(form.is_absolute() or form.drive or ".." in form.parts for form in forms):
+            raise UserError(
+                f"{where} is {value!r}, which leaves {self.listing.parent}; give a folder that holds its own frames"
+            )
+        return self.listing.parent / value
+
+
+def is_path(value: Any) -> bool:
+    """Whether the value is text that a file system takes as a path: encodable, and no part of it too long."""
+    if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
+        return False
+    try:
+        return max(len(part.encode()) for part in value.split("/")) <= 255
+    except UnicodeEncodeError:
+        return False
+
+
+def read_listings(folder: Path) -> list[ListedFrame]:
+    """All frames that the folder lists, in the order of the numbers in their images' names; empty without a listing.
+
+    `transforms_{train,val,test}.json`, or `flame_params.json` in train/, val/ and test/, or one `transforms.json` or
+    `flame_params.json` for all. An image that several of them list is a test frame if `test` has it, else a training
+    frame if `train` has it. Raises UserError for listings that cannot be read and for two frames of one image.
+    """
+    divided = {
+        split: path
+        for split in SPLITS
+        for path in (folder / f"transforms_{split}.json", folder / split / "flame_params.json")
+        if path.is_file()
+    }
+    whole = [path for path in (folder / "transforms.json", folder / "flame_params.json") if path.is_file()]
+    frames: dict[Path, ListedFrame] = {}
+    for split in sorted(divided, key=("val", "train", "test").index):
+        frames |= _read_listing(divided[split], split, folder)
+    if not frames and whole:
+        frames = _read_listing(whole[0], None, folder)
+    elif frames and not any(frame.split == "test" for frame in frames.values()):
+        held_out = {path for path, frame in frames.items() if frame.split == "val"}
+        frames = {path: _resplit(frame, "test") if path in held_out else frame for path, frame in frames.items()}
+    return [frames[path] for path in sorted(frames, key=_natural)]
+
+
+def _resplit(frame: ListedFrame, split: str) -> ListedFrame:
+    return ListedFrame(frame.listing, frame.position, frame.values, frame.shared, split, frame.root)
+
+
+def _read_listing(file: Path, split: str | None, root: Path) -> dict[Path, ListedFrame]:
+    """The listed frames by their image."""
+    raw = read_json(file)
+    entries = raw.get("frames") if isinstance(raw, dict) else None
+    if not isinstance(entries, list) or len(entries) > MAX_FRAMES:
+        raise UserError(f"{file} has no list of at most {MAX_FRAMES} frames under 'frames'; export the folder again")
+    shared = {key: value for key, value in raw.items() if key != "frames"}
+    frames: dict[Path, ListedFrame] = {}
+    for position, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise UserError(f"{file}: frame {position} is not an object with values; export the folder again")
+        frame = ListedFrame(file, position, entry, shared, split, root)
+        key = frame.image
+        if key in frames:
+            raise UserError(
+                f"{file}: frames {frames[key].position} and {position} are both {entry['file_path']}; remove one of them"
+            )
+        frames[key] = frame
+    return frames
+
+
+def read_json(file: Path) -> Any:
+    """Raises UserError when the file is unreadable, larger than a listing can be, or nested like no listing is."""
+    try:
+        if file.stat().st_size > MAX_BYTES:
+            raise UserError(f"{file} has more than {MAX_BYTES} bytes; no listing of frames has")
+        return json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise UserError(f"{file} cannot be read as JSON ({reason}); copy or export it again") from None
+
+
+def _natural(path: Path) -> tuple[Any, ...]:
+    """Sorts frame 10 after frame 9, padded or not."""
+    parts = re.split(r"([0-9]+)", str(path))
+    return tuple((int(part[:300]), "") if part.isdigit() and part.isascii() else (-1, part) for part in parts if part)
+
+
+def read_frames(
+    listed: dict[int, ListedFrame],
+    paths: dict[int, Path],
+    read: Callable[[ListedFrame], FrameTrack],
+    complain: Callable[[str], object] = refuse,
+) -> Tracking:
+    """`read` every frame; the BadFrames among them end up in `bad`. `complain` as in `checked_tracking`."""
+    frames: dict[int, FrameTrack] = {}
+    bad: dict[int, str] = {}
+    for number, frame in listed.items():
+        try:
+            frames[number] = read(frame)
+        except BadFrame as error:
+            bad[number] = str(error)
+    return checked_tracking(frames, bad, paths, complain)
+
+
+def camera_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:
+    """R [3, 3], t [3] from the world to the camera's own axes, out of `transform_matrix`, the camera in the world."""
+    matrix = frame.numbers("transform_matrix", 16).reshape(4, 4)
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise BadFrame("the last row of transform_matrix is not 0 0 0 1")
+    R = nearest_rotation(matrix[:3, :3], "transform_matrix").T
+    return R, -R @ matrix[:3, 3]
+
+
+def pinhole(frame: ListedFrame, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+    """fx, fy, cx, cy in pixels [4] and the (width, height) that they are for; `size` is that of the images.
+
+    From `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`; without focal lengths from `camera_angle_x`, without a centre the middle.
+    """
+
+    def optional(key: str) -> float | None:
+        is_given = frame.values.get(key, frame.shared.get(key)) is not None
+        return float(frame.numbers(key, 1)[0]) if is_given else None
+
+    w, h = optional("w"), optional("h")
+    width, height = size[0] if w is None else w, size[1] if h is None else h
+    if not (1 <= width < 2**16 and 1 <= height < 2**16):
+        raise BadFrame(f"w and h are {width:g} and {height:g}, which no image is")
+    fx, fy = optional("fl_x"), optional("fl_y")
+    if fx is None:
+        angle = float(frame.numbers("camera_angle_x", 1)[0])
+        if not 0 < angle < math.pi:
+            raise BadFrame(f"camera_angle_x is {angle:g}, not between 0 and pi")
+        fx = width / (2 * math.tan(angle / 2))
+    fy = fx if fy is None else fy
+    cx, cy = optional("cx"), optional("cy")
+    if fx <= 0 or fy <= 0:
+        raise BadFrame("the focal lengths fl_x and fl_y are not positive")
+    centre = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    return np.array([fx, fy, *centre]), (round(width), round(height))

@@ -1,0 +1,195 @@
+"""A run over time: interrupted, resumed, moved, opened by two, taken away."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from command_line import avatar
+from small_runs import SMALL, train_small
+from tracked_folder import write_tracked_folder
+
+from avatar.errors import UserError
+from avatar.losses.lpips import save_lpips
+from avatar.losses.lpips_network import Lpips
+from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
+from avatar.runs.lock import locked
+from avatar.runs.run import read_run_info
+
+OPTIONS = ("--frame-offset", "1", *SMALL)
+
+
+@pytest.fixture
+def own_folder(tmp_path: Path) -> Path:
+    return write_tracked_folder(tmp_path / "someone", frames=12, size=48)
+
+
+@pytest.fixture
+def begun(own_folder: Path, tmp_path: Path) -> Path:
+    """A run of 12 steps, with its checkpoints of steps 4 and 8 and the video beside it."""
+    run = tmp_path / "run"
+    avatar("train", own_folder, "--out", run, *OPTIONS)
+    list_checkpoints(run / "checkpoints")[-1].unlink()
+    return run
+
+
+def weights(place: Path) -> None:
+    place.mkdir()
+    save_lpips(Lpips("squeeze"), place / "lpips_squeeze.safetensors")
+
+
+def test_a_run_begun_without_weights_goes_on_without_them(
+    begun: Path, own_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights(tmp_path / "weights")
+    monkeypatch.setenv("AVATAR_LPIPS", str(tmp_path / "weights"))
+    output = avatar("train", own_folder, "--out", begun, "--resume")
+    assert "at step 8 of 12" in output and "D-SSIM in place of LPIPS" not in output
+    assert read_run_info(begun).perceptual == newest_checkpoint(begun).meta["perceptual"] == "dssim"
+
+
+def test_a_run_begun_with_weights_does_not_go_on_without_them(
+    own_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights(tmp_path / "weights")
+    monkeypatch.setenv("AVATAR_LPIPS", str(tmp_path / "weights"))
+    run = tmp_path / "run"
+    avatar("train", own_folder, "--out", run, *OPTIONS)
+    list_checkpoints(run / "checkpoints")[-1].unlink()
+    assert read_run_info(run).perceptual == "lpips-squeeze"
+    monkeypatch.setenv("AVATAR_LPIPS", str(tmp_path / "nothing"))
+    output = avatar("train", own_folder, "--out", run, "--resume", status=1)
+    assert "the run began with LPIPS and cannot go on without it" in output
+    assert newest_checkpoint(run).step == 8
+
+
+CHANGES = {
+    "another preset": (["preset=paper"], "began with preset=fast, not paper"),
+    "another model": (["model=flashavatar"], "began with model=hypergaussians, not flashavatar"),
+    "a recipe": (["experiment=paper"], "began with experiment=none, not paper"),
+    "another key": (["trainer.seed=5"], "began with trainer.seed=0, not 5"),
+    "another size": (["--size", "40"], "began with data.size=None, not 40"),
+    "another offset": (["--frame-offset", "2"], "began with --frame-offset 1, not with --frame-offset 2"),
+    "a tracking folder": (["--tracking", "elsewhere"], "began without --tracking, not with --tracking"),
+    "a format": (["--format", "VHAP"], "began without --format, not with --format VHAP"),
+    "a frame rate": (["--fps", "30"], "began without --fps, not with --fps 30"),
+    "more left out": (["--max-left-out", "0.5"], "began with --max-left-out 0.05, not with --max-left-out 0.5"),
+    "a wrong head": (["--ignore-misfit"], "began without --ignore-misfit, not with --ignore-misfit True"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_a_resumed_run_cannot_change_is_refused(name: str, begun: Path, own_folder: Path) -> None:
+    options, sentence = CHANGES[name]
+    assert sentence in avatar("train", own_folder, "--out", begun, "--resume", *options, status=1)
+    assert newest_checkpoint(begun).step == 8
+
+
+def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:
+    same = ("preset=fast", "model=hypergaussians", "trainer.seed=0", "--frame-offset", 1, "--max-left-out", 0.05)
+    assert "at step 8 of 12" in avatar("train", own_folder, "--out", begun, "--resume", *same)
+
+
+def test_two_trainings_into_one_folder_are_one_too_many(own_folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "avatar.cli", "train", str(own_folder), "--out", str(run), *OPTIONS]
+    first = subprocess.Popen(
+        [*command, "trainer.iterations=100000"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while not (run / "run.json").is_file() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        recorded = (run / "run.json").read_bytes()
+        for options in (OPTIONS, ("--resume",)):
+            output = avatar("train", own_folder, "--out", run, *options, status=1)
+            assert f"{run} is being written by process {first.pid} on " in output
+        assert (run / "run.json").read_bytes() == recorded
+    finally:
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    with locked(run):  # the system has let go of it
+        pass
+    assert not (run / ".lock").exists()
+
+
+def test_a_lock_is_held_once(tmp_path: Path) -> None:
+    with (
+        locked(tmp_path / "run"),
+        pytest.raises(UserError, match="is being written by process"),
+        locked(tmp_path / "run"),
+    ):
+        raise AssertionError("the lock was taken twice")
+    with locked(tmp_path / "run"):
+        pass
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written"), locked(tmp_path / "file" / "run"):
+        pass
+
+
+def test_an_avatar_needs_neither_its_video_nor_its_run(tracked_folder: Path, tmp_path: Path) -> None:
+    """The video is moved away, the file copied elsewhere: both still draw, and to the same bits."""
+    folder = Path(shutil.copytree(tracked_folder, tmp_path / "someone"))
+    driver = write_tracked_folder(tmp_path / "driver", frames=8, size=48, seed=5)
+    run = tmp_path / "run"
+    train_small(folder, run)
+    head = Path(shutil.copytree(folder / "head_model", tmp_path / "head"))
+    folder.rename(tmp_path / "moved")
+
+    output = avatar("reenact", run, "--driver", driver, "--frame-offset", 1, status=1)
+    assert "needs its head model (that of the training, " in output and "is gone): give --head PATH" in output
+    avatar("reenact", run, "--head", head, "--driver", driver, "--frame-offset", 1)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    avatar("drive-file", driver, "--frame-offset", 1, "--out", empty / "motion.npz")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(empty)
+        avatar("reenact", run / "avatar.safetensors", "--head", head, "--driver", "motion.npz")
+        assert (empty / "reenact" / "motion-relative.mp4").stat().st_size > 1000
+        avatar("export", run, "--head", head, "--with-head", "--out", "alone.safetensors")
+        output = avatar("reenact", "alone.safetensors", "--driver", "motion.npz", "--out", "alone.mp4")
+    assert (empty / "alone.mp4").read_bytes() == (empty / "reenact" / "motion-relative.mp4").read_bytes()
+    recorded = json.loads((empty / "alone.choices.json").read_text())
+    assert recorded["avatar"]["file"] == str(empty / "alone.safetensors")
+
+    gone = avatar("eval", run, "--head", head, "--protocol", "strict", status=1)
+    assert f"{folder}, on which {run} was trained, is gone: give its new place with --folder" in gone
+    measured = avatar("eval", run, "--head", head, "--folder", tmp_path / "moved", "--protocol", "strict")
+    assert "strict" in measured
+    avatar("report", run, "--head", head, "--folder", tmp_path / "moved")
+    other = write_tracked_folder(tmp_path / "other", frames=30, size=48, seed=9)
+    refused = avatar("eval", run, "--head", head, "--folder", other, status=1)
+    assert f"the data of other is not what {run} was trained on" in refused
+
+
+def test_a_moved_video_is_resumed_from_its_new_place(begun: Path, own_folder: Path, tmp_path: Path) -> None:
+    moved = own_folder.rename(tmp_path / "moved")
+    assert "is gone: give its new place" in avatar(
+        "train", "--out", begun, "--resume", "--head", moved / "head_model", status=1
+    )
+    output = avatar("train", "--out", begun, "--resume", "--folder", moved, "--head", moved / "head_model")
+    assert "at step 8 of 12" in output
+
+
+def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted in its training, it does not present the half-trained avatar the next time."""
+    from avatar.commands import demonstrating
+
+    monkeypatch.setattr(demonstrating, "RECIPE", [*SMALL, "trainer.iterations=16"])
+    for name in ("actor", "driver"):
+        write_tracked_folder(tmp_path / "demo" / name, frames=30, size=48, seed=1)
+    avatar("train", tmp_path / "demo" / "actor", "--out", tmp_path / "demo" / "run", *SMALL, "trainer.iterations=16")
+    run = tmp_path / "demo" / "run"
+    list_checkpoints(run / "checkpoints")[-1].unlink()
+    before = newest_checkpoint(run)
+    assert before.step == 12
+    output = avatar("demo", tmp_path / "demo")
+    assert "Resuming" in output and "The demo is done" in output
+    assert newest_checkpoint(run).step == 16
+    assert "strict" in output, "the whole avatar is measured"

@@ -1,0 +1,67 @@
+"""The page of `avatar check --out`."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from folder_damage import all_zero
+from tracked_folder import write_tracked_folder
+
+from avatar.cli import main
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+class Sources(HTMLParser):
+    """Everything that a browser would load, and the text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "poster", "data")]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_tracked_folder(tmp_path_factory.mktemp("page") / "so <me> & one", 24)
+    all_zero(5)(folder)
+    out = folder.parent / "out"
+    assert main(["check", str(folder), "--frame-offset", "1", "--out", str(out)]) == 1
+    return out / "index.html"
+
+
+def test_the_page_holds_pictures_findings_and_cost_and_loads_nothing(page: Path) -> None:
+    parsed = Sources()
+    parsed.feed(page.read_text(encoding="utf-8"))
+    assert len(parsed.sources) == 8 + 6  # overlays, plots
+    assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in parsed.sources)
+    assert "Check of so <me> & one" in parsed.text
+    assert "The tracking cannot be used in frame 00005 of checkpoint: all zero" in parsed.text
+    assert "one training step on this machine" in parsed.text
+    assert page.stat().st_size < 3e6
+
+
+def test_the_table_has_a_line_for_every_image(page: Path) -> None:
+    rows = list(csv.DictReader((page.parent / "frames.csv").open()))
+    assert [row["image"] for row in rows] == [f"{n:05d}.jpg" for n in range(1, 25)]
+    assert rows[5]["overlap"] == "" and all(float(row["overlap"]) > 0.99 for row in rows if row["image"] != "00006.jpg")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_browser_shows_it_without_complaint(page: Path, tmp_path: Path) -> None:
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+    options += ["--no-first-run", "--disable-component-update", "--disable-quic", f"--user-data-dir={tmp_path}"]
+    command = [str(CHROMIUM), *options, "--enable-logging=stderr", "--dump-dom", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.count("<img") == 14 and "CONSOLE" not in done.stderr

@@ -1,0 +1,116 @@
+"""Videos: what is read back is what was written, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+
+from avatar.errors import UserError
+from avatar.files.video import error_map, side_by_side, write_video
+
+
+def gradients(count: int, height: int, width: int) -> Iterator[np.ndarray]:
+    for index in range(count):
+        y, x = np.mgrid[0:height, 0:width]
+        yield np.stack((255 * x / width, 255 * y / height, np.full_like(x, 20 * index)), axis=-1).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (33, 51)])
+def test_reads_back_in_order_size_and_rate(tmp_path: Path, height: int, width: int) -> None:
+    path = tmp_path / "new" / "clip.mp4"
+    write_video(path, gradients(7, height, width), fps=12.5)
+    reader = imageio.get_reader(path)
+    meta = reader.get_meta_data()
+    assert meta["codec"] == "h264" and meta["pix_fmt"].startswith("yuv420p") and meta["fps"] == 12.5
+    assert meta["size"] == (width + width % 2, height + height % 2)
+    frames = [np.asarray(frame) for frame in reader]
+    assert len(frames) == 7
+    for frame, truth in zip(frames, gradients(7, height, width), strict=True):
+        error = np.abs(frame[:height, :width].astype(int) - truth)
+        assert error.mean() < 3.0  # of 255: chroma is stored at half the resolution
+    assert [p.name for p in path.parent.iterdir()] == ["clip.mp4"]
+
+
+def test_a_failure_on_the_way_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"the old one")
+
+    def failing() -> Iterator[np.ndarray]:
+        yield from gradients(3, 32, 32)
+        raise UserError("frame 00004.jpg is damaged")
+
+    with pytest.raises(UserError, match=r"frame 00004\.jpg is damaged"):
+        write_video(path, failing(), fps=25)
+    assert path.read_bytes() == b"the old one"
+    assert [p.name for p in tmp_path.iterdir()] == ["clip.mp4"]
+
+
+def test_refusals(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    with pytest.raises(UserError, match=r"there is no frame to write to .*clip\.mp4"):
+        write_video(path, iter(()), fps=25)
+    with pytest.raises(UserError, match=r"clip\.mp4 cannot hold a frame of 40x32 pixels after frames of 32x32"):
+        write_video(path, [*gradients(1, 32, 32), *gradients(1, 32, 40)], fps=25)
+    with pytest.raises(ValueError, match=r"must be uint8 \[H, W, 3\], got float64 \[32, 32, 3\]"):
+        write_video(path, [np.zeros((32, 32, 3))], fps=25)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "clip.mp4"
+    broken = tmp_path / "ffmpeg"
+    broken.write_text('#!/bin/sh\nif [ "$1" = -version ]; then echo ffmpeg version 7; exit 0; fi\nexit 1\n')
+    broken.chmod(0o755)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(broken))
+    with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \("):
+        write_video(path, gradients(200, 64, 64), fps=25)
+    assert not path.exists()
+
+
+def test_a_folder_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \(.*(Not a directory|File exists)"):
+        write_video(tmp_path / "file" / "clip.mp4", gradients(1, 32, 32), fps=25)
+
+
+def test_errors_of_the_caller_are_not_blamed_on_the_video(tmp_path: Path) -> None:
+    def failing() -> Iterator[np.ndarray]:
+        yield from gradients(1, 32, 32)
+        raise RuntimeError("the renderer broke")
+
+    with pytest.raises(RuntimeError, match="the renderer broke"):
+        write_video(tmp_path / "clip.mp4", failing(), fps=25)
+
+
+def test_pictures_stand_side_by_side_under_captions() -> None:
+    red, green = torch.zeros(2, 60, 80, 3)
+    red[..., 0], green[..., 1] = 1.0, 1.5
+    small = torch.full((30, 20, 3), 0.25)
+    panel = side_by_side((red, green, small), ("truth", "render", "a caption far too long for its picture"))
+    strip = panel.shape[0] - 60
+    assert panel.dtype == np.uint8 and panel.shape == (60 + strip, 80 + 80 + 40, 3) and strip >= 16
+    assert (panel[strip:, :80] == (255, 0, 0)).all()
+    assert (panel[strip:, 80:160] == (0, 255, 0)).all()  # clamped
+    assert (panel[strip:, 160:] == 64).all()
+    for left, right in ((0, 80), (80, 160), (160, 200)):
+        ink = panel[:strip, left:right].min(axis=(0, 2)) < 128
+        assert ink.any() and not ink[0] and not ink[-1]  # every caption is there and inside its column
+
+
+def test_error_map_grows_with_the_error() -> None:
+    target = torch.full((4, 5, 3), 0.5)
+    image = target.clone()
+    image[0, 0] += 0.05
+    image[0, 1] += 0.1
+    image[0, 2] -= 0.4
+    image[0, 3] -= 0.2
+    heat = error_map(image, target, full_scale=0.2)
+    light = heat.sum(dim=-1)
+    assert light[1:].max() < 0.05  # no error: black
+    assert light[1, 0] < light[0, 0] < light[0, 1] < light[0, 2]
+    assert torch.equal(heat[0, 2], heat[0, 3])  # full scale and above

@@ -1,0 +1,116 @@
+"""The training loss against its written-out formula, its exact shortcuts and its gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from avatar.losses.lpips_network import Lpips
+from avatar.losses.metrics import ssim
+from avatar.losses.photometric import dssim, masked_huber, masked_lpips, on_head, photometric_loss
+
+
+def huber_written_out(image: Tensor, target: Tensor, delta: float) -> float:
+    total = 0.0
+    for a, b in zip(image.flatten().tolist(), target.flatten().tolist(), strict=True):
+        d = abs(a - b)
+        total += 0.5 * d * d if d < delta else delta * (d - delta / 2)
+    return total / image.numel()
+
+
+def sample(height: int = 24, width: int = 31) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    image, target = torch.rand(2, height, width, 3, dtype=torch.float64)
+    mouth, head = torch.zeros(2, height, width, dtype=torch.float64)
+    mouth[14:19, 11:22] = torch.rand(5, 11, dtype=torch.float64)
+    head[3:22, 4:28] = torch.rand(19, 24, dtype=torch.float64)
+    return image, target, mouth, head
+
+
+def test_terms_equal_the_formula_over_the_whole_frame() -> None:
+    image, target, mouth, head = sample()
+    terms = photometric_loss(image, target, mouth, head)
+    assert terms.frame.item() == pytest.approx(huber_written_out(image, target, 0.1), rel=1e-12)
+    expected = 40 * huber_written_out(image * mouth[..., None], target * mouth[..., None], 0.1)
+    assert terms.mouth.item() == pytest.approx(expected, rel=1e-12)
+    assert terms.perceptual.item() == 0.0
+    assert terms.total.item() == pytest.approx(terms.frame.item() + terms.mouth.item(), rel=1e-12)
+
+
+def test_dssim_on_the_box_equals_dssim_of_the_masked_frame() -> None:
+    image, target, _, head = sample(60, 47)
+    for rows, columns in ((slice(0, 60), slice(0, 47)), (slice(25, 35), slice(20, 24)), (slice(0, 3), slice(44, 47))):
+        mask = torch.zeros_like(head)
+        mask[rows, columns] = torch.rand(60, 47, dtype=torch.float64)[rows, columns]
+        expected = (1 - ssim(image * mask[..., None], target * mask[..., None])) / 2
+        assert dssim(image, target, mask).item() == pytest.approx(expected.item(), rel=1e-9, abs=1e-15)
+
+
+def test_perceptual_term_has_its_weight_and_sees_masked_images() -> None:
+    image, target, mouth, head = sample()
+    seen: list[Tensor] = []
+
+    def distance(a: Tensor, b: Tensor) -> Tensor:
+        seen.extend((a, b))
+        return (a - b).abs().sum()
+
+    terms = photometric_loss(image, target, mouth, head, perceptual=masked_lpips(distance))
+    torch.testing.assert_close(seen[0], image * head[..., None])
+    torch.testing.assert_close(seen[1], target * head[..., None])
+    assert terms.perceptual.item() == pytest.approx(0.05 * (seen[0] - seen[1]).abs().sum().item())
+    assert terms.total.item() == pytest.approx(sum(term.item() for term in terms[1:]))
+
+
+@pytest.mark.parametrize("perceptual", [None, dssim], ids=["huber", "huber and D-SSIM"])
+def test_gradient_agrees_with_finite_differences(perceptual) -> None:
+    image, target, mouth, head = (tensor[10:23, 6:18] for tensor in sample())
+    image = image.clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x: photometric_loss(x, target, mouth, head, perceptual=perceptual).total, (image,), atol=1e-8
+    )
+
+
+def test_a_hidden_mouth_gives_a_zero_gradient() -> None:
+    image, target, mouth, head = sample()
+    image.requires_grad_()
+    loss = masked_huber(image, target, torch.zeros_like(mouth), delta=0.1) + dssim(
+        image, target, torch.zeros_like(head)
+    )
+    loss.backward()
+    assert loss.item() == 0.0
+    assert image.grad is not None and not image.grad.any()
+
+
+def test_sizes_that_disagree_are_named() -> None:
+    image, target, mouth, head = sample()
+    with pytest.raises(ValueError, match=r"mouth_mask has H = 20, but image has H = 24"):
+        photometric_loss(image, target, mouth[:20], head)
+
+
+def test_the_heads_box_weighs_what_the_whole_frame_does() -> None:
+    image, target, _, _ = sample()
+    head = torch.zeros(24, 31, dtype=torch.float64)
+    head[4:12, 20:28] = torch.rand(8, 8) + 0.01
+    seen = []
+
+    def mean_error(a, b, m):
+        seen.append(tuple(m.shape))
+        return (((a - b) * m[..., None]) ** 2).mean()
+
+    whole = mean_error(image, target, head)
+    torch.testing.assert_close(on_head(mean_error, margin=3)(image, target, head), whole)
+    assert seen == [(24, 31), (14, 14)]
+    leaf = image.clone().requires_grad_()
+    nothing = on_head(mean_error)(leaf, target, torch.zeros(24, 31, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(nothing, leaf)
+    assert nothing.item() == 0.0 and not gradient.any()
+
+
+def test_a_network_sees_in_the_heads_box_nearly_what_it_sees_in_the_frame() -> None:
+    y, x = torch.meshgrid(torch.arange(160.0), torch.arange(160.0), indexing="ij")
+    head = ((y - 80) ** 2 + (x - 70) ** 2 < 40**2).float()
+    image, target = torch.rand(160, 160, 3), torch.rand(160, 160, 3)
+    distance = masked_lpips(Lpips("squeeze"))
+    with torch.no_grad():
+        whole, box = distance(image, target, head), on_head(distance)(image, target, head)
+    assert abs(float(box / whole) - 1) < 0.1

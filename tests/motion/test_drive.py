@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from heads import random_params, rest_params
+
+from avatar.head.model import matrix_from_6d
+from avatar.motion.distance_strip import FAR, DistanceStrip, distances_csv
+from avatar.motion.drive import Drive, choose_cameras, smoothed
+from avatar.types import Camera
+
+
+def camera(focal: float, depth: float, size: int = 100, centre: float = 50.0) -> Camera:
+    return Camera(torch.eye(3), torch.tensor([0.02, -0.01, depth]), focal, focal, centre, centre, size, size)
+
+
+def drive(frames: int, **changes: object) -> Drive:
+    params = [random_params(seed) for seed in range(frames)]
+    cameras = [camera(200.0, 1.0 + 0.01 * i) for i in range(frames)]
+    names = tuple(f"{i:05d}" for i in range(frames))
+    return replace(Drive("d", 25.0, names, params, cameras, torch.zeros(0)), **changes)  # type: ignore[arg-type]
+
+
+def test_no_smoothing_changes_nothing_and_some_keeps_what_is_constant_or_linear() -> None:
+    moving = drive(40)
+    assert smoothed(moving, 0.0) is moving
+    still = replace(moving, params=[random_params(3)] * 40)
+    out = smoothed(still, 2.0)
+    assert out.cameras is not None
+    for params in out.params:
+        torch.testing.assert_close(params.expression, random_params(3).expression)
+        expected = matrix_from_6d(random_params(3).jaw)[:2].reshape(6)
+        torch.testing.assert_close(params.jaw, expected, rtol=0, atol=1e-5)
+    depths = torch.stack([c.t_cam_world[2] for c in out.cameras])[6:-6]
+    torch.testing.assert_close(depths, 1.0 + 0.01 * torch.arange(6, 34), rtol=0, atol=1e-5)
+
+
+def test_smoothing_is_a_centred_gaussian_and_leaves_gaze_and_blinks() -> None:
+    frames = 21
+    peak = [rest_params() for _ in range(frames)]
+    peak[10] = replace(peak[10], expression=torch.ones(5), eyelids=torch.ones(2))
+    out = smoothed(drive(frames, params=peak), 1.5)
+    values = torch.stack([p.expression[0] for p in out.params])
+    assert int(values.argmax()) == 10
+    torch.testing.assert_close(values, values.flip(0))
+    assert float(values.sum()) == pytest.approx(1.0, abs=1e-5)
+    ratio = torch.exp(torch.tensor(-0.5 / 1.5**2))
+    assert float(values[9] / values[10]) == pytest.approx(float(ratio), abs=1e-5)
+    assert [float(p.eyelids[0]) for p in out.params] == [float(p.eyelids[0]) for p in peak]
+    assert all(torch.equal(a.eyes, b.eyes) for a, b in zip(out.params, peak, strict=True))
+
+
+def test_whose_camera() -> None:
+    own, moving = camera(400.0, 2.0), drive(3)
+    assert choose_cameras(moving, own, "driver", "driver") == moving.cameras
+    assert choose_cameras(moving, own, "target", "driver") == [own] * 3
+    assert choose_cameras(replace(moving, cameras=None), own, "driver", "driver") == [own] * 3
+
+
+def test_the_targets_lens_keeps_the_heads_place_and_size_and_changes_its_perspective() -> None:
+    own = camera(800.0, 2.0, size=200, centre=90.0)  # off-centre, a longer lens, other pictures
+    moving = drive(2)
+    assert moving.cameras is not None
+    for before, after in zip(moving.cameras, choose_cameras(moving, own, "driver", "target"), strict=True):
+        assert (after.width, after.height) == (100, 100)
+        assert (after.fx, after.fy, after.cx, after.cy) == (400.0, 400.0, 45.0, 45.0)
+        points = torch.tensor([[0.0, 0, 0], [0.05, 0, 0], [0, 0.1, 0], [0.05, 0, 0.1]])
+        a, b = before.project(points)[:, :2], after.project(points)[:, :2]
+        torch.testing.assert_close(a[:3], b[:3], rtol=0, atol=1e-3)
+        assert (a[3] - b[3]).abs().max() > 0.3
+
+
+def test_the_strip_marks_the_frame_and_says_when_it_is_far() -> None:
+    strip = DistanceStrip([0.2, 0.5, 3.0, 0.1], width=300, picture_height=200)
+    near, far = strip.frame(0), strip.frame(2)
+    assert near.shape == far.shape == (32, 300, 3)
+    marks = [(picture == torch.tensor(FAR).numpy()).all(axis=2).sum() for picture in (near, far)]
+    assert marks[1] > marks[0], "the mark of a far frame has the colour of far ones"
+    assert (near[:, :80] != far[:, :80]).any() and (near[:, 150:260] != far[:, 150:260]).any()
+
+
+def test_one_frame_has_a_strip_and_the_csv_has_one_line_per_frame() -> None:
+    assert DistanceStrip([0.0], width=64, picture_height=64).frame(0).shape == (24, 64, 3)
+    text = distances_csv(("00007", "00009"), (0.5, 1.25))
+    assert text.splitlines() == ["frame,name,distance", "0,00007,0.5000", "1,00009,1.2500"]
