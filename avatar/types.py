@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import brought
+
 IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
@@ -64,6 +66,14 @@ class HeadParams:
     def condition(self) -> Float[Tensor, " C"]:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""
         return torch.cat((self.expression, self.jaw, self.eyes, self.eyelids))
+
+    def to(self, device: torch.device) -> HeadParams:
+        """The same on another device, brought there in one copy."""
+        if self.jaw.device == device:
+            return self
+        parts = (self.expression, self.jaw, self.eyes, self.eyelids, self.neck)
+        expression, jaw, eyes, eyelids, neck = brought(torch.cat(parts), device).split([len(part) for part in parts])
+        return HeadParams(expression, jaw, eyes, eyelids, neck)
 
 
 @dataclass(frozen=True)

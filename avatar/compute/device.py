@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import torch
 from torch import Tensor
 
 
@@ -20,3 +21,12 @@ def on_gpu(tensor: Tensor) -> bool:
     """
     kind = tensor.device.type
     return kind in ("cuda", "meta") or (kind == "cpu" and interpreted())
+
+
+def brought(tensor: Tensor, device: torch.device) -> Tensor:
+    """The tensor on `device`; to a GPU the copy is made while the program goes on."""
+    if tensor.device == device:
+        return tensor
+    if device.type == "cuda" and tensor.is_cpu and not tensor.requires_grad:
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)

@@ -38,8 +38,9 @@ class Embedding:
 
     def move(self, device: torch.device) -> None:
         """Bring it to where the vertices are to be. The texels stay: they are for people."""
-        self.corners, self.barycentric = self.corners.to(device), self.barycentric.to(device)
-        self._flat_corners, self._touching = self.corners.reshape(-1), None
+        if self.corners.device != device:
+            self.corners, self.barycentric = self.corners.to(device), self.barycentric.to(device)
+            self._flat_corners, self._touching = self.corners.reshape(-1), None
 
 
 def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, " N"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,13 +22,6 @@ ENTRIES = 32  # of a node's list that are summed at a time
 WIDEST = 64  # values of a node that one program sums
 
 
-class Bound(NamedTuple):
-    """What never changes: how the Gaussians hang on the mesh and, if there is a grid, on its nodes."""
-
-    embedding: Embedding
-    interpolation: Interpolation | None
-
-
 def place_gpu(
     vertices: Float[Tensor, "V 3"],
     values: Float[Tensor, "M n"],
@@ -37,25 +30,27 @@ def place_gpu(
     log_scales: Float[Tensor, "N 3"],
     opacity_logits: Float[Tensor, " N"],
     sh: Float[Tensor, "N K 3"],
-    bound: Bound,
+    embedding: Embedding,
+    grid: Interpolation | None,
 ) -> Gaussians:
     """`compose_raw` of the embedding's points and of the network's `values`, which are brought from the grid's nodes to the
     Gaussians if there is a grid and through the HyperGaussians `packed` if there are any. Float32 tensors on one GPU.
 
-    Differentiable in all but `bound`. Raises ValueError for tensors whose sizes disagree.
+    Differentiable in all tensors. Raises ValueError for tensors whose sizes disagree.
     """
     N, n = len(quats), values.shape[-1]
     check_shapes(vertices=(vertices, "V 3"), quats=(quats, "N 4"), log_scales=(log_scales, "N 3"))
     check_shapes(quats=(quats, "N 4"), opacity_logits=(opacity_logits, "N"), sh=(sh, "N _ 3"))
-    places = N if bound.interpolation is None else bound.interpolation.num_cells
+    places = N if grid is None else grid.num_cells
     check_shapes(values=(values, f"{places} {'n' if packed is not None else 10}"))
-    if len(bound.embedding) != N:
-        raise ValueError(f"quats has N = {N}, but the embedding has {len(bound.embedding)} Gaussians")
+    if len(embedding) != N:
+        raise ValueError(f"quats has N = {N}, but the embedding has {len(embedding)} Gaussians")
     if packed is not None and tuple(packed.shape) != packed_shape(N, n):
         raise ValueError(f"packed must have shape {list(packed_shape(N, n))}, got {list(packed.shape)}")
-    if packed is None and bound.interpolation is not None:
+    if packed is None and grid is not None:
         raise ValueError("offsets are not smooth over the map: there is no grid without HyperGaussians")
-    placed: Any = _Place.apply(vertices, values, packed, quats, log_scales, opacity_logits, bound)
+    given = (vertices, values, packed, quats, log_scales, opacity_logits)
+    placed: Any = _Place.apply(*given, embedding, grid)
     means, turned, scales, opacities = placed
     return Gaussians(means, turned, scales, opacities, sh)
 
@@ -63,21 +58,20 @@ def place_gpu(
 class _Place(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *given, bound = arguments
+        *given, embedding, grid = arguments
         tensors: list[Any] = [None if t is None else t.detach().contiguous() for t in given]
         vertices, values, packed, quats, log_scales, opacity_logits = tensors
         N, n = len(quats), values.shape[1]
-        is_hyper, grid = packed is not None, bound.interpolation
-        saves = any(ctx.needs_input_grad)
+        is_hyper, saves = packed is not None, any(ctx.needs_input_grad)
         raw = torch.empty((N, 10), dtype=torch.float32, device=quats.device) if is_hyper and saves else values
-        placed = [torch.empty_like(quats[:, :3]), *(torch.empty_like(t) for t in (quats, log_scales, opacity_logits))]
+        placed = [torch.empty_like(t) for t in (log_scales, quats, log_scales, opacity_logits)]
         cells, weights = (values, values) if grid is None else grid.corners
         start(
             place,
             -(-N // LANES),
             vertices,
-            bound.embedding.corners,
-            bound.embedding.barycentric,
+            embedding.corners,
+            embedding.barycentric,
             values,
             cells,
             weights,
@@ -95,7 +89,7 @@ class _Place(torch.autograd.Function):
             SAVE=saves,
             BLOCK=LANES,
         )
-        ctx.bound, ctx.vertex_shape = bound, vertices.shape
+        ctx.embedding, ctx.grid, ctx.num_vertices = embedding, grid, len(vertices)
         ctx.save_for_backward(values, packed, raw, quats, log_scales, placed[2], placed[3])
         return tuple(placed)
 
@@ -104,7 +98,7 @@ class _Place(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Any, ...] = ctx.saved_tensors
         values, packed, raw, quats, log_scales, scales, opacities = saved
-        grid: Interpolation | None = ctx.bound.interpolation
+        grid: Interpolation | None = ctx.grid
         by_means, by_quats, by_scales, by_opacities = (gradient.contiguous() for gradient in upstream)
         N, n, is_hyper = len(quats), values.shape[1], packed is not None
         own = values if grid is None else values.new_empty(N, n)  # the shape of each Gaussian's own values
@@ -139,8 +133,8 @@ class _Place(torch.autograd.Function):
             by_values = summed_at_nodes(grid.touching, by_values)
         by_vertices = None
         if ctx.needs_input_grad[0]:
-            by_vertices = summed_at_nodes(ctx.bound.embedding.touching(ctx.vertex_shape[0]), by_means)
-        return by_vertices, by_values, by_packed if is_hyper else None, *by_base, None
+            by_vertices = summed_at_nodes(ctx.embedding.touching(ctx.num_vertices), by_means)
+        return by_vertices, by_values, by_packed if is_hyper else None, *by_base, None, None
 
 
 def summed_at_nodes(lists: Touching, gradients: Float[Tensor, "N w"]) -> Float[Tensor, "M w"]:

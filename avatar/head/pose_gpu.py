@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.head.model import PoseTensors
 from avatar.kernels.pose import FEATURES, TRANSFORM, blend, pose
 from avatar.kernels.start import start
 from avatar.types import HeadParams
 
-PARENTS = (-1, 0, 1, 1, 1)  # the only tree that the kernel knows: root, neck, then jaw and eyes on the neck
 LANES = 128  # vertices of a program
-
-
-class PoseTensors(NamedTuple):
-    """What posing needs of a head model of one identity; float32, contiguous, on one GPU."""
-
-    shape: Float[Tensor, " V*3"]  # without expression
-    basis: Float[Tensor, "V*3 E+36"]  # expression and pose correctives
-    joints: Float[Tensor, "5 3"]
-    joint_directions: Float[Tensor, "15 E"]
-    weights: Float[Tensor, "V 5"]
-    eyelid_directions: Float[Tensor, "2 V 3"]
 
 
 def pose_gpu(head: PoseTensors, params: HeadParams) -> Float[Tensor, "V 3"]:

@@ -8,7 +8,7 @@ enough. On a CPU, where Triton interprets the kernels for tests, every drawing w
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Int
 from torch import Tensor
+
+from avatar.types import Rendering
 
 # 9 values of a record, and 9 of its moments, are found by int32: three tenths of what that reaches.
 MAX_PAIRS = 1 << 26
@@ -67,6 +69,12 @@ class Capacities:
             self._pairs[kind] = roomy(needed)
             return self._pairs[kind]
 
+    def forget(self) -> None:
+        """Let the next drawing of each kind wait for its number."""
+        with self._lock:
+            self._pairs.clear()
+            self._pending.clear()
+
     def watch(self, kind: Kind, ends: Int[Tensor, " N"]) -> None:
         """Let the number of pairs of a drawing, the last of `ends`, come back when the GPU gets there."""
         if self.fixed is not None or kind.device.type != "cuda":
@@ -92,6 +100,15 @@ def roomy(needed: int) -> int:
 
 
 CAPACITIES = Capacities()
+
+
+def with_room(draw: Callable[[], Rendering]) -> Rendering:
+    """What `draw` gives, waited for; where the buffers of a GPU were too small, drawn again with room for everything."""
+    rendering = draw()
+    if rendering.alpha.is_cuda and bool(rendering.alpha.isnan().any()):
+        CAPACITIES.forget()
+        rendering = draw()
+    return rendering
 
 
 @contextmanager

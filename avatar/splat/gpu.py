@@ -6,6 +6,7 @@ that overflows or more pairs of tile and splat than there is room for cannot rai
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from avatar.compute.device import brought
 from avatar.kernels.geometry import VIEW_VALUES
 from avatar.splat.gpu_draw import Settings, backward, draw
 from avatar.splat.region import Region
@@ -33,7 +35,7 @@ def settings_of(
 
 
 def view_block(camera: Camera, blur: float, near: float, device: torch.device) -> Float[Tensor, " 25"]:
-    """What the kernels need of a camera, in the order of `avatar.kernels.geometry`; one asynchronous copy."""
+    """What the kernels need of a camera, in the order of `avatar.kernels.geometry`; one copy, the first time."""
     rotation, translation = camera.R_cam_world.double().flatten().tolist(), camera.t_cam_world.double().tolist()
     slopes: list[float] = []
     for focal, centre, size in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)):
@@ -43,8 +45,12 @@ def view_block(camera: Camera, blur: float, near: float, device: torch.device) -
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
     values = [*rotation, *translation, *intrinsics, *slopes, *eye, blur, near]
     assert len(values) == VIEW_VALUES
-    block = torch.tensor(values, dtype=torch.float64, device="cpu")
-    return (block.pin_memory() if device.type == "cuda" else block).to(device, non_blocking=True)
+    return _uploaded(tuple(values), device)
+
+
+@lru_cache(maxsize=8192)  # the frames of a training come again
+def _uploaded(values: tuple[float, ...], device: torch.device) -> Tensor:
+    return brought(torch.tensor(values, dtype=torch.float64), device)
 
 
 class _Splat(torch.autograd.Function):
