@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -59,9 +58,14 @@ class Renderer:
 
             avatar, grid = self._avatar, self._avatar.grid
             values = self._network(avatar.condition(params))
-            base: Any = self._base.values()
-            bound = avatar.embedding, None if grid is None else grid.interpolate
-            return place_gpu(self.vertices(params), values, self._packed, *base, *bound)
+            return place_gpu(
+                self.vertices(params),
+                values,
+                self._packed,
+                **self._base,
+                embedding=avatar.embedding,
+                grid=None if grid is None else grid.interpolate,
+            )
         return self.place(self.points(self.vertices(params)), self.offsets(self.latents(params)))
 
     @torch.no_grad()

@@ -7,6 +7,8 @@ import os
 import torch
 from torch import Tensor
 
+CPU = torch.device("cpu")
+
 
 def interpreted() -> bool:
     """Whether Triton interprets kernels on the CPU, which is slow and for tests: the variable TRITON_INTERPRET."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.losses.lpips import Net, load_lpips
@@ -20,10 +22,13 @@ from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
 from avatar.types import Frame, Gaussians
 
+Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
+
 
 class Weighted(NamedTuple):
     function: Perceptual
     weight: float
+    crops: bool = False  # to the head's box, which it takes as `box` where it is known
 
 
 @dataclass(frozen=True)
@@ -67,12 +72,13 @@ class Objective:
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
         start = round(self.config.perceptual_start * self.config.iterations)
         term = self.perceptual.at(step, start)
+        function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
         return photometric_loss(
             image,
             target,
             frame.mouth_mask,
             frame.head_mask,
-            perceptual=term.function if term else None,
+            perceptual=function,
             perceptual_weight=term.weight if term else 0.0,
             mouth_weight=self.config.mouth_weight,
             delta=self.config.huber_delta,
@@ -90,23 +96,30 @@ def training_step(
     step: int,
     frame: Frame,
     vertices: Float[Tensor, "V 3"],
+    judge: Judge | None = None,
 ) -> Outcome:
     """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`.
 
-    Raises UserError, leaving the parameters as they were, when the loss or a gradient is not finite.
+    Raises UserError, leaving the parameters as they were, when the loss or a gradient is not finite; with a `judge` that is
+    for it to see to.
     """
     target = frame.composite(objective.background)
     image = objective.draw(step, frame, avatar(frame.params, vertices), avatar.config.sh_degree)
     loss = objective.loss(step, frame, image, target)
     optimizer.zero_grad()
     loss.total.backward()
-    check_step(step, frame, loss, avatar)
+    if judge is None:
+        check_step(step, frame, loss, avatar)
+    else:
+        judge(loss, [parameter.grad for parameter in avatar.parameters() if parameter.grad is not None])
     set_rates(optimizer, schedule(step, objective.config))
     optimizer.step()
     return Outcome(loss, image.detach(), target)
 
 
-def choose_perceptual(config: TrainerConfig, say: Callable[[str], None], recorded: str | None = None) -> PerceptualTerm:
+def choose_perceptual(
+    config: TrainerConfig, say: Callable[[str], None], recorded: str | None = None, device: torch.device = CPU
+) -> PerceptualTerm:
     """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
 
     `recorded` is the name of what a run began with, which it keeps whatever this machine has. Raises UserError when LPIPS
@@ -118,9 +131,10 @@ def choose_perceptual(config: TrainerConfig, say: Callable[[str], None], recorde
     lpips_name = f"lpips-{config.lpips_net}"
     if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
         try:
-            lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
-            function = masked_lpips(lpips) if config.lpips_region == "frame" else on_head(masked_lpips(lpips))
-            term = Weighted(function, config.perceptual_weight)
+            lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips").on(device)
+            crops = config.lpips_region == "head"
+            function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
+            term = Weighted(function, config.perceptual_weight, crops)
             return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place)
         except UserError as error:
             if recorded is not None:
