@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
 from avatar.kernels.place import place
 from avatar.kernels.place_backward import gather_nodes, place_backward
@@ -22,6 +21,15 @@ ENTRIES = 32  # of a node's list that are summed at a time
 WIDEST = 64  # values of a node that one program sums
 
 
+class Mesh(Protocol):
+    """How Gaussians hang on a mesh; an `Embedding`."""
+
+    corners: Int[Tensor, "N 3"]
+    barycentric: Float[Tensor, "N 3"]
+
+    def touching(self, num_vertices: int) -> Touching: ...
+
+
 def place_gpu(
     vertices: Float[Tensor, "V 3"],
     values: Float[Tensor, "M n"],
@@ -30,7 +38,7 @@ def place_gpu(
     log_scales: Float[Tensor, "N 3"],
     opacity_logits: Float[Tensor, " N"],
     sh: Float[Tensor, "N K 3"],
-    embedding: Embedding,
+    embedding: Mesh,
     grid: Interpolation | None,
 ) -> Gaussians:
     """`compose_raw` of the embedding's points and of the network's `values`, which are brought from the grid's nodes to the
@@ -43,8 +51,8 @@ def place_gpu(
     check_shapes(quats=(quats, "N 4"), opacity_logits=(opacity_logits, "N"), sh=(sh, "N _ 3"))
     places = N if grid is None else grid.num_cells
     check_shapes(values=(values, f"{places} {'n' if packed is not None else 10}"))
-    if len(embedding) != N:
-        raise ValueError(f"quats has N = {N}, but the embedding has {len(embedding)} Gaussians")
+    if len(embedding.corners) != N:
+        raise ValueError(f"quats has N = {N}, but the embedding has {len(embedding.corners)} Gaussians")
     if packed is not None and tuple(packed.shape) != packed_shape(N, n):
         raise ValueError(f"packed must have shape {list(packed_shape(N, n))}, got {list(packed.shape)}")
     if packed is None and grid is not None:

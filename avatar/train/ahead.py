@@ -36,14 +36,14 @@ class Guard:
     """Tells the optimizer, on its own device, to leave everything as it is from the first step on that is not finite."""
 
     def __init__(self, optimizer: torch.optim.Adam, device: torch.device) -> None:
-        self._sum = torch.zeros(1, device=device)  # of 0 for each step, NaN from the first that is not finite on
-        self.is_spoilt: Float[Tensor, " 1"] = torch.zeros(1, device=device)
+        self._sum = torch.zeros((), device=device)  # of 0 for each step, NaN from the first that is not finite on
+        self.is_spoilt: Float[Tensor, ""] = torch.zeros((), device=device)
         optimizer.found_inf = self.is_spoilt  # type: ignore[attr-defined]  # of Adam's fused kernel: 1 is to do nothing
 
     def judge(self, loss: PhotometricLoss, gradients: list[Tensor]) -> None:
         """Before the optimizer's step."""
-        norm = torch.nn.utils.get_total_norm(gradients)
-        self._sum.add_((norm + loss.total.detach()) * 0.0)
+        norms = torch.stack(torch._foreach_norm(gradients))  # pyright: ignore
+        self._sum.add_((norms.sum() + loss.total.detach()) * 0.0)
         torch.ne(self._sum, self._sum, out=self.is_spoilt)
 
     def forgive(self) -> None:
@@ -113,7 +113,7 @@ class Ahead:
         total = outcome.loss.total.detach()
         quality = psnr(outcome.render, outcome.target).float() if self._log.shows(step) else total
         terms = [term.detach() for term in outcome.loss]
-        numbers = torch.stack((self._guard.is_spoilt[0], *terms, quality))
+        numbers = torch.stack((self._guard.is_spoilt, *terms, quality))
         copy, arrived = numbers.to("cpu", non_blocking=True), None
         if numbers.is_cuda:
             arrived = torch.cuda.Event()
