@@ -22,6 +22,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"avatar: {error}", file=sys.stderr)
         return EXIT_ERROR
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # torch's, which need not be imported yet
+            raise
+        print(
+            "avatar: the GPU's memory is full: lower --size or model.uv_size, end other programs that use it, or take "
+            "--device cpu",
+            file=sys.stderr,
+        )
+        return EXIT_ERROR
     except KeyboardInterrupt:
         print("avatar: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

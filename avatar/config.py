@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +99,7 @@ class Config:
     data: DataConfig
     model: ModelConfig
     trainer: TrainerConfig
+    device: str = "auto"  # files of earlier versions do not say
 
     def to_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -106,6 +108,7 @@ class Config:
 MAX_OVERRIDE = 1000  # characters; a message quotes the override
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 
+DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 CHOICES: dict[str, tuple[str, ...]] = {
     "model.name": ("hypergaussians", "flashavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
@@ -205,8 +208,14 @@ def _check_values(config: Config) -> None:
         value = flat[key]
         if value is not None and not low <= value <= high:
             raise UserError(f"{key}={value} is out of range: it must lie between {low:g} and {high:g}")
+    check_device(config.device)
     if any(not 0.0 <= c <= 1.0 for c in config.data.background):
         raise UserError(f"data.background={list(config.data.background)} must be three values from 0 to 1")
+
+
+def check_device(name: str) -> None:
+    if not DEVICE.fullmatch(name):
+        raise UserError(f"device={name} is not one of auto, cpu, cuda, cuda:N (such as cuda:0)")
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:

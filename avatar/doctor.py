@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 import avatar
+from avatar.compute.choose import check_gpu, describe_gpu
 from avatar.config import config_dir
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
@@ -29,6 +30,7 @@ def diagnose(say: Callable[[str], None] = print) -> int:
         try_finding("configuration", lambda: str(config_dir()), say),
     ]
     try_finding("video encoder", find_encoder, say)
+    try_finding("GPU", find_gpu, say)
     try_finding("head model", find_default_head, say)
     for net in ("vgg", "alex", "squeeze"):
         try_finding(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
@@ -66,6 +68,12 @@ def find_encoder() -> str:
     import imageio_ffmpeg
 
     return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+
+
+def find_gpu() -> str:
+    device = torch.device("cuda", 0)
+    check_gpu(device)
+    return f"{describe_gpu(device)}: computes what the CPU does"
 
 
 def find_default_head() -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from avatar.commands import OK
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, open_trained, source_of
 from avatar.commands.outputs import check_outputs
+from avatar.compute.choose import choose_device
 from avatar.errors import UserError
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
@@ -18,6 +19,7 @@ from data_prep.open import open_subject
 
 def run_reenact(arguments: Namespace) -> int:
     trained = open_trained(arguments.run, arguments.head)
+    trained.avatar.to(choose_device(arguments.device or "auto", print))
     choices = Choices(
         arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
     )

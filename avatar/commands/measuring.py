@@ -8,6 +8,7 @@ from argparse import Namespace
 from avatar.commands import OK
 from avatar.commands.opening import open_run
 from avatar.commands.outputs import check_outputs
+from avatar.compute.choose import choose_device
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
@@ -15,6 +16,7 @@ from avatar.evaluation.evaluate import evaluate
 
 def run_eval(arguments: Namespace) -> int:
     run = open_run(arguments.run, arguments.head, arguments.folder)
+    run.avatar.to(choose_device(arguments.device or "auto", print))
     evaluate(run, arguments.protocol, write_frames=arguments.frames)
     return OK
 

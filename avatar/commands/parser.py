@@ -63,6 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the preset's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on from RUN's newest checkpoint")
+    add_device(train, "the configuration's, auto")
     train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
@@ -75,6 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="only this protocol, by name or as FILE.yaml; may be repeated",
     )
     evaluate.add_argument("--frames", action="store_true", help="write every render, truth and mask as PNG too")
+    add_device(evaluate)
 
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
     add_run(report)
@@ -106,6 +108,7 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument(
         "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
     )
+    add_device(reenact)
 
     export = commands.add_parser("export", help="write an avatar as a file to take away")
     add_avatar(export)
@@ -191,6 +194,14 @@ def add_folder(parser: argparse.ArgumentParser) -> None:
 def add_avatar(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="AVATAR", help="folder that avatar train wrote, or its avatar file")
     add_head(parser)
+
+
+def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
+    parser.add_argument(
+        "--device",
+        metavar="auto|cpu|cuda[:N]",
+        help=f"what computes; auto takes a GPU that passes its test (default: {default})",
+    )
 
 
 def add_head(parser: argparse.ArgumentParser) -> None:

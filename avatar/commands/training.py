@@ -11,6 +11,7 @@ import torch
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
+from avatar.compute.choose import choose_device
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
@@ -31,9 +32,9 @@ def run_train(arguments: Namespace) -> int:
     overrides = config_overrides(arguments)
     if arguments.resume:
         refuse_changes(run, read_run_info(run), arguments, overrides)
-        return resume_run(run, arguments.head, arguments.folder)
+        return resume_run(run, arguments.head, arguments.folder, arguments.device)
     load_config(overrides)  # a mistake in it before one in the folder
-    return train_new(source_of(arguments), overrides, run)
+    return train_new(source_of(arguments), overrides, run, arguments.device)
 
 
 def default_run(folder: Path | None) -> Path:
@@ -42,19 +43,21 @@ def default_run(folder: Path | None) -> Path:
     return Path("runs") / folder.resolve().name
 
 
-def train_new(source: Source, overrides: list[str], run: Path) -> int:
+def train_new(source: Source, overrides: list[str], run: Path, device: str | None = None) -> int:
+    """`device` stands in for the configuration's."""
     config = load_config(overrides)
     with locked(run):
         refuse_trained(run)
+        chosen = choose_device(device or config.device, print)
         subject, assets = open_subject(source, split_sizes(config))
-        perceptual = choose_perceptual(config.trainer, print)
+        perceptual = choose_perceptual(config.trainer, print, device=chosen)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, subject.identity, config.model)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
-        return finish_training(avatar, subject, config, run, perceptual)
+        return finish_training(avatar, subject, config, run, perceptual, chosen)
 
 
-def resume_run(run: Path, head: Path | None = None, folder: Path | None = None) -> int:
+def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, device: str | None = None) -> int:
     """Go on from the newest checkpoint, with the decisions that the run began with."""
     with locked(run):
         info, checkpoint = read_run_info(run), newest_checkpoint(run)
@@ -62,10 +65,12 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None) 
         subject, assets = open_subject(source, split_sizes(info.config))
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
-        return go_on(run, info, checkpoint, subject, assets)
+        return go_on(run, info, checkpoint, subject, assets, device)
 
 
-def go_on(run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets) -> int:
+def go_on(
+    run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets, device: str | None
+) -> int:
     config = info.config
     if checkpoint.meta.get("threads") != torch.get_num_threads():
         print(
@@ -77,9 +82,12 @@ def go_on(run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, as
         leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
         return OK
-    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual)
+    chosen = choose_device(device or config.device, print)
+    if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
+        print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; the result is the same to rounding")
+    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, device=chosen)
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
-    return finish_training(avatar, subject, config, run, perceptual, checkpoint)
+    return finish_training(avatar, subject, config, run, perceptual, chosen, checkpoint)
 
 
 def finish_training(
@@ -88,6 +96,7 @@ def finish_training(
     config: Config,
     run: Path,
     perceptual: PerceptualTerm,
+    device: torch.device,
     checkpoint: Checkpoint | None = None,
 ) -> int:
     split = subject.split
@@ -96,7 +105,7 @@ def finish_training(
         f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
     )
     begin = time.monotonic()
-    done = train(avatar, subject, config, run, perceptual, resume=checkpoint)
+    done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
     first = checkpoint.step if checkpoint else 0
     seconds = time.monotonic() - begin
     rate = f"{seconds / max(done - first, 1):.3f} s per step"
@@ -126,7 +135,7 @@ def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: li
         recorded = {**flatten(info.config.to_dict()), **info.options}
         asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
         for key in (override.partition("=")[0] for override in overrides):
-            if recorded[key] != asked[key]:
+            if key != "device" and recorded[key] != asked[key]:
                 raise UserError(
                     f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
                     "start a new run"

@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from avatar.compute.device import CPU
+from avatar.config import check_device
 from avatar.errors import UserError
 
 LEAST_TRITON = (3, 7, 1)  # what the kernels are verified with
@@ -30,6 +31,7 @@ def choose_device(name: str, say: Callable[[str], None]) -> torch.device:
     "auto" takes the first GPU, if there is one that passes `check_gpu`, and says which; where there is one that does not,
     it says why. A GPU that is asked for by name is used or refused: UserError.
     """
+    check_device(name)
     if name == "cpu":
         return CPU
     if name == "auto":
@@ -40,10 +42,7 @@ def choose_device(name: str, say: Callable[[str], None]) -> torch.device:
         except NoGpu as error:
             say(f"Working on the CPU: {error}")
             return CPU
-    kind, _, number = name.partition(":")
-    if kind != "cuda" or (number and not number.isdigit()):
-        raise UserError(f"--device {name}: the device must be auto, cpu, cuda or cuda:N, such as cuda:0")
-    return _ready(torch.device("cuda", int(number or 0)), say)
+    return _ready(torch.device("cuda", int(name.partition(":")[2] or 0)), say)
 
 
 def _ready(device: torch.device, say: Callable[[str], None]) -> torch.device:

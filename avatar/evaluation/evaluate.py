@@ -61,7 +61,7 @@ def evaluate(
     folder = run.path / "eval"
     subject, data = run.subject, run.config.data
     renderer = Renderer(run.avatar, torch.tensor(chosen[0].background))
-    networks = find_networks(protocol.lpips_net for protocol in chosen)
+    networks = find_networks((protocol.lpips_net for protocol in chosen), renderer.background.device)
     lpips: dict[Net, Lpips | None] = {net: found.network for net, found in networks.items()}
     indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in chosen}
     order = sorted(set().union(*indices.values()))
