@@ -54,6 +54,19 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def the_cpus_way() -> Iterator[None]:
+    """Tensors on the CPU take the compiled kernels in here, whether Triton interprets or not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("TRITON_INTERPRET", raising=False)
+        yield
+
+
+def error(found: Tensor, expected: Tensor) -> float:
+    """The largest difference, relative to the largest value."""
+    return float((found.detach().cpu() - expected.detach()).abs().max() / expected.detach().abs().max())
+
+
 @dataclass
 class Buffer:
     """Memory that was asked for, between two bands that nobody may write to."""

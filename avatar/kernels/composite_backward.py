@@ -67,7 +67,8 @@ def composite_backward(
         behind -= tl.load(grad_alpha + pixel, mask=inside, other=0.0)
     behind = transmittance * behind
 
-    seen = tl.minimum(tl.load(chunks + tile) * FORWARD_STEP, (pairs + STEP - 1) // STEP * STEP)
+    # What was looked at, in steps of this direction; what of it no pixel shows is behind all of their stops.
+    seen = (tl.minimum(tl.load(chunks + tile) * FORWARD_STEP, pairs) + STEP - 1) // STEP * STEP
     for start in range(seen, pairs, STEP):  # behind what every pixel shows
         for moment in tl.static_range(MOMENTS):
             tl.store(
