@@ -20,6 +20,7 @@ MODULES = {
     "demo-data": "demonstrating",
     "demo": "demonstrating",
     "bench": "benchmarking",
+    "sweep": "sweeping",
     "doctor": "diagnosing",
 }
 

@@ -151,6 +151,18 @@ def build_parser() -> argparse.ArgumentParser:
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
     extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")
 
+    sweep = commands.add_parser("sweep", help="train and measure many subjects, configurations and seeds")
+    sweep.add_argument(
+        "spec", type=Path, nargs="?", metavar="SPEC.yaml", help="what to train; without it, go on with --out"
+    )
+    sweep.add_argument("--out", type=Path, metavar="DIR", help="where jobs and tables go (default: runs/NAME-OF-SPEC)")
+    sweep.add_argument("--engine", choices=("local", "ray", "slurm"), default="local", help="where the jobs run")
+    sweep.add_argument("--workers", type=int, metavar="N", help="jobs at a time (default: as many as fit)")
+    sweep.add_argument("--address", metavar="ADDRESS", help="of the Ray cluster, or submitit's kind of cluster")
+    sweep.add_argument("--partition", metavar="NAME", help="of the SLURM cluster")
+    sweep.add_argument("--status", action="store_true", help="say what has become of each job, and start nothing")
+    sweep.add_argument("--retry-failed", action="store_true", help="try jobs again that have failed with a sentence")
+
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser
 

@@ -68,8 +68,9 @@ class ProtocolComparison:
     """All runs by one protocol."""
 
     protocol: str
-    frames: int  # that all runs have
-    block: int  # frames in a block of the bootstrap
+    count: int  # of what the means are over, the same for all runs
+    unit: str  # frames, for instance
+    method: str  # of the intervals
     rows: Mapping[str, Sequence[Cell]]  # figure -> one cell per run
 
 
@@ -189,7 +190,7 @@ def compare_protocol(evaluations: Sequence[Evaluation], name: str, notes: list[s
         rows[figure] = [Cell(_mean(first), None, None), *(_cell(own, first, bootstrap) for own in others)]
     if empty:
         notes.append(f"{name}: in no frame of all runs is there {', '.join(empty)}")
-    return ProtocolComparison(name, len(frames), block, rows)
+    return ProtocolComparison(name, len(frames), "frames", f"blocks of {block} frames", rows)
 
 
 def _cell(values: np.ndarray, first: np.ndarray, bootstrap: BlockBootstrap) -> Cell:

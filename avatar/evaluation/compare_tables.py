@@ -77,13 +77,13 @@ def as_csv(comparison: Comparison) -> str:
     """A line for each protocol, figure and run."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(("protocol", "figure", "run", "frames", "mean", "difference", "low", "high"))
+    writer.writerow(("protocol", "figure", "run", "count", "mean", "difference", "low", "high"))
     for each in comparison.protocols:
         for figure, row in each.rows.items():
             for label, cell in zip(comparison.labels, row, strict=True):
                 numbers = (cell.mean, cell.difference, *(cell.interval or (None, None)))
                 shown = ("" if number is None else f"{number:.6f}" for number in numbers)
-                writer.writerow((each.protocol, figure, label, each.frames, *shown))
+                writer.writerow((each.protocol, figure, label, each.count, *shown))
     return file.getvalue()
 
 
@@ -103,8 +103,7 @@ def write_tables(folder: Path, comparison: Comparison) -> None:
 
 def _caption(each: ProtocolComparison, first: str) -> str:
     return (
-        f"{each.protocol}: {each.frames} frames, differences to {first} with {LEVEL:.0%} intervals "
-        f"(blocks of {each.block} frames)"
+        f"{each.protocol}: {each.count} {each.unit}, differences to {first} with {LEVEL:.0%} intervals ({each.method})"
     )
 
 

@@ -1,41 +1,33 @@
-"""Reading of other programs' pickles (.pkl, .frame, .npz) without ever running what they contain.
+"""Reading of other programs' pickles (.pkl, .frame) and arrays (.npz, .npy) without running what they contain.
 
-A pickle is a program. `pickle_machine` interprets its instructions and knows only those that make plain containers,
-numpy arrays, scipy sparse matrices (dense on return), `chumpy.ch.Ch` arrays and torch tensors (numpy on return). Names
-in the file are compared with a list and never imported, so there is nothing that a file could call.
+A pickle is a program. `DataUnpickler` follows it only as far as it makes data: nothing is imported or called. Objects of
+numpy, scipy, chumpy and torch come back as numpy arrays, sparse matrices as dense ones.
 """
 
 from __future__ import annotations
 
 import io
 import math
+import pickle
 import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.pickle_machine import PersistentLoad, PickleMachine
-from avatar.files.pickle_values import Budget, Refused, resolve, storage_array
+from avatar.files.data_unpickler import DataUnpickler
+from avatar.files.pickled_data import Budget, Refused, plain
 
 MAX_FILE_BYTES = 2**30  # FLAME's largest pickle has 53 MB
 MIN_BUDGET_BYTES = 2**26
 _LEGACY_TORCH_MAGIC = 0x1950A86A20F9469CFC6C  # first pickle of a file that torch.save wrote before 1.6
-_MALFORMED = (
-    ValueError,
-    IndexError,
-    KeyError,
-    TypeError,
-    OverflowError,
-    MemoryError,
-    RecursionError,
-    struct.error,
-)  # what reading nonsense as a pickle runs into
-
+_MALFORMED = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, RecursionError)
+_MALFORMED += (EOFError, struct.error, pickle.UnpicklingError)  # what reading nonsense as a pickle runs into
 _BAD_ZIP = (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError)  # the same for an archive
 
 
@@ -51,7 +43,7 @@ def load_pickle(source: Path | str | bytes, name: str | None = None) -> Any:
     UserError) when it holds anything else.
     """
     data, name = _read(source, name)
-    return _unpickle_all(data, name, count=1, persistent=None)[0]
+    return _unpickle(io.BytesIO(data), name, _budget(data))
 
 
 def load_torch_pickle(source: Path | str | bytes, name: str | None = None) -> Any:
@@ -66,12 +58,9 @@ def load_torch_pickle(source: Path | str | bytes, name: str | None = None) -> An
                 raise UserError(f"{name} is a zip file that torch.save did not write: it has {len(pickles)} data.pkl")
             if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
                 raise UserError(f"{name} holds compressed members, which torch.save never writes; write it again")
-            root = pickles[0][: -len("data.pkl")]
-
-            def load_storage(identity: Any, budget: Budget) -> np.ndarray:
-                return storage_array(identity, lambda key: archive.read(f"{root}data/{key}"), budget)
-
-            return _unpickle_all(archive.read(pickles[0]), name, count=1, persistent=load_storage)[0]
+            root = pickles[0].removesuffix("data.pkl")
+            stream = io.BytesIO(archive.read(pickles[0]))
+            return _unpickle(stream, name, _budget(data), lambda key: archive.read(f"{root}data/{key}"))
     except (*_BAD_ZIP, *_MALFORMED) as error:
         raise UserError(f"{name} is damaged or cut short ({_short(error)}); write or copy it again") from error
 
@@ -117,10 +106,26 @@ def _parse_npy(data: bytes, path: Path) -> np.ndarray:
         raise UserError(f"{path} is damaged or holds no numpy arrays ({_short(error)})") from error
 
 
-def _short(error: Exception) -> str:
-    """What went wrong, without the pages of the file that some reasons quote."""
-    text = str(error)
-    return text if len(text) <= 400 else f"{text[:300]} ... {text[-80:]}"
+def _load_legacy_torch(data: bytes, name: str) -> Any:
+    """torch.save before 1.6 wrote magic number, version, system information and the object, one pickle each."""
+    stream, budget = io.BytesIO(data), _budget(data)
+    if _unpickle(stream, name, budget) != _LEGACY_TORCH_MAGIC:
+        raise UserError(f"{name} was not written by torch.save (neither its zip format nor the older one)")
+    return [_unpickle(stream, name, budget) for _ in range(3)][-1]
+
+
+def _budget(data: bytes) -> Budget:
+    return Budget(max(4 * len(data), MIN_BUDGET_BYTES))
+
+
+def _unpickle(stream: io.BytesIO, name: str, budget: Budget, read_storage: Callable[[str], bytes] | None = None) -> Any:
+    """The data of the next pickle in the stream."""
+    try:
+        return plain(DataUnpickler(stream, budget, read_storage).load(), budget, done={})
+    except Refused as error:
+        raise UnsafeFileError(f"{name} was not read: {_short(error)}") from error
+    except _MALFORMED as error:
+        raise UserError(f"{name} is damaged, cut short or not a pickle ({_short(error)})") from error
 
 
 def _read(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
@@ -133,7 +138,8 @@ def _read(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
             size = path.stat().st_size
             if size > MAX_FILE_BYTES:
                 raise UserError(f"{name} has {size} bytes; files of more than {MAX_FILE_BYTES} bytes are not read")
-            data = path.read_bytes()
+            with path.open("rb") as file:
+                data = file.read(size)  # a device has no size and no end
         except OSError as error:
             raise UserError(f"{name} cannot be read: {error.strerror}") from error
     if not data:
@@ -141,20 +147,8 @@ def _read(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
     return data, name
 
 
-def _load_legacy_torch(data: bytes, name: str) -> Any:
-    """torch.save before 1.6 wrote magic number, version, system information and the object, one pickle each."""
-    stream_start = _unpickle_all(data, name, count=1, persistent=None)[0]
-    if stream_start != _LEGACY_TORCH_MAGIC:
-        raise UserError(f"{name} was not written by torch.save (neither its zip format nor the older one)")
-    return _unpickle_all(data, name, count=4, persistent=None)[3]
-
-
-def _unpickle_all(data: bytes, name: str, count: int, persistent: PersistentLoad | None) -> list[Any]:
-    stream = io.BytesIO(data)
-    budget = Budget(max(4 * len(data), MIN_BUDGET_BYTES))
-    try:
-        return [resolve(PickleMachine(stream, budget, persistent).run(), budget) for _ in range(count)]
-    except Refused as error:
-        raise UnsafeFileError(f"{name} was not read: {_short(error)}") from error
-    except _MALFORMED as error:
-        raise UserError(f"{name} is damaged, cut short or not a pickle ({_short(error)})") from error
+def _short(error: Exception) -> str:
+    """What went wrong, without the pages of the file that some reasons quote, nor what would steer a terminal."""
+    text = str(error) or ("it ends before the pickle does" if isinstance(error, EOFError) else type(error).__name__)
+    text = text if len(text) <= 400 else f"{text[:300]} ... {text[-80:]}"
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)

@@ -13,6 +13,7 @@ from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.check.check_files import check_files, from_sentence, lost_frames
+from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
 from data_prep.check.check_tracking import behind_camera, check_behind_camera, check_tracking, repeated_tracking
 from data_prep.check.clip import Clip, Progress, read_clip, silent
@@ -71,6 +72,7 @@ def check_tracked_folder(
         clip = read_clip(folder.resolve(), assets, tracking, frame_offset, format, progress)
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
+    findings += [] if assets is None else check_head(assets)
     findings += check_files(clip) + check_tracking(clip) + check_behind_camera(clip) + check_images(clip)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     lost = left_out(clip)

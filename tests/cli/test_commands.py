@@ -97,7 +97,7 @@ def test_eval_prints_the_table_and_writes_what_it_says(trained: Path) -> None:
     assert "Written to" in compared
     rows = list(csv.DictReader((trained / "compared" / "compare.csv").open()))
     strict = [row for row in rows if (row["protocol"], row["figure"], row["run"]) == ("strict", "psnr", str(trained))]
-    assert [(row["frames"], row["difference"]) for row in strict] == [("6", ""), ("6", "0.000000")]
+    assert [(row["count"], row["difference"]) for row in strict] == [("6", ""), ("6", "0.000000")]
     # compare reads frames.csv, whose figures have six decimals
     assert float(strict[0]["mean"]) == pytest.approx(results["protocols"]["strict"]["means"]["psnr"], abs=1.1e-6)
     assert {path.name for path in (trained / "compared").iterdir()} == {

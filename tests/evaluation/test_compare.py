@@ -56,7 +56,10 @@ def test_paired_differences_are_clear_where_the_means_overlap(tmp_path: Path) ->
     comparison = compare_runs([a, b])
     (each,) = comparison.protocols
     first, second = each.rows["psnr"]
-    assert (each.frames, each.block) == (40, 10) and comparison.labels == ["a", "b"]
+    assert (each.count, each.unit, each.method) == (40, "frames", "blocks of 10 frames") and comparison.labels == [
+        "a",
+        "b",
+    ]
     assert first.mean == pytest.approx(smooth(1).mean(), abs=1e-6) and first.difference is None
     assert second.difference == pytest.approx(second.mean - first.mean, abs=1e-9)
     assert second.interval is not None
@@ -73,7 +76,7 @@ def test_only_frames_that_all_runs_have_count(tmp_path: Path) -> None:
     c = write_run(tmp_path / "c", {"psnr": values[:30] + 2.0}, FRAMES[:30])
     comparison = compare_runs([a, b, c])
     (each,) = comparison.protocols
-    assert each.frames == 20 and each.block == 5
+    assert each.count == 20 and each.method == "blocks of 5 frames"
     assert [cell.mean for cell in each.rows["psnr"]] == pytest.approx(values[10:30].mean() + np.arange(3), abs=1e-6)
     assert comparison.notes == ["strict: 20 frames are in all runs, 20 more in some; only the common ones count"]
     d = write_run(tmp_path / "d", {"psnr": values[:5]}, FRAMES[:5])

@@ -14,6 +14,7 @@ import scipy.sparse
 import torch
 
 from avatar.errors import UserError
+from avatar.files import pickles
 from avatar.files.pickles import load_npz, load_pickle, load_torch_pickle
 
 
@@ -35,6 +36,7 @@ def test_plain_data_round_trips(protocol: int) -> None:
     data = {
         "float64": np.arange(6.0).reshape(2, 3),
         "fortran": np.asfortranarray(np.arange(6, dtype=np.int32).reshape(2, 3)),
+        "permuted": np.arange(24.0).reshape(2, 3, 4).transpose(1, 0, 2),
         "strided": np.arange(24.0).reshape(4, 6)[::2, ::3],
         "big endian": np.arange(5, dtype=">f4"),
         "bool": np.array([True, False]),
@@ -132,6 +134,11 @@ def test_chumpy_formula_without_a_value_is_refused(old_modules: dict[str, type])
         load_pickle(pickle.dumps({"posedirs": formula}, 2))
 
 
+def test_a_formula_is_not_taken_for_its_argument(old_modules: dict[str, type]) -> None:
+    with pytest.raises(UserError, match=r"chumpy\.reordering\.Select whose value is not stored"):
+        load_pickle(pickle.dumps(instance(old_modules["Select"], x=np.arange(3)), 2))
+
+
 @pytest.mark.parametrize("kind", ["csc_matrix", "csr_matrix", "coo_matrix", "csc_array", "csr_array", "coo_array"])
 def test_scipy_sparse_becomes_dense(kind: str) -> None:
     matrix = getattr(scipy.sparse, kind)(np.arange(54.0).reshape(6, 9) * (np.arange(54).reshape(6, 9) % 3 == 0))
@@ -141,6 +148,12 @@ def test_scipy_sparse_becomes_dense(kind: str) -> None:
 def test_sparse_duplicates_add_up() -> None:
     matrix = scipy.sparse.coo_matrix(([1.0, 2.0], ([0, 0], [1, 1])), shape=(2, 2))
     np.testing.assert_array_equal(load_pickle(pickle.dumps(matrix)), [[0, 3], [0, 0]])
+
+
+def test_sparse_arrays_may_be_longer_than_what_is_used_of_them() -> None:
+    matrix = scipy.sparse.csc_matrix(np.array([[0.0, 5.0], [7.0, 0.0]]))
+    matrix.indices, matrix.data = np.append(matrix.indices, 9), np.append(matrix.data, 9.0)
+    np.testing.assert_array_equal(load_pickle(pickle.dumps(matrix)), [[0, 5], [7, 0]])
 
 
 def test_torch_save_of_arrays_and_tensors(tmp_path: Path) -> None:
@@ -179,6 +192,44 @@ def test_agrees_with_pickle_on_the_development_model(shared_dir: Path) -> None:
     path = shared_dir / "subjects" / "head_model" / "generic_model.pkl"
     with path.open("rb") as file:
         assert_same(load_pickle(path), pickle.load(file))
+
+
+@pytest.mark.shared
+def test_agrees_with_torch_on_development_frames(shared_dir: Path, tmp_path: Path) -> None:
+    frames = sorted((shared_dir / "subjects" / "carla" / "checkpoint").glob("*.frame"))
+    assert len(frames) > 100
+    for path in frames[::100]:
+        written = torch.load(path, weights_only=False)
+        torch.save(written, tmp_path / "legacy.frame", _use_new_zipfile_serialization=False)
+        assert_same(load_torch_pickle(path), written)
+        assert_same(load_torch_pickle(tmp_path / "legacy.frame"), written)
+
+
+def test_what_a_file_calls_things_cannot_steer_the_terminal() -> None:
+    with pytest.raises(UserError) as refusal:
+        load_pickle(b"\x80\x04X\x06\0\0\0os\x1b[2JX\x04\0\0\0a\nb\r\x93.", "model.pkl")
+    assert str(refusal.value).isprintable() and "refers to os\N{REPLACEMENT CHARACTER}[2J.a" in str(refusal.value)
+
+
+def test_a_reason_does_not_quote_pages() -> None:
+    with pytest.raises(UserError) as refusal:
+        load_pickle(b"c" + b"long" * 10_000 + b"\nname\n.", "model.pkl")
+    assert len(str(refusal.value)) < 500 and "longlong" in str(refusal.value)
+
+
+def test_files_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.savez_compressed(tmp_path / "zeros.npz", zeros=np.zeros(10_000))
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps(np.zeros(200)))
+    monkeypatch.setattr(pickles, "MAX_FILE_BYTES", 1000)
+    with pytest.raises(UserError, match=r"zeros\.npz would unpack to more than 1000 bytes"):
+        load_npz(tmp_path / "zeros.npz")
+    with pytest.raises(UserError, match=r"model\.pkl has \d{4} bytes; files of more than 1000 bytes are not read"):
+        load_pickle(tmp_path / "model.pkl")
+
+
+def test_a_large_file_may_ask_for_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pickles, "MIN_BUDGET_BYTES", 1000)
+    assert len(load_pickle(pickle.dumps(np.zeros(10_000)))) == 10_000
 
 
 def _valid() -> bytes:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from heads import grid_head
 
 from avatar.errors import UserError
@@ -85,6 +86,13 @@ def test_the_objs_faces_may_come_in_another_order(head_dir: Path) -> None:
     order = np.random.default_rng(0).permutation(len(expected))
     (head_dir / "head_template.obj").write_text(obj_text(grid_head(), order))
     np.testing.assert_array_equal(load_head_assets(head_dir).uv_faces, expected)
+
+
+def test_trimesh_reads_the_same_layout(head_dir: Path) -> None:
+    assets = load_head_assets(head_dir)
+    read = trimesh.load(head_dir / "head_template.obj", process=False, force="mesh")
+    np.testing.assert_allclose(read.visual.uv[read.faces], assets.uvs[assets.uv_faces], atol=1e-7)
+    np.testing.assert_allclose(read.vertices[read.faces], assets.template[assets.faces], atol=1e-7)
 
 
 def test_parts_that_a_model_may_lack(head_dir: Path) -> None:

@@ -1,0 +1,79 @@
+"""avatar sweep: many trainings as one."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+from avatar.commands import INTERRUPTED, OK
+from avatar.errors import UserError
+from avatar.evaluation.compare_tables import FORMATS, text, write_tables
+from avatar.sweep.conduct import conduct
+from avatar.sweep.engines import EngineOptions, make_engine
+from avatar.sweep.results import fold_results
+from avatar.sweep.spec import Spec, read_spec
+from avatar.sweep.state import State, read_state, read_sweep, write_state, write_sweep
+from avatar.sweep.table import Progress, full_table, overview
+
+FAILED = 1
+
+
+def run_sweep(arguments: Namespace) -> int:
+    folder = sweep_folder(arguments.spec, arguments.out)
+    if arguments.spec is not None and not arguments.status:
+        write_sweep(folder, read_spec(arguments.spec))
+    spec = read_sweep(folder)
+    if arguments.status:
+        return show_status(folder, spec)
+    if arguments.workers is not None and arguments.workers < 1:
+        raise UserError(f"--workers must be at least 1, not {arguments.workers}")
+    if arguments.retry_failed:
+        reopen_failed(folder, spec)
+    options = EngineOptions(arguments.workers, arguments.address, arguments.partition)
+    engine = make_engine(arguments.engine, spec.resources, folder, options)
+    print(f"{len(spec.jobs)} jobs on {engine.name}; their files are in {folder / 'jobs'}")
+    try:
+        with closing(engine):
+            states = conduct(folder, spec, engine, Progress(arguments.workers))
+    except KeyboardInterrupt:
+        print(f"\nInterrupted; what was done is kept. Go on with: avatar sweep --out {folder}")
+        return INTERRUPTED
+    leave_tables(folder, spec)
+    failed = [state for state in states.values() if state.status == "failed"]
+    return FAILED if failed else OK
+
+
+def sweep_folder(spec: Path | None, out: Path | None) -> Path:
+    if out is not None:
+        return out
+    if spec is None:
+        raise UserError("say which sweep: avatar sweep SPEC.yaml, or avatar sweep --out DIR to go on with one")
+    return Path("runs") / spec.stem
+
+
+def show_status(folder: Path, spec: Spec) -> int:
+    states = {job.name: read_state(folder / "jobs" / job.name) for job in spec.jobs}
+    print("\n".join([*overview(states), "", *full_table(states)]))
+    return FAILED if any(state.status == "failed" for state in states.values()) else OK
+
+
+def reopen_failed(folder: Path, spec: Spec) -> None:
+    for job in spec.jobs:
+        place = folder / "jobs" / job.name
+        state = read_state(place)
+        if state.status == "failed":
+            write_state(place, replace(State(), seconds=state.seconds))
+
+
+def leave_tables(folder: Path, spec: Spec) -> None:
+    """The table on the terminal, and in every format in files, as far as there are results."""
+    try:
+        comparison = fold_results(folder, spec)
+    except UserError as error:
+        print(f"No table: {error}")
+        return
+    write_tables(folder, comparison)
+    print(text(comparison), end="")
+    print(f"Tables {folder / 'compare'}.{{{','.join(suffix for suffix, _ in FORMATS.values())}}}")

@@ -1,0 +1,78 @@
+"""The loop of a sweep: submit what waits, look what became of it, try again what may go better, show it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from avatar.sweep.engines import Engine
+from avatar.sweep.spec import Spec
+from avatar.sweep.state import State, read_state, write_state
+from avatar.sweep.table import Progress
+
+POLL_SECONDS = 0.5
+
+
+def conduct(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> dict[str, State]:
+    """Run every job that is not done on the engine; returns what became of each.
+
+    A job that fails never stops the others. One whose worker was killed or crashed is tried again up to `spec.retries`
+    times; one that failed with a sentence is not. Ctrl-C asks the workers to save their state and ends.
+    """
+    places = {job.name: folder / "jobs" / job.name for job in spec.jobs}
+    states = {name: read_state(place) for name, place in places.items()}
+    handles: dict[str, Any] = {}
+
+    def submit(names: list[str]) -> None:
+        if names:
+            handles.update(zip(names, engine.submit([places[name] for name in names]), strict=True))
+
+    elsewhere = {name for name, state in states.items() if state.status == "running"}
+    submit([name for name, state in states.items() if name not in elsewhere and is_open(state, spec.retries)])
+    try:
+        while handles or elsewhere:
+            again = []
+            for name, handle in list(handles.items()):
+                said = engine.poll(handle)
+                if said is not None:
+                    del handles[name]
+                    states[name] = settle(places[name], said, spec.retries)
+                    again += [name] if is_open(states[name], spec.retries) else []
+                else:
+                    states[name] = read_state(places[name])
+            for name in list(elsewhere):  # another engine's worker has it, until it is done or falls silent
+                states[name] = read_state(places[name])
+                if states[name].status != "running":
+                    elsewhere.remove(name)
+                    again += [name] if is_open(states[name], spec.retries) else []
+            submit(again)
+            progress.show(states)
+            if handles or elsewhere:
+                time.sleep(POLL_SECONDS)
+    except BaseException:
+        engine.stop(list(handles.values()))
+        raise
+    progress.show(states, last=True)
+    return states
+
+
+def is_open(state: State, retries: int) -> bool:
+    """Whether there is something left to do, and to hope for."""
+    if state.status == "done" or state.is_final:
+        return False
+    return state.status != "failed" or state.attempts <= retries
+
+
+def settle(place: Path, said: str, retries: int) -> State:
+    """The state of a job whose worker has ended. One that died without a word leaves `running` behind."""
+    state = read_state(place)
+    if state.status == "running":
+        state = replace(state, status="failed", sentence=said or "the worker ended without a word")
+    elif said and state.status == "waiting":
+        state = replace(state, status="failed", sentence=said, attempts=state.attempts + 1)
+    if state.status == "failed" and state.attempts > retries:
+        state = replace(state, is_final=True)
+    write_state(place, state)
+    return state

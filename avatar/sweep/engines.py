@@ -1,0 +1,215 @@
+"""Where a sweep's jobs run: processes of this machine, a Ray cluster, a SLURM cluster. An engine keeps nothing itself."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from avatar.compute.memory import available_bytes
+from avatar.errors import UserError
+from avatar.sweep.job import last_words, start_worker, work_until_done
+from avatar.sweep.spec import Resources
+
+ENGINES = ("local", "ray", "slurm")
+LONGEST_MINUTES = 24 * 60
+
+
+class Engine(Protocol):
+    """Starts workers and tells what became of them."""
+
+    name: str
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        """A handle for each job; the engine queues what it cannot start at once."""
+        ...
+
+    def poll(self, handle: Any) -> str | None:
+        """None while the worker runs or waits; then its last words, empty when it ended as it should."""
+        ...
+
+    def stop(self, handles: Sequence[Any]) -> None:
+        """Ask workers to save their state and end."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the cluster."""
+        ...
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    workers: int | None = None  # at a time; None: as many as fit
+    address: str | None = None  # of a Ray cluster
+    partition: str | None = None  # of a SLURM cluster
+    minutes: int = LONGEST_MINUTES  # of a SLURM job; training goes on in the next one
+
+
+def make_engine(name: str, resources: Resources, folder: Path, options: EngineOptions) -> Engine:
+    """Raises UserError when the engine's package is missing or its cluster cannot be reached."""
+    if name == "local":
+        return LocalProcesses(resources, options.workers)
+    if name == "ray":
+        return RayCluster(resources, options.address, options.workers)
+    if name == "slurm":
+        return SlurmCluster(resources, folder / "slurm", options)
+    raise UserError(f"--engine must be one of {', '.join(ENGINES)}, not {name!r}")
+
+
+def workers_that_fit(resources: Resources) -> int:
+    """How many jobs this machine's cores and memory hold at a time; at least one."""
+    by_cores = (os.cpu_count() or 1) // resources.threads
+    by_memory = int(available_bytes() // (resources.memory_gb * 2**30))
+    return max(1, min(by_cores, by_memory))
+
+
+class LocalProcesses:
+    """Processes of this machine."""
+
+    name = "local"
+
+    def __init__(self, resources: Resources, workers: int | None) -> None:
+        self.workers = workers or workers_that_fit(resources)
+        self._threads = resources.threads
+        self._waiting: list[Path] = []
+        self._running: dict[Path, subprocess.Popen[bytes]] = {}
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        self._waiting += folders
+        self._start()
+        return list(folders)
+
+    def poll(self, handle: Any) -> str | None:
+        process = self._running.get(handle)
+        if process is None or process.poll() is None:
+            return None
+        _, said = process.communicate()
+        del self._running[handle]
+        self._start()
+        return last_words(process.returncode, said)
+
+    def stop(self, handles: Sequence[Any]) -> None:
+        self._waiting.clear()
+        for process in self._running.values():
+            process.terminate()
+        for process in self._running.values():
+            process.wait()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _start(self) -> None:
+        while self._waiting and len(self._running) < self.workers:
+            folder = self._waiting.pop(0)
+            self._running[folder] = start_worker(folder, self._threads)
+
+
+class RayCluster:
+    """An existing Ray cluster, or one of this machine's own when no address is given.
+
+    Its machines need this program installed and the sweep's folder under the same path.
+    """
+
+    name = "ray"
+
+    def __init__(self, resources: Resources, address: str | None, workers: int | None) -> None:
+        ray = _import("ray", "ray")
+        try:
+            ray.init(address=address, num_cpus=None if address else workers, log_to_driver=False, logging_level="error")
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            place = f"at {address}" if address else "on this machine"
+            raise UserError(f"no Ray cluster answers {place} ({str(error).splitlines()[0]})") from None
+        self._ray = ray
+        needs: dict[str, Any] = {"num_cpus": resources.threads, "memory": int(resources.memory_gb * 2**30)}
+        if resources.gpus:
+            needs["num_gpus"] = resources.gpus
+        # What is tried again is decided in one place, from the job's files.
+        self._work = ray.remote(max_retries=0, **needs)(work_until_done)
+        self._threads = resources.threads
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        return [self._work.remote(str(folder.resolve()), self._threads) for folder in folders]
+
+    def poll(self, handle: Any) -> str | None:
+        ready, _ = self._ray.wait([handle], timeout=0)
+        if not ready:
+            return None
+        try:
+            return self._ray.get(handle)
+        except self._ray.exceptions.RayError as error:  # the worker, its machine, or its memory is gone
+            return str(error).strip().splitlines()[0]
+
+    def stop(self, handles: Sequence[Any]) -> None:
+        for handle in handles:
+            self._ray.cancel(handle, force=False)
+
+    def close(self) -> None:
+        self._ray.shutdown()
+
+
+class SlurmCluster:
+    """Job arrays of a SLURM cluster, through submitit; a job that is preempted or runs out of time is queued again."""
+
+    name = "slurm"
+
+    def __init__(self, resources: Resources, folder: Path, options: EngineOptions) -> None:
+        submitit = _import("submitit", "slurm")
+        try:
+            self._executor = submitit.AutoExecutor(folder=folder, cluster=options.address)
+        except (RuntimeError, ValueError) as error:
+            raise UserError(f"submitit cannot use this machine ({error}); is it one of a SLURM cluster?") from None
+        self._executor.update_parameters(
+            name="avatar-sweep",
+            cpus_per_task=resources.threads,
+            mem_gb=resources.memory_gb,
+            gpus_per_node=round(resources.gpus),
+            timeout_min=options.minutes,
+            **({"slurm_partition": options.partition} if options.partition else {}),
+            **({"slurm_array_parallelism": options.workers} if options.workers else {}),
+        )
+        self._work = Requeued(resources.threads)
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        return list(self._executor.map_array(self._work, [str(folder.resolve()) for folder in folders]))
+
+    def poll(self, handle: Any) -> str | None:
+        if not handle.done():
+            return None
+        try:
+            return handle.result()
+        except Exception as error:  # submitit raises what it likes for workers that are gone
+            return str(error).strip().splitlines()[0]
+
+    def stop(self, handles: Sequence[Any]) -> None:
+        for handle in handles:
+            handle.cancel()
+
+    def close(self) -> None:
+        """The cluster keeps the jobs."""
+
+
+@dataclass
+class Requeued:
+    """A job for submitit that goes on in a new one when SLURM takes its machine away."""
+
+    threads: int
+
+    def __call__(self, folder: str) -> str:
+        return work_until_done(folder, self.threads)
+
+    def checkpoint(self, folder: str) -> Any:
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, folder)
+
+
+def _import(module: str, extra: str) -> Any:
+    try:
+        return __import__(module)
+    except ImportError:
+        raise UserError(
+            f"--engine {extra} needs the package {module}: pip install 'hyperavatar[{extra}]', or {module}"
+        ) from None

@@ -1,0 +1,168 @@
+"""One job: `avatar train`, resumed where it was stopped, then `avatar eval`. Running it again changes nothing.
+
+As a program, which engines start wherever they like: python -m avatar.sweep.job FOLDER
+What it says goes into FOLDER/log.txt. When it is killed, nothing of it lives on, and the next one goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+
+from avatar.errors import UserError
+from avatar.runs.checkpoint import list_checkpoints
+from avatar.runs.lock import locked
+from avatar.sweep.spec import Job
+from avatar.sweep.state import HEARTBEAT_SECONDS, State, beat, read_job, read_state, worker_name, write_state
+
+OPTIONS = {
+    "head": "--head",
+    "tracking": "--tracking",
+    "frame_offset": "--frame-offset",
+    "format": "--format",
+    "fps": "--fps",
+}
+OK, EXIT_ERROR, EXIT_INTERRUPTED = 0, 1, 130
+Command = Callable[[list[str]], int]  # `avatar WORDS`, its exit status
+
+
+def run_job(folder: Path, command: Command) -> State:
+    """Do a job, or what is left of it, and return what became of it.
+
+    Whatever the job's commands do becomes a state. Raises UserError when another worker has the job.
+    """
+    job = read_job(folder)
+    with locked(folder):
+        before = read_state(folder)
+        if before.status == "done" or before.is_final:
+            return before
+        begin = time.monotonic()
+        running = State("running", before.attempts + 1, worker_name(), seconds=before.seconds)
+        write_state(folder, running)
+        with heart(folder):
+            outcome = work(job, folder, command)
+        seconds = before.seconds + time.monotonic() - begin
+        # A worker that was wanted back has not failed; the attempt does not count.
+        attempts = before.attempts if outcome.status == "waiting" else running.attempts
+        state = replace(outcome, attempts=attempts, worker=running.worker, seconds=seconds)
+        write_state(folder, state)
+        return state
+
+
+def work(job: Job, folder: Path, command: Command) -> State:
+    run = folder / "run"
+    train = ["train", *source_words(job), "--out", str(run)]
+    train += ["--resume"] if list_checkpoints(run / "checkpoints") else list(job.overrides)
+    evaluate = ["eval", str(run), *(word for name in job.protocols for word in ("--protocol", name))]
+    for words in (train, evaluate):
+        status, said = logged(command, words, folder / "log.txt")
+        if status == EXIT_INTERRUPTED:
+            return State("waiting")
+        if status != OK:
+            # A sentence is an answer, and would be given again. Everything else may go away.
+            return State("failed", sentence=said, is_final=status == EXIT_ERROR)
+    return State("done")
+
+
+def source_words(job: Job) -> list[str]:
+    words = [str(job.source["folder"])]
+    for key, option in OPTIONS.items():
+        if key in job.source:
+            words += [option, str(job.source[key])]
+    return words
+
+
+def logged(command: Command, words: list[str], log: Path) -> tuple[int, str]:
+    """Run a command, all that it says going into `log`; its exit status and the last line that it said."""
+    with log.open("a", encoding="utf-8", buffering=1) as file:
+        file.write(f"$ avatar {' '.join(words)}\n")
+        with redirect_stdout(file), redirect_stderr(file):
+            try:
+                status = command(words)
+            except SystemExit as stop:  # usage
+                status = EXIT_ERROR if stop.code else OK
+            except Exception:
+                traceback.print_exc()
+                status = -1
+    return status, last_line(log)
+
+
+def last_line(log: Path) -> str:
+    with log.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
+        lines = file.read().decode(errors="replace").replace("\r", "\n").strip().splitlines()
+    return lines[-1].removeprefix("avatar: ") if lines else ""
+
+
+@contextmanager
+def heart(folder: Path) -> Iterator[None]:
+    """Says every few seconds that the worker lives, until the block ends."""
+    ended = threading.Event()
+
+    def keep_beating() -> None:
+        while not ended.wait(HEARTBEAT_SECONDS):
+            beat(folder)
+
+    beat(folder)
+    thread = threading.Thread(target=keep_beating, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def start_worker(folder: Path, threads: int) -> subprocess.Popen[bytes]:
+    """A process that does the job of `folder`; what it says beside its log is its last words."""
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "AVATAR_THREADS": str(threads)}
+    words = [sys.executable, "-m", "avatar.sweep.job", str(folder)]
+    return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def work_until_done(folder: str, threads: int) -> str:
+    """`start_worker`, waited for, as schedulers call it on another machine; its last words, empty when all went well.
+
+    An interruption of this process is passed on, so that the training saves its state.
+    """
+    process = start_worker(Path(folder), threads)
+    try:
+        _, said = process.communicate()
+    except BaseException:
+        process.terminate()
+        process.wait()
+        raise
+    return last_words(process.returncode, said)
+
+
+def last_words(status: int, said: bytes) -> str:
+    """Why a worker ended, empty when it ended as it should."""
+    if status == OK:
+        return ""
+    if status < 0:
+        return f"the worker was killed by signal {-status}"
+    lines = said.decode(errors="replace").strip().splitlines()
+    return lines[-1].removeprefix("avatar: ") if lines else f"the worker ended with status {status}"
+
+
+def main(arguments: Sequence[str]) -> int:
+    from avatar.cli import main as command
+
+    try:
+        run_job(Path(arguments[0]), lambda words: command(words))
+    except UserError as error:
+        print(f"avatar: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    return OK
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

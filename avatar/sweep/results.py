@@ -1,0 +1,89 @@
+"""A sweep's figures as the tables of `avatar compare`: means over subjects and seeds, differences to the first variant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from avatar.errors import UserError
+from avatar.evaluation.bootstrap import LEVEL, Interval
+from avatar.evaluation.compare import Cell, Comparison, Evaluation, ProtocolComparison, read_evaluation
+from avatar.sweep.spec import Job, Spec
+
+Figures = Mapping[tuple[str, int], float]  # (subject, seed) -> a figure
+
+
+def fold_results(folder: Path, spec: Spec) -> Comparison:
+    """Means of each variant, and paired differences, over the (subject, seed) pairs that all variants have.
+
+    Intervals are Student's t over those pairs, each one training: unlike those of `avatar compare` they know of the
+    training's seed. Raises UserError when no pair is evaluated for all variants.
+    """
+    notes: list[str] = []
+    evaluations = read_evaluations(folder, spec.jobs, notes)
+    variants = list(dict.fromkeys(job.variant for job, _ in evaluations))
+    protocols = list(dict.fromkeys(name for _, each in evaluations for name in each.results["protocols"]))
+    comparisons = []
+    for protocol in protocols:
+        compared = compare_variants(evaluations, variants, protocol)
+        if compared is not None:
+            comparisons.append(compared)
+    if not comparisons:
+        raise UserError(f"no subject and seed in {folder} is measured for all {len(variants)} variants yet")
+    return Comparison(variants, comparisons, notes)
+
+
+def read_evaluations(folder: Path, jobs: Sequence[Job], notes: list[str]) -> list[tuple[Job, Evaluation]]:
+    """Of the jobs that have results; what is missing goes into `notes`."""
+    runs = {job.name: folder / "jobs" / job.name / "run" for job in jobs}
+    done = [job for job in jobs if (runs[job.name] / "eval" / "results.json").is_file()]
+    if len(done) < len(jobs):
+        notes.append(f"{len(jobs) - len(done)} of {len(jobs)} jobs have no results, and do not count")
+    absent = {job.variant for job in jobs} - {job.variant for job in done}
+    notes.extend(f"{variant} is left out: none of its jobs has results" for variant in sorted(absent))
+    return [(job, read_evaluation(job.name, runs[job.name])) for job in done]
+
+
+def compare_variants(
+    evaluations: Sequence[tuple[Job, Evaluation]], variants: Sequence[str], protocol: str
+) -> ProtocolComparison | None:
+    """None where no (subject, seed) pair is there for all variants."""
+    means: dict[str, dict[tuple[str, int], Mapping[str, float]]] = {variant: {} for variant in variants}
+    for job, evaluation in evaluations:
+        if entry := evaluation.results["protocols"].get(protocol):
+            means[job.variant][job.subject, job.seed] = entry["means"]
+    pairs = sorted(set.intersection(*(set(found) for found in means.values()))) if means else []
+    if not pairs:
+        return None
+    figures = [
+        name for name in means[variants[0]][pairs[0]] if all(name in means[v][p] for v in variants for p in pairs)
+    ]
+    rows: dict[str, list[Cell]] = {}
+    for figure in figures:
+        values = [np.array([_number(means[variant][pair][figure]) for pair in pairs]) for variant in variants]
+        if np.isfinite(values).all():
+            first = values[0]
+            rows[figure] = [Cell(float(first.mean()), None, None)] + [
+                Cell(float(own.mean()), float((own - first).mean()), interval(own - first)) for own in values[1:]
+            ]
+    subjects, seeds = len({subject for subject, _ in pairs}), len({seed for _, seed in pairs})
+    unit = f"trainings each ({subjects} subjects, {seeds} seeds)"
+    return ProtocolComparison(protocol, len(pairs), unit, "Student's t over trainings", rows)
+
+
+def interval(differences: np.ndarray) -> Interval | None:
+    """Student's interval of the mean; None for a single value."""
+    count = len(differences)
+    if count < 2:
+        return None
+    mean, spread = float(differences.mean()), float(differences.std(ddof=1)) / math.sqrt(count)
+    reach = float(stats.t.ppf((1 + LEVEL) / 2, count - 1)) * spread
+    return mean - reach, mean + reach
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

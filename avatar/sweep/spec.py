@@ -1,0 +1,213 @@
+"""The file that says what a sweep trains; docs/scaling.md is its definition.
+
+subjects: [../anna, {folder: ../carla, head: ../head_model, frame_offset: 1}]
+head: ../head_model                            # of subjects that name none
+variants: {n8: [], n32: [model.latent_dim=32]} # or `product: {model.latent_dim: [8, 32], preset: [fast, paper]}`
+overrides: [data.size=256]                     # of every job
+seeds: [0, 1, 2]
+protocols: [hypergaussians]                    # none: all of them
+threads: 2                                     # of a job
+memory_gb: 3
+gpus: 0
+retries: 2                                     # after a kill or a crash; a sentence is an answer, and not tried again
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from avatar.config import load_config
+from avatar.errors import UserError
+
+MAX_BYTES, MAX_JOBS = 2**20, 100_000
+KEYS = {
+    "subjects",
+    "head",
+    "variants",
+    "product",
+    "overrides",
+    "seeds",
+    "protocols",
+    "threads",
+    "memory_gb",
+    "gpus",
+    "retries",
+}
+SUBJECT_KEYS = {"folder", "head", "name", "tracking", "frame_offset", "format", "fps"}
+SEED_KEY = "trainer.seed"
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What one job takes."""
+
+    threads: int = 2
+    memory_gb: float = 3.0
+    gpus: float = 0.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training and its evaluation."""
+
+    name: str  # a folder's name, of its own in the sweep
+    subject: str
+    variant: str
+    seed: int
+    source: Mapping[str, Any]  # folder, and what else belongs to it, as `avatar train` takes them
+    overrides: tuple[str, ...]
+    protocols: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**self.__dict__, "overrides": list(self.overrides), "protocols": list(self.protocols)}
+
+    @classmethod
+    def from_dict(cls, raw: Mapping[str, Any]) -> Job:
+        return cls(**{**raw, "overrides": tuple(raw["overrides"]), "protocols": tuple(raw["protocols"])})
+
+
+@dataclass(frozen=True)
+class Spec:
+    jobs: tuple[Job, ...]
+    resources: Resources
+    retries: int
+
+
+def read_spec(path: Path) -> Spec:
+    """Read a sweep's file; relative paths in it count from its folder.
+
+    Raises UserError naming the key that is unknown, missing or wrong, and for overrides that `avatar train` would refuse.
+    """
+    raw = _read_yaml(path)
+    if unknown := sorted(map(str, raw.keys() - KEYS)):
+        raise UserError(f"{path}: there is no key '{unknown[0]}'; a sweep has {', '.join(sorted(KEYS))}")
+    subjects = [_subject(path, entry, raw.get("head")) for entry in _list(path, raw, "subjects")]
+    names = [subject["name"] for subject in subjects]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise UserError(f"{path}: two subjects are called {twice[0]}; give them a `name`")
+    variants = _variants(path, raw)
+    common = _words(path, "overrides", raw.get("overrides", []))
+    seeds = _list(path, raw, "seeds", [0])
+    if wrong := [seed for seed in seeds if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0]:
+        raise UserError(f"{path}: seeds holds {wrong[0]!r}, which is no number from 0 up")
+    if len(set(seeds)) < len(seeds):
+        raise UserError(f"{path}: seeds names one twice")
+    protocols = tuple(_words(path, "protocols", raw.get("protocols", [])))
+    if len(subjects) * len(variants) * len(seeds) > MAX_JOBS:
+        raise UserError(f"{path} asks for more than {MAX_JOBS:,} jobs; split it into several sweeps")
+    jobs = [
+        Job(
+            name=_folder_name(subject["name"], variant, seed),
+            subject=subject["name"],
+            variant=variant,
+            seed=seed,
+            source={key: value for key, value in subject.items() if key != "name"},
+            overrides=(*common, *overrides, f"{SEED_KEY}={seed}"),
+            protocols=protocols,
+        )
+        for subject, (variant, overrides), seed in itertools.product(subjects, variants.items(), seeds)
+    ]
+    for variant, overrides in variants.items():
+        _check_overrides(path, variant, [*common, *overrides])
+    resources = Resources(
+        threads=int(_number(path, raw, "threads", Resources.threads, 1, 1024)),
+        memory_gb=_number(path, raw, "memory_gb", Resources.memory_gb, 0.1, 10_000),
+        gpus=_number(path, raw, "gpus", Resources.gpus, 0, 64),
+    )
+    return Spec(tuple(jobs), resources, int(_number(path, raw, "retries", 2, 0, 100)))
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UserError(f"{path} has more than {MAX_BYTES} bytes; no sweep has")
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise UserError(f"{path} cannot be read as YAML ({str(error).splitlines()[0]})") from None
+    if not isinstance(raw, dict):
+        raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
+    return raw
+
+
+def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:
+    entry = {"folder": entry} if isinstance(entry, str) else entry
+    if not isinstance(entry, dict) or not isinstance(entry.get("folder"), str):
+        raise UserError(f"{path}: subjects holds {entry!r}, which names no folder")
+    if unknown := sorted(map(str, entry.keys() - SUBJECT_KEYS)):
+        raise UserError(f"{path}: a subject has no key '{unknown[0]}'; it has {', '.join(sorted(SUBJECT_KEYS))}")
+    found = {"head": head, **entry}
+    for key in ("folder", "head", "tracking"):
+        if (value := found.get(key)) is not None:
+            if not isinstance(value, str):
+                raise UserError(f"{path}: {key} is {value!r}, not a path")
+            found[key] = str((path.resolve().parent / Path(value).expanduser()).resolve())
+    name = found.get("name", Path(found["folder"]).name)
+    if not isinstance(name, str) or not name:
+        raise UserError(f"{path}: a subject's name is {name!r}, not text")
+    return {"name": name, **{key: value for key, value in found.items() if key != "name" and value is not None}}
+
+
+def _variants(path: Path, raw: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Name -> overrides, from a list, a table, or the product of lists of values."""
+    if "variants" in raw and "product" in raw:
+        raise UserError(f"{path}: give variants or product, not both")
+    if "product" in raw:
+        product = raw["product"]
+        if not isinstance(product, dict) or not all(isinstance(values, list) and values for values in product.values()):
+            raise UserError(f"{path}: product must hold a list of values for each key")
+        choices = [[f"{key}={_plain(value)}" for value in values] for key, values in product.items()]
+        return {" ".join(words): list(words) for words in itertools.product(*choices)}
+    given = raw.get("variants", {"default": []})
+    if isinstance(given, list):
+        given = {" ".join(_words(path, "variants", words)) or "default": words for words in given}
+    if not isinstance(given, dict) or not given:
+        raise UserError(f"{path}: variants must name at least one list of overrides")
+    return {str(name): _words(path, f"variants.{name}", words) for name, words in given.items()}
+
+
+def _plain(value: Any) -> str:
+    return json.dumps(value) if isinstance(value, (bool, list, type(None))) else str(value)
+
+
+def _check_overrides(path: Path, variant: str, overrides: list[str]) -> None:
+    try:
+        load_config(overrides)
+    except UserError as error:
+        raise UserError(f"{path}: variant {variant}: {error}") from None
+
+
+def _words(path: Path, key: str, value: Any) -> list[str]:
+    words = [value] if isinstance(value, str) else value
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise UserError(f"{path}: {key} must be a list of texts, such as [model.latent_dim=4]")
+    return words
+
+
+def _list(path: Path, raw: Mapping[str, Any], key: str, default: list[Any] | None = None) -> list[Any]:
+    value = raw.get(key, default)
+    if not isinstance(value, list) or not value:
+        raise UserError(f"{path}: {key} must be a list with at least one entry")
+    return value
+
+
+def _number(path: Path, raw: Mapping[str, Any], key: str, default: float, low: float, high: float) -> float:
+    value = raw.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise UserError(f"{path}: {key} is {value!r}; it must lie between {low:g} and {high:g}")
+    return value
+
+
+def _folder_name(subject: str, variant: str, seed: int) -> str:
+    """Readable, and never the same for two jobs."""
+    readable = re.sub(r"[^0-9A-Za-z.=-]+", "_", f"{subject}-{variant}")[:80]
+    digest = hashlib.sha256(json.dumps([subject, variant]).encode()).hexdigest()[:6]
+    return f"{readable}-{digest}-seed{seed}"

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from avatar.errors import UserError
+from avatar.sweep.spec import read_spec
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_a_sweep_is_every_subject_with_every_variant_and_seed(tmp_path: Path) -> None:
+    spec = read_spec(
+        write(
+            tmp_path / "sweep.yaml",
+            """
+            subjects: [anna, {folder: /data/carla, head: models/flame, frame_offset: 1}]
+            head: head_model
+            variants: {n8: [], n32: [model.latent_dim=32]}
+            overrides: [data.size=64]
+            seeds: [0, 5]
+            protocols: [strict]
+            threads: 1
+            """,
+        )
+    )
+    assert len(spec.jobs) == len({job.name for job in spec.jobs}) == 8
+    first, last = spec.jobs[0], spec.jobs[-1]
+    assert (first.subject, first.variant, first.seed) == ("anna", "n8", 0)
+    assert first.source == {"folder": str(tmp_path / "anna"), "head": str(tmp_path / "head_model")}
+    assert first.overrides == ("data.size=64", "trainer.seed=0") and first.protocols == ("strict",)
+    assert last.source == {"folder": "/data/carla", "head": str(tmp_path / "models/flame"), "frame_offset": 1}
+    assert last.overrides == ("data.size=64", "model.latent_dim=32", "trainer.seed=5")
+    assert (spec.resources.threads, spec.resources.gpus, spec.retries) == (1, 0, 2)
+
+
+def test_a_product_is_every_combination(tmp_path: Path) -> None:
+    text = "subjects: [a]\nproduct: {model.latent_dim: [4, 8], preset: [fast, paper], data.size: [null]}\n"
+    spec = read_spec(write(tmp_path / "sweep.yaml", text))
+    assert [job.variant for job in spec.jobs] == [
+        "model.latent_dim=4 preset=fast data.size=null",
+        "model.latent_dim=4 preset=paper data.size=null",
+        "model.latent_dim=8 preset=fast data.size=null",
+        "model.latent_dim=8 preset=paper data.size=null",
+    ]
+
+
+def test_a_list_of_variants_is_named_by_its_overrides(tmp_path: Path) -> None:
+    text = "subjects: [a]\nvariants: [[], [model=flashavatar], model.latent_dim=2]\n"
+    spec = read_spec(write(tmp_path / "sweep.yaml", text))
+    assert [job.variant for job in spec.jobs] == ["default", "model=flashavatar", "model.latent_dim=2"]
+
+
+MISTAKES = {
+    "not YAML": ("subjects: [", "cannot be read as YAML"),
+    "nothing": ("", "holds no keys"),
+    "code": ("subjects: !!python/object/apply:os.system [touch x]", "cannot be read as YAML"),
+    "unknown key": ("subjects: [a]\nseed: [1]", "there is no key 'seed'"),
+    "no subjects": ("seeds: [1]", "subjects must be a list with at least one entry"),
+    "a subject without folder": ("subjects: [{head: x}]", "names no folder"),
+    "an unknown key of a subject": ("subjects: [{folder: a, size: 3}]", "a subject has no key 'size'"),
+    "two subjects of one name": ("subjects: [x/a, y/a]", "two subjects are called a; give them a `name`"),
+    "an override that is none": (
+        "subjects: [a]\nvariants: {x: [model.latent=3]}",
+        "variant x: there is no configuration",
+    ),
+    "a value out of range": ("subjects: [a]\noverrides: [data.size=1]", "data.size=1 is out of range"),
+    "seeds that are text": ("subjects: [a]\nseeds: [one]", "seeds holds 'one'"),
+    "a seed twice": ("subjects: [a]\nseeds: [1, 1]", "seeds names one twice"),
+    "variants and product": (
+        "subjects: [a]\nvariants: [[]]\nproduct: {preset: [fast]}",
+        "variants or product, not both",
+    ),
+    "an empty product": ("subjects: [a]\nproduct: {preset: []}", "product must hold a list of values for each key"),
+    "too many": (f"subjects: [a]\nseeds: {list(range(100_001))}", "more than 100,000 jobs"),
+    "threads that are none": ("subjects: [a]\nthreads: many", "threads is 'many'; it must lie between 1 and 1024"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_gets_a_sentence(name: str, tmp_path: Path) -> None:
+    text, sentence = MISTAKES[name]
+    path = write(tmp_path / "sweep.yaml", text)
+    with pytest.raises(UserError, match=sentence) as error:
+        read_spec(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)

@@ -1,0 +1,126 @@
+"""Six tiny jobs, one of them broken on purpose, one killed in the middle, on every engine: the same figures on each."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from command_line import avatar
+from small_runs import SMALL
+from tracked_folder import write_tracked_folder
+
+from avatar.runs.checkpoint import list_checkpoints
+from avatar.sweep.state import State, read_state, write_state
+
+ENGINES = {"local": "json", "ray": "ray", "slurm": "submitit"}
+OPTIONS = {"local": (), "ray": (), "slurm": ("--address", "local")}
+BROKEN = "data.train_frames=500"
+
+
+def write_spec(folder: Path, name: str = "sweep.yaml", **changes: object) -> Path:
+    content = {
+        "subjects": [{"folder": "someone", "head": "someone/head_model", "frame_offset": 1}],
+        "variants": [[], *(f"model.latent_dim={n}" for n in (2, 4, 16)), "model=flashavatar", BROKEN],
+        "overrides": [*SMALL, "trainer.iterations=40", "trainer.checkpoint_every=2"],
+        "protocols": ["strict"],
+        "threads": 1,
+        "memory_gb": 0.5,
+        **changes,
+    }
+    path = folder / name
+    path.write_text(json.dumps(content))  # JSON is YAML
+    return path
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweep")
+    write_tracked_folder(folder / "someone", frames=12, size=32)
+    return folder
+
+
+def kill_first_worker_with_a_checkpoint(folder: Path, killed: list[str]) -> None:
+    """SIGKILL to the worker of the first job that has saved something."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        for job in sorted((folder / "jobs").glob("*")):
+            if list_checkpoints(job / "run" / "checkpoints"):
+                state = read_state(job)
+                if state.status == "running" and state.attempts == 1:
+                    os.kill(int(state.worker.rpartition(":")[2]), signal.SIGKILL)
+                    killed.append(job.name)
+                    return
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="module")
+def tables() -> dict[str, str]:
+    """What the engines before have found."""
+    return {}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_sweep_on_every_engine(engine: str, place: Path, tables: dict[str, str], tmp_path: Path) -> None:
+    if importlib.util.find_spec(ENGINES[engine]) is None:
+        pytest.skip(f"{ENGINES[engine]} is not installed (extra [{engine}])")
+    folder, killed = tmp_path / "out", []
+    killer = threading.Thread(target=kill_first_worker_with_a_checkpoint, args=(folder, killed), daemon=True)
+    killer.start()
+    options = ("--out", folder, "--engine", engine, "--workers", 2, *OPTIONS[engine])
+    output = avatar("sweep", write_spec(place), *options, status=1)
+    killer.join()
+    states = {path.name: read_state(path) for path in (folder / "jobs").iterdir()}
+    assert len(states) == 6
+    (broken,) = [name for name, state in states.items() if state.status == "failed"]
+    assert "500 training frames cannot be taken from 12" in states[broken].sentence
+    assert states[broken].is_final and states[broken].attempts == 1, "a sentence is an answer"
+    assert [state.status for state in states.values()].count("done") == 5 and len(killed) == 1
+    assert states[killed[0]].attempts == 2, "the job whose worker was killed went on in another"
+    assert "Resuming" in (folder / "jobs" / killed[0] / "log.txt").read_text()
+    assert "6 jobs: 5 done, 1 failed" in output and f"{BROKEN} is left out" in output
+    # Figures hold no times: they are the same on every engine, killed or not.
+    table = (folder / "compare.csv").read_text()
+    rows = list(csv.DictReader(table.splitlines()))
+    assert {row["run"] for row in rows if row["figure"] == "psnr"} >= {"default", "model=flashavatar"}
+    assert tables.setdefault("first", table) == table
+
+    again = avatar("sweep", *options, status=1)
+    after = {path.name: read_state(path).attempts for path in (folder / "jobs").iterdir()}
+    assert after == {name: state.attempts for name, state in states.items()}, "nothing settled is done again"
+    assert "5 done, 1 failed" in again
+
+
+def test_status_and_another_try(place: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    broken = write_spec(place, "broken.yaml", variants=[BROKEN])
+    assert "holds no sweep; start one with" in avatar("sweep", broken, "--out", folder, "--status", status=1)
+    assert "No table" in avatar("sweep", broken, "--out", folder, "--workers", 1, status=1)
+    shown = avatar("sweep", "--out", folder, "--status", status=1)
+    assert "1 jobs: 0 done, 1 failed" in shown and shown.count("500 training frames cannot be taken") == 2
+    (job,) = (folder / "jobs").iterdir()
+    assert read_state(job).is_final
+    write_state(job, State("failed", 1, sentence="x", is_final=True))
+    avatar("sweep", "--out", folder, "--retry-failed", status=1)
+    assert "500 training frames" in read_state(job).sentence
+
+    another = write_spec(place, "another.yaml", variants=[BROKEN], protocols=["hypergaussians"])
+    assert "holds a sweep in which" in avatar("sweep", another, "--out", folder, status=1)
+    more = write_spec(place, "more.yaml", variants=[BROKEN], seeds=[0, 7])
+    avatar("sweep", more, "--out", folder, "--workers", 1, status=1)
+    assert len(list((folder / "jobs").iterdir())) == 2
+
+
+def test_a_worker_that_fell_silent_is_replaced(tmp_path: Path) -> None:
+    write_state(tmp_path, State("running", 1, "elsewhere:1"))
+    assert read_state(tmp_path).status == "waiting", "a running job without a heartbeat has no worker"
+    (tmp_path / "heartbeat").touch()
+    assert read_state(tmp_path).status == "running"
+    os.utime(tmp_path / "heartbeat", (time.time() - 61, time.time() - 61))
+    assert read_state(tmp_path).status == "waiting"
