@@ -35,7 +35,10 @@ BACKENDS, CAPACITY, HOSTILE, PLACE = (
 LOOPS = BACKENDS + "test_image_and_alpha_are_those_of_the_definition_written_as_loops"
 REFERENCE = BACKENDS + "test_gpu_kernels_agree_with_the_reference"
 SPLATTER = [
-    *(f"{LOOPS}[{scene}-gpu]" for scene in ("random", "opaque", "cut-offs", "antialiased", "beyond the Jacobian's clamp")),
+    *(
+        f"{LOOPS}[{scene}-gpu]"
+        for scene in ("random", "opaque", "cut-offs", "antialiased", "beyond the Jacobian's clamp")
+    ),
     *(f"{REFERENCE}[{scene}-gpu]" for scene in ("17x33", "wide field of view", "degree 3 of 3", "other cut-offs")),
     "tests/splat/test_splat_public_bugs.py::test_alpha_just_under_the_cut_off_is_skipped_and_at_it_drawn[gpu]",
     "tests/splat/test_splat_public_bugs.py::test_gradient_is_zero_where_alpha_is_clamped[gpu]",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     if not interpreted():
         yield
         return
-    from triton.runtime.interpreter import InterpretedFunction
+    from triton.runtime.interpreter import InterpretedFunction, interpreter_builder
 
     from avatar.gaussians import place_gpu
     from avatar.losses import gpu as losses_gpu
@@ -40,7 +40,10 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     wide = gpu_draw.Tuning(tile=16, step=32, backward_step=32, lanes=1024, backward_lanes=1024)
     patch.setattr(gpu_draw, "TUNING", wide)
     patch.setattr(place_gpu, "LANES", 1024)
+    patch.setattr(place_gpu, "ENTRIES", 256)
     patch.setattr(losses_gpu, "LANES", 8192)
+    # Its search for integers that overflow takes a quarter of the time, and tells nobody unless Triton is being debugged.
+    patch.setattr(interpreter_builder, "options", replace(interpreter_builder.options, sanitize_overflow=False))
     call = InterpretedFunction.__call__
 
     def call_without_patching(self: Any, *arguments: Any, **named: Any) -> Any:

@@ -346,7 +346,10 @@ def test_a_full_gpu_is_a_sentence_that_says_what_to_lower(monkeypatch: pytest.Mo
 
     monkeypatch.setattr("avatar.commands.run_command", full)
     output = avatar("doctor", status=1)
-    assert output.startswith("avatar: the GPU's memory is full: lower --size or model.uv_size") and "Traceback" not in output
+    assert (
+        output.startswith("avatar: the GPU's memory is full: lower --size or model.uv_size")
+        and "Traceback" not in output
+    )
 
 
 def test_other_errors_of_torch_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,10 @@ MISSING: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], str]] = {
         r"cuda:0, NVIDIA Pretend with 24 GiB is too old: it has compute capability 7\.5, the kernels need 8\.0",
     ),
     "no Triton": (attribute(choose, "version", raising(PackageNotFoundError())), r"not installed: pip install"),
-    "an old Triton": (attribute(choose, "version", lambda _: "3.7.0+git1"), r"Triton 3\.7\.0\+git1 is older than 3\.7\.1"),
+    "an old Triton": (
+        attribute(choose, "version", lambda _: "3.7.0+git1"),
+        r"Triton 3\.7\.0\+git1 is older than 3\.7\.1",
+    ),
     "no compiler": (lacks_compiler, r"needs a C compiler .*apt install gcc.* or name one with CC"),
     "no memory": (
         attribute(self_test, "self_test", raising(torch.OutOfMemoryError("CUDA out of memory"))),

@@ -20,7 +20,13 @@ from avatar.train import trainer as trainer_module
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
 
-TINY = ("model.uv_size=10", "data.size=24", "trainer.perceptual=dssim", "trainer.checkpoint_every=100")
+TINY = (
+    "model.uv_size=10",
+    "data.size=24",
+    "trainer.perceptual=dssim",
+    "trainer.checkpoint_every=100",
+    "model.latent_grid=4",
+)
 
 
 def trained(
