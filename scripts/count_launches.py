@@ -88,36 +88,44 @@ def counting() -> Iterator[Counter[str]]:
 
 
 class Rehearsal:
-    """An avatar of the preset `fast` on the meta device, with one frame."""
+    """An avatar of the preset `fast`, with one frame; on the meta device, or on one that computes."""
 
-    def __init__(self, assets: HeadAssets, uv_size: int, size: int, overrides: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        assets: HeadAssets,
+        uv_size: int,
+        size: int,
+        overrides: tuple[str, ...] = (),
+        device: torch.device = META,
+    ) -> None:
         config = load_config([f"model.uv_size={uv_size}", *overrides])
-        self.avatar = Avatar(assets, torch.zeros(1), config.model).to(META)
+        self.avatar = Avatar(assets, torch.zeros(1), config.model).to(device)
         self.trainer = config.trainer
         with patch("torch.optim.adam._device_dtype_check_for_fused"):  # it knows no meta device
             self.optimizer = make_optimizer(self.avatar, config.trainer)
-        self.guard = Guard(self.optimizer, META)
-        self.background = torch.ones(3, device=META)
+        self.guard = Guard(self.optimizer, device)
+        self.background = torch.ones(3, device=device)
         rest = torch.tensor(IDENTITY_6D)
         still = HeadParams(torch.zeros(assets.num_expressions), rest, rest.repeat(2), torch.zeros(2), rest)
-        self.params, self.camera = still.to(META), head_camera(size)
-        planes = [torch.empty(size, size, *channels, device=META) for channels in ((3,), (), (), ())]
+        self.params, self.camera = still.to(device), head_camera(size)
+        planes = [torch.rand(size, size, *channels, device=device) for channels in ((3,), (), (), ())]
         box = slice(size // 8, size), slice(size // 4, 3 * size // 4)
         self.frame = Frame(0, "rehearsed", self.camera, self.params, *planes, head_box=box)
-        self.lpips = Lpips("squeeze").on(META)
+        self.vertices = self.avatar.vertices(self.params)
+        self.lpips = Lpips("squeeze").on(device)
 
     def step(self, perceptual: PerceptualTerm, late: bool) -> Counter[str]:
         """What one training step launches; `late`: in the second half of the training."""
-        objective = Objective(self.trainer, self.background, perceptual)
-        number = self.trainer.iterations - self.trainer.lpips_every if late else self.trainer.iterations // 4
-        vertices = self.avatar.vertices(self.params)
         with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
             for _ in range(2):  # the first makes the optimizer's state
                 with counting() as launches:
-                    training_step(
-                        self.avatar, self.optimizer, objective, number, self.frame, vertices, self.guard.judge
-                    )
+                    self.train(perceptual, late)
         return launches
+
+    def train(self, perceptual: PerceptualTerm, late: bool) -> None:
+        objective = Objective(self.trainer, self.background, perceptual)
+        number = self.trainer.iterations - self.trainer.lpips_every if late else self.trainer.iterations // 4
+        training_step(self.avatar, self.optimizer, objective, number, self.frame, self.vertices, self.guard.judge)
 
     def rendered(self) -> Counter[str]:
         renderer = Renderer(self.avatar, self.background)
