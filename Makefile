@@ -27,7 +27,7 @@ stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRES
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress
 
 fuzz: setup ## give every reader damaged and hostile files (FUZZ_CASES=20000 in all)
-	AVATAR_FUZZ_CASES=$(FUZZ_CASES) $(BIN)/python -m pytest --timeout=0 -rP tests/fuzz
+	AVATAR_FUZZ_CASES=$(FUZZ_CASES) AVATAR_FUZZ_TABLE=docs/bench/fuzz.md $(BIN)/python -m pytest --timeout=0 -rP tests/fuzz
 
 sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh

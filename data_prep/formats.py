@@ -9,7 +9,7 @@ from avatar.errors import UserError, refuse
 from data_prep import imavatar, insta, vhap
 from data_prep.frame_files import find_frame_files
 from data_prep.metrical_tracker import read_tracking
-from data_prep.tracked_folder import TrackedFolder
+from data_prep.tracked_folder import TrackedFolder, matte_notes
 from data_prep.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
@@ -34,7 +34,12 @@ def open_tracked_folder(
     name = format or detect_format(folder, frames)
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)
-        return TrackedFolder(name, files, lambda head, size, complain: read_tracking(files.tracking, complain))
+        return TrackedFolder(
+            name,
+            files,
+            lambda head, size, complain: read_tracking(files.tracking, complain),
+            notes=matte_notes(files),
+        )
     if not _LISTED[name].recognise(frames):
         raise UserError(f"{folder} is not a folder of {name}'s: docs/data.md says which files and values belong to it")
     if name == insta.NAME:

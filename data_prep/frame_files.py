@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, decode_mask
+from avatar.data.images import IMAGE_SUFFIXES, decode_mask, decode_transparency, has_transparency, read_bytes
 from avatar.errors import UserError, refuse
 
 
@@ -26,6 +27,7 @@ class KindNames(NamedTuple):
 
 
 _NUMBERED_NAMES = KindNames()
+_SAMPLES = 8  # images that are looked at for transparency
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,15 @@ class FrameFiles:
     decode_parsing: Callable[[bytes, Path], np.ndarray] = decode_mask  # to the classes of `face_parsing`
     listings: tuple[Path, ...] = ()  # files that say which image and which tracking belong together
     names: KindNames = _NUMBERED_NAMES
+
+    @cached_property
+    def is_transparent(self) -> bool:
+        """Whether the images are their own mattes."""
+        return any(self.alphas.get(number) == path for number, path in self.images.items())
+
+    def decode_alpha(self, data: bytes, path: Path) -> np.ndarray:
+        """A file of `alphas` as its matte, uint8 [H, W]. Raises UserError naming the file."""
+        return decode_transparency(data, path) if self.is_transparent else decode_mask(data, path)
 
     def of_kind(self) -> dict[str, dict[int, Path]]:
         """By the name that a person knows each kind by."""
@@ -90,11 +101,23 @@ def find_frame_files(
     return FrameFiles(
         folder=folder,
         images=images,
-        alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES, complain),
+        alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES, complain) or transparent(images),
         head_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_neckhead"),
         mouth_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_mouth"),
         tracking=_find_tracking(folder, tracking, complain),
     )
+
+
+def transparent(images: Mapping[int, Path]) -> dict[int, Path]:
+    """The images as their own mattes, where any of a few is transparent somewhere; else none."""
+    for number in list(images)[:: max(1, len(images) // _SAMPLES)]:
+        try:
+            data = read_bytes(images[number])
+            if has_transparency(data) and decode_transparency(data, images[number]).min() < 255:
+                return dict(images)
+        except UserError:
+            continue  # damaged: named when all of them are read
+    return {}
 
 
 def _find_tracking(folder: Path, given: Path | None, complain: Callable[[str], object]) -> dict[int, Path]:

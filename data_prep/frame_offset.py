@@ -8,19 +8,19 @@ when the two clocks differ. Where the masks do not decide, the motion in the ima
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from avatar.data.images import read_mask
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
+from data_prep.frame_files import FrameFiles
 from data_prep.image_motion import motion_residuals
-from data_prep.overlap import MIN_OVERLAP, mean_overlap
+from data_prep.masks import read_masks
+from data_prep.misfit import judge_sample
 from data_prep.projection import filled_lips, project_head, region_faces, silhouette
 from data_prep.tracking import FrameTrack
 
@@ -28,7 +28,9 @@ RADIUS = 4  # offsets tried on each side; the outermost ones only serve to see t
 SAMPLED_FRAMES = 120
 RASTER_WIDTH = 256  # pixels; the features are sub-pixel, more resolution does not help
 MIN_COMMON_FRAMES = 6
+MIN_FRAMES = MIN_COMMON_FRAMES + 1  # so that a neighbouring offset can be compared
 MIN_T = 3.0  # paired differences, best against every other offset
+GIVE_OFFSET = "give --frame-offset (1 where images are numbered from 1 and tracking from 0)"
 _RIDGE = 4.0  # pseudo-frames that say "no pose-dependent misfit"
 _CLIP = 9.0  # squared, in units of the best offset's own misfit: one bad mask must not decide
 _MASK_ON = 127
@@ -42,19 +44,13 @@ class OffsetEstimate:
     offset: int  # image number - tracking number
     t: float  # by how many standard errors the best offset beats the next best
     runner_up: int
-    head_overlap: float | None  # mean IoU of head mask and mesh at this offset, None without head masks
-    mouth_overlap: float | None
     frames: int
     used_images: bool  # whether the images' motion had to decide
 
     def sentence(self) -> str:
-        evidence = [
-            f"{name} overlap {value:.3f}"
-            for name, value in (("head", self.head_overlap), ("mouth", self.mouth_overlap))
-            if value is not None
-        ] + ["from the motion in the images"] * self.used_images
+        witness = " from the motion in the images" if self.used_images else ""
         return (
-            f"image offset {self.offset} (image number = tracking number {self.offset:+d}): {', '.join(evidence)}, "
+            f"image offset {self.offset} (image number = tracking number {self.offset:+d}){witness}, "
             f"better than offset {self.runner_up} by {self.t:.1f} standard errors over {self.frames} frames"
         )
 
@@ -62,56 +58,59 @@ class OffsetEstimate:
 def detect_offset(
     head: HeadModel,
     tracks: Mapping[int, FrameTrack],
-    intrinsics: np.ndarray,
-    images: Mapping[int, Path],
-    head_masks: Mapping[int, Path],
-    mouth_masks: Mapping[int, Path],
+    files: FrameFiles,
+    without: Collection[int] = (),
+    ignore_misfit: bool = False,
 ) -> OffsetEstimate:
-    """Find the offset, or raise UserError asking for --frame-offset when the evidence does not single one out."""
+    """Find the offset, or raise UserError asking for --frame-offset when the evidence does not single one out.
+
+    without        numbers of images that cannot be read
+    ignore_misfit  do not blame head model or video where the offset is not clear
+    """
+    images = {number: path for number, path in files.images.items() if number not in without}
+    if min(len(tracks), len(images)) < MIN_FRAMES:
+        raise UserError(
+            f"there are too few frames to find the offset between images and tracking ({len(images)} images, {len(tracks)} "
+            f"tracking frames; {MIN_FRAMES} of each are needed); {GIVE_OFFSET}"
+        )
     lips = region_faces(head, "lips")
-    use_mouth = bool(mouth_masks) and len(lips) > 0
+    use_head, use_mouth = bool(files.head_masks or files.alphas), bool(files.mouth_masks) and len(lips) > 0
     candidates = _candidates(list(images), list(tracks))
-    sampled = _frames_with_motion(tracks, use_mouth or not head_masks)
+    sampled = _frames_with_motion(tracks, use_mouth or not use_head)
     first = next(iter(tracks.values()))
     width = min(RASTER_WIDTH, first.size[0])
     height = max(1, round(first.size[1] * width / first.size[0]))
 
     bodies, mouths = {}, {}
     for number in sampled:
-        screen = project_head(head, tracks[number], intrinsics, width, height)
+        screen = project_head(head, tracks[number], first.intrinsics, width, height)
         bodies[number] = silhouette(screen, head.faces.numpy(), width, height)
         mouths[number] = filled_lips(screen, lips, width, height) if use_mouth else None
     # A fixed line through the middle of the head: below it are neck and shoulders, which the mesh does not follow.
     centres = [cv2.moments(body, True) for body in bodies.values()]
     cut = float(np.median([m["m01"] / m["m00"] for m in centres if m["m00"]] or [height])) / height
 
-    needed = sorted({number + offset for number in sampled for offset in candidates})
-    observed = _observed_features(needed, head_masks, mouth_masks if use_mouth else {}, cut)
+    needed = sorted({number + offset for number in sampled for offset in candidates} & images.keys())
+    observed = _observed_features(needed, files, use_head, use_mouth, cut)
     predicted = {
-        n: np.concatenate((_head_features(bodies[n], cut) if head_masks else [], _mouth_features(mouths[n])))
+        n: np.concatenate((_head_features(bodies[n], cut) if use_head else [], _mouth_features(mouths[n])))
         for n in sampled
     }
     residuals = _mask_residuals(predicted, observed, candidates)
     best, runner_up, t = _decide(_misfits(residuals))
     used_images = t < MIN_T
     if used_images:
-        moving = motion_residuals(head, tracks, intrinsics, images, candidates, sampled, (width, height))
+        moving = motion_residuals(head, tracks, first.intrinsics, images, candidates, sampled, (width, height))
         best, runner_up, t = _decide(_misfits(_joined(residuals, moving)))
-
-    head_overlap = mean_overlap(bodies, head_masks, best) if head_masks else None
-    mouth_overlap = mean_overlap(mouths, mouth_masks, best) if use_mouth else None
-    estimate = OffsetEstimate(best, t, runner_up, head_overlap, mouth_overlap, len(sampled), used_images)
-    overlaps = [value for value in (head_overlap, mouth_overlap) if value is not None]
-    if overlaps and max(overlaps) < MIN_OVERLAP:
-        raise UserError(
-            f"the tracked head does not lie on the masks (best is {estimate.sentence()}): is the tracking of this "
-            "video, and the head model the one it was made with? Give --frame-offset to go on regardless"
-        )
+    estimate = OffsetEstimate(best, t, runner_up, len(sampled), used_images)
     is_edge = not {best - 1, best + 1} <= set(candidates)
     if t < MIN_T or is_edge:
+        if not ignore_misfit:
+            pairs = [(n + best, n) for n in tracks if n + best in images]
+            judge_sample(head, tracks, files, pairs).refuse()  # the likelier reason
         raise UserError(
-            f"the offset between images and tracking is not clear (best is {estimate.sentence()}); look at the frames "
-            "and give --frame-offset (1 where images are numbered from 1 and tracking from 0)"
+            f"the offset between images and tracking is not clear (best is {estimate.sentence()}); look at the frames and "
+            f"{GIVE_OFFSET}"
         )
     return estimate
 
@@ -150,22 +149,21 @@ def _frames_with_motion(tracks: Mapping[int, FrameTrack], use_mouth: bool) -> li
 
 
 def _observed_features(
-    numbers: Sequence[int], head_masks: Mapping[int, Path], mouth_masks: Mapping[int, Path], cut: float
+    numbers: Sequence[int], files: FrameFiles, use_head: bool, use_mouth: bool, cut: float
 ) -> dict[int, np.ndarray]:
     """Features of the masks of images that have all kinds of mask."""
 
-    def features(number: int) -> np.ndarray:
-        parts = []
-        if head_masks:
-            parts.append(_head_features(read_mask(head_masks[number]) > _MASK_ON, cut))
-        if mouth_masks:
-            parts.append(_mouth_features(read_mask(mouth_masks[number]) > _MASK_ON))
-        return np.concatenate(parts)
+    def features(number: int) -> np.ndarray | None:
+        head, mouth = read_masks(files, number)
+        if (use_head and head is None) or (use_mouth and mouth is None):
+            return None
+        parts = [_head_features(head > _MASK_ON, cut)] if use_head and head is not None else []
+        parts += [_mouth_features(mouth > _MASK_ON)] if use_mouth and mouth is not None else []
+        return np.concatenate(parts) if parts else None
 
-    kinds = [masks for masks in (head_masks, mouth_masks) if masks]
-    complete = [n for n in numbers if kinds and all(n in masks for masks in kinds)]
     with ThreadPoolExecutor(max_workers=2) as pool:
-        return dict(zip(complete, pool.map(features, complete), strict=True))
+        found = dict(zip(numbers, pool.map(features, numbers), strict=True))
+    return {number: values for number, values in found.items() if values is not None}
 
 
 def _head_features(mask: np.ndarray, cut: float) -> np.ndarray:

@@ -20,11 +20,11 @@ import numpy as np
 
 from avatar.head.assets import HeadAssets
 from data_prep.face_parsing import decode_numbers
-from data_prep.frame_files import FrameFiles, KindNames
+from data_prep.frame_files import FrameFiles, KindNames, transparent
 from data_prep.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
-from data_prep.tracked_folder import TrackedFolder, existing, listings_of, numbered
+from data_prep.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.tracking import BadFrame, FrameTrack, Tracking, nearest_rotation
-from data_prep.transforms import OPENCV_FROM_OPENGL, ListedFrame, read_frames
+from data_prep.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate, read_frames
 
 NAME = "IMavatar"
 NAMES = KindNames("mask/", "semantic/", "semantic/", images="image/", tracking="flame_params.json")
@@ -43,7 +43,7 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
     files = FrameFiles(
         folder=folder,
         images=images,
-        alphas=existing({number: _beside(path, "mask") for number, path in images.items()}),
+        alphas=existing({number: _beside(path, "mask") for number, path in images.items()}) or transparent(images),
         head_masks={},
         mouth_masks={},
         tracking={number: frame.listing for number, frame in listed.items()},
@@ -57,7 +57,9 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
         root = RootJoint(head)
         return read_frames(listed, files.tracking, lambda frame: _read_frame(frame, root, size), complain)
 
-    return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()})
+    fps, fps_notes = frame_rate(frames)
+    notes = (*matte_notes(files), *fps_notes)
+    return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()}, notes, fps)
 
 
 def _beside(image: Path, kind: str) -> Path:

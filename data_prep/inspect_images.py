@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.images import decode_image, decode_mask, read_bytes, read_image, read_mask
+from avatar.data.images import decode_image, decode_mask, read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.frame_files import FrameFiles
 
@@ -56,7 +56,7 @@ def inspect_images(files: FrameFiles) -> Inspection:
             )
     digests = {n: [seen.digest] for n, seen in images.items()}
     kinds = {
-        "alpha": (files.alphas, decode_mask),
+        "alpha": (files.alphas, files.decode_alpha),
         "head mask": (files.head_masks, decode_mask),
         "mouth mask": (files.mouth_masks, decode_mask),
         "face parsing": (files.parsing, files.decode_parsing),
@@ -101,7 +101,8 @@ def composited_background(files: FrameFiles, bad: Mapping[int, str]) -> str | No
     usable = [n for n in files.images if n in files.alphas and n not in bad]
     sums, count, pixels = np.zeros((len(_BACKGROUNDS),)), 0, 0
     for number in usable[:: max(1, len(usable) // _SAMPLES)]:
-        background = read_mask(files.alphas[number]) <= 2
+        path = files.alphas[number]
+        background = files.decode_alpha(read_bytes(path), path) <= 2
         colours = read_image(files.images[number])[background].astype(np.float64)
         for i, flat in enumerate(_BACKGROUNDS.values()):
             sums[i] += np.abs(colours - flat).sum() / 3

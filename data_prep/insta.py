@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from avatar.data.images import has_transparency, read_bytes
 from avatar.errors import UserError
 from data_prep.face_parsing import decode_reds
-from data_prep.frame_files import FrameFiles, KindNames
+from data_prep.frame_files import FrameFiles, KindNames, transparent
 from data_prep.metrical_tracker import read_tracking
 from data_prep.tracked_folder import TrackedFolder, existing, listings_of, numbered
-from data_prep.transforms import ListedFrame
+from data_prep.transforms import ListedFrame, frame_rate
 
 NAME = "INSTA"
 NAMES = KindNames("matted/", "seg_mask/", "seg_mask/", images="images/")
@@ -48,11 +47,14 @@ def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None =
         names=NAMES,
     )
     division = {number: frame.split for number, frame in listed.items()}
+    fps, notes = frame_rate(frames)
     return TrackedFolder(
         NAME,
         files,
         lambda head, size, complain: read_tracking(files.tracking, complain, named_by_number=False),
         division,
+        notes,
+        fps,
     )
 
 
@@ -68,7 +70,5 @@ def _tracking_folder(folder: Path, given: Path | None) -> Path:
 
 
 def _mattes(folder: Path, images: dict[int, Path]) -> dict[int, Path]:
-    first = next((path for path in images.values() if path.is_file()), None)
-    if first is not None and has_transparency(read_bytes(first)):
-        return images
-    return existing({number: folder / "matted" / f"{path.stem}.png" for number, path in images.items()})
+    matted = {number: folder / "matted" / f"{path.stem}.png" for number, path in images.items()}
+    return transparent(images) or existing(matted)

@@ -102,7 +102,8 @@ def _refuse_if_unpaired(files: FrameFiles, paired: int, offset: int, share: floa
         if unpaired > max(share * len(found), RADIUS):
             raise UserError(
                 f"{unpaired} of {len(found)} {kind} have no partner under offset {offset}: images are "
-                f"{_range(files.images)}, tracking is {_range(files.tracking)}; are they of the same video?"
+                f"{_range(files.images)}, tracking is {_range(files.tracking)}; are they of the same video? If so, allow "
+                "more with --max-left-out"
             )
 
 

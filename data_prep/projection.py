@@ -38,10 +38,15 @@ def silhouette(screen: np.ndarray, faces: np.ndarray, width: int, height: int) -
 
 
 def filled_lips(screen: np.ndarray, lip_faces: np.ndarray, width: int, height: int) -> np.ndarray:
-    """uint8 [H, W], 1 on the lips and on what their outer outline encloses (teeth, tongue)."""
-    lips = silhouette(screen, lip_faces, width, height)
-    outlines, _ = cv2.findContours(lips, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(lips, outlines, -1, 1, thickness=cv2.FILLED)
+    """bool [H, W], true on the lips and on what they enclose (teeth, tongue)."""
+    return filled(silhouette(screen, lip_faces, width, height))
+
+
+def filled(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W]: the mask, uint8 or bool, with its holes filled."""
+    canvas = mask.astype(np.uint8)
+    outlines, _ = cv2.findContours(canvas, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(canvas, outlines, -1, 1, thickness=cv2.FILLED) > 0
 
 
 def region_faces(head: HeadModel, region: str) -> np.ndarray:

@@ -36,13 +36,16 @@ class TrackedFolder:
         if self.is_paired and given:
             raise UserError(
                 f"--frame-offset {given}: {self.files.listings[0].name} itself says which image belongs to which "
-                "tracking; leave it out, or give 0 to go on where head and masks do not overlap"
+                "tracking; leave it out"
             )
 
 
 def divide(division: Mapping[int, str | None], numbers: Sequence[int], sizes: SplitSizes) -> tuple[Split, list[str]]:
     """Positions in `numbers` by the folder's own division, where it has one and no sizes are asked for, else by the rule
-    of `split_frames`; and notes on it. Raises UserError where there are too few frames."""
+    of `split_frames`; and notes on it. A single frame is all there is to drive with, and not divided (`check_divided`).
+    Raises UserError where there are too few frames."""
+    if len(numbers) == 1 and sizes == DEFAULT_SIZES:
+        return Split((0,), ()), ["there is a single frame: it can drive an avatar, and none can be trained on it"]
     parts = [division.get(number) for number in numbers]
     listed = Split(*(tuple(i for i, part in enumerate(parts) if part == name) for name in ("train", "test")))
     if not any(parts) or sizes != DEFAULT_SIZES:
@@ -53,6 +56,15 @@ def divide(division: Mapping[int, str | None], numbers: Sequence[int], sizes: Sp
     left = len(parts) - len(listed.train) - len(listed.test)
     unused = f" ({left} of validation are not used)" if left else ""
     return listed, [f"the folder's own division into training and test frames is kept{unused}"]
+
+
+def matte_notes(files: FrameFiles) -> tuple[str, ...]:
+    """That the images' own transparency is used, in a layout that has another place for mattes."""
+    return (
+        (f"there is no {files.names.alphas}: the transparency of the images is taken as the matte",)
+        if files.is_transparent
+        else ()
+    )
 
 
 def numbered(frames: list[ListedFrame]) -> dict[int, ListedFrame]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES
+from avatar.data.source import MAX_FPS
 from avatar.errors import UserError, refuse
 from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
 
@@ -90,11 +91,13 @@ def is_path(value: Any) -> bool:
 
 
 def read_listings(folder: Path) -> list[ListedFrame]:
-    """All frames that the folder lists, in the order of the numbers in their images' names; empty without a listing.
+    """All frames that the folder lists; empty without a listing.
 
     `transforms_{train,val,test}.json`, or `flame_params.json` in train/, val/ and test/, or one `transforms.json` or
     `flame_params.json` for all. An image that several of them list is a test frame if `test` has it, else a training
-    frame if `train` has it. Raises UserError for listings that cannot be read and for two frames of one image.
+    frame if `train` has it. Frames of one folder are in the order of the numbers in their images' names (exporters list
+    them as their processes finish), folders in the order of what they are for: training, validation, test.
+    Raises UserError for listings that cannot be read and for two frames of one image.
     """
     divided = {
         split: path
@@ -111,7 +114,16 @@ def read_listings(folder: Path) -> list[ListedFrame]:
     elif frames and not any(frame.split == "test" for frame in frames.values()):
         held_out = {path for path, frame in frames.items() if frame.split == "val"}
         frames = {path: _resplit(frame, "test") if path in held_out else frame for path, frame in frames.items()}
-    return [frames[path] for path in sorted(frames, key=_natural)]
+    return _in_order(frames)
+
+
+def _in_order(frames: dict[Path, ListedFrame]) -> list[ListedFrame]:
+    first_use = {folder: len(SPLITS) for folder in {path.parent for path in frames}}
+    for path, frame in frames.items():
+        if frame.split is not None:
+            first_use[path.parent] = min(first_use[path.parent], SPLITS.index(frame.split))
+    order = sorted(frames, key=lambda path: (first_use[path.parent], _natural(path)))
+    return [frames[path] for path in order]
 
 
 def _resplit(frame: ListedFrame, split: str) -> ListedFrame:
@@ -171,6 +183,21 @@ def read_frames(
         except BadFrame as error:
             bad[number] = str(error)
     return checked_tracking(frames, bad, paths, complain)
+
+
+def frame_rate(frames: Sequence[ListedFrame]) -> tuple[float | None, tuple[str, ...]]:
+    """Frames a second of the video, where the listing has it under `fps`; and a note where that is no frame rate."""
+    given = next((frame for frame in frames if "fps" in frame.shared), None)
+    if given is None:
+        return None, ()
+    try:
+        fps = float(given.numbers("fps", 1)[0])
+    except BadFrame:
+        fps = math.nan
+    if 0 < fps <= MAX_FPS:
+        return fps, ()
+    shown = str(given.shared["fps"])[:40]
+    return None, (f"fps in {given.listing.name} is {shown}, which is no frame rate: it is not used; give --fps",)
 
 
 def camera_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:

@@ -21,14 +21,15 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
-from data_prep.frame_files import FrameFiles, KindNames
+from data_prep.frame_files import FrameFiles, KindNames, transparent
 from data_prep.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
-from data_prep.tracked_folder import TrackedFolder, existing, listings_of, numbered
+from data_prep.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.tracking import BadFrame, FrameTrack, Tracking, vector
 from data_prep.transforms import (
     OPENCV_FROM_OPENGL,
     ListedFrame,
     camera_pose,
+    frame_rate,
     pinhole,
     read_frames,
 )
@@ -46,10 +47,12 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
     frames, notes = _one_camera(frames)
     listed = numbered(frames)
     parameters = {number: _parameter_file(frame) for number, frame in listed.items()}
+    images = {number: frame.image for number, frame in listed.items()}
+    mattes = existing({number: frame.path("fg_mask_path") for number, frame in listed.items()})
     files = FrameFiles(
         folder=folder,
-        images={number: frame.image for number, frame in listed.items()},
-        alphas=existing({number: frame.path("fg_mask_path") for number, frame in listed.items()}),
+        images=images,
+        alphas=mattes or transparent(images),
         head_masks={},
         mouth_masks={},
         tracking=parameters,
@@ -61,7 +64,9 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
         root = RootJoint(head)
         return read_frames(listed, parameters, lambda frame: _read_frame(frame, root, size), complain)
 
-    return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()}, notes)
+    fps, fps_notes = frame_rate(frames)
+    notes = (*notes, *matte_notes(files), *fps_notes)
+    return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()}, notes, fps)
 
 
 def _parameter_file(frame: ListedFrame) -> Path:

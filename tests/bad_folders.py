@@ -198,9 +198,13 @@ CASES: dict[str, tuple[Edit, str]] = {
         freeze,
         r"the offset between images and tracking is not clear \(best is .*and give --frame-offset",
     ),
-    "masks elsewhere": (shift_masks, r"the tracked head does not lie on the masks .*is the tracking of this video"),
+    "masks elsewhere": (
+        shift_masks,
+        r"neither the tracked head .* nor its lips .*is the head model the one .* this video",
+    ),
     "far too few frames": (
         lambda f: [remove(f"{d}/{n}.*")(f) for d in ("imgs", "checkpoint") for n in ("000[12]*", "0000[5-9]")],
-        r"the offset between images and tracking is not clear .*and give --frame-offset",
+        r"there are too few frames to find the offset between images and tracking \(4 images, 5 tracking frames; 7 of each "
+        r"are needed\); give --frame-offset \(1 where",
     ),
 }

@@ -14,10 +14,10 @@ from avatar.bench.results import leave, new_figure
 def run(request: Request) -> None:
     """Measure, print and write; `quick` takes too few Gaussians to say anything."""
     rows = measure(QUICK_LATENT_SIZES, count=300, repeats=3) if request.quick else measure(LATENT_SIZES)
-    for line in (*table(rows), "", *comparisons(rows)):
-        print(line)
     content = {"rows": [asdict(row) for row in rows]}
-    leave(request.out, "bench_hyper", content, lambda path: write_plot(rows, path))
+    leave(
+        request.out, "bench_hyper", [*table(rows), "", *comparisons(rows)], content, lambda path: write_plot(rows, path)
+    )
 
 
 def table(rows: Sequence[Row]) -> list[str]:

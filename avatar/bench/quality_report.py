@@ -20,10 +20,8 @@ def run(request: Request) -> None:
     frames = QUICK_FRAMES if request.quick else FULL_FRAMES if request.full else FRAMES
     repeats = QUICK_REPEATS if request.quick else REPEATS
     curves = measure(request.inputs, request.head, frames=frames, repeats=repeats)
-    for line in table(curves):
-        print(line)
     content = {"curves": [asdict(curve) for curve in curves]}
-    leave(request.out, "bench_quality", content, lambda path: write_plot(curves, path))
+    leave(request.out, "bench_quality", table(curves), content, lambda path: write_plot(curves, path))
 
 
 def table(curves: Sequence[Curve]) -> list[str]:

@@ -59,10 +59,8 @@ class Row:
 def run(request: Request) -> None:
     trained = open_trained(request.inputs[0], request.head)
     rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
-    for line in table(rows, describe(trained)):
-        print(line)
     content = {"avatar": describe(trained), "rows": [asdict(row) for row in rows]}
-    leave(request.out, "bench_render", content, lambda path: write_plot(rows, path))
+    leave(request.out, "bench_render", table(rows, describe(trained)), content, lambda path: write_plot(rows, path))
 
 
 def describe(trained: TrainedAvatar) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""What a benchmark leaves in its folder: the figures as JSON and a plot."""
+"""What a benchmark leaves in its folder: the figures as JSON, the table as Markdown and a plot."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +14,39 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def leave(folder: Path, name: str, content: Mapping[str, Any], draw: Callable[[Path], None] | None = None) -> None:
-    """Write NAME.json, the content behind a description of the machine, and NAME.png, and say where they are."""
-    figures, plot = folder / f"{name}.json", folder / f"{name}.png"
-    text = json.dumps({"machine": describe_machine(), **content}, indent=1) + "\n"
-    write_atomically(figures, text.encode())
-    print(f"\nFigures  {figures}")
+def leave(
+    folder: Path,
+    name: str,
+    table: Sequence[str],
+    content: Mapping[str, Any],
+    draw: Callable[[Path], None] | None = None,
+) -> None:
+    """Print the table and write NAME.md with it, NAME.json, the content behind a description of the machine, and NAME.png.
+
+    Says where the files are.
+    """
+    for line in table:
+        print(line)
+    machine = describe_machine()
+    files = {"Figures": folder / f"{name}.json", "Table": folder / f"{name}.md"}
+    write_atomically(files["Figures"], (json.dumps({"machine": machine, **content}, indent=1) + "\n").encode())
+    write_atomically(files["Table"], as_page(name, table, machine).encode())
     if draw is not None:
-        draw(plot)
-        print(f"Plot     {plot}")
+        files["Plot"] = folder / f"{name}.png"
+        draw(files["Plot"])
+    print()
+    for label, path in files.items():
+        print(f"{label:8} {path}")
+
+
+def as_page(name: str, table: Sequence[str], machine: Mapping[str, Any]) -> str:
+    """The table as a page of Markdown, under the command that made it and the machine."""
+    command = f"avatar bench {name.removeprefix('bench_')}"
+    where = (
+        f"{machine['processors']} cores of {machine['processor']} ({machine['simd'][-1]}), {machine['threads']} threads, "
+        f"PyTorch {machine['torch']}, load {machine['load']}"
+    )
+    return "\n".join([f"# `{command}`", "", f"{where}.", "", "```", *table, "```", ""])
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -34,16 +34,12 @@ def run(request: Request) -> None:
     else:
         sizes, counts = (FULL_SIZES, FULL_COUNTS) if request.full else (USUAL_SIZES, USUAL_COUNTS)
         rows = measure(all_variants(sizes, counts, all_threads=request.full), repeats=21, validation_size=512)
-    for line in table(rows):
-        print(line)
     works = [
         work_of(*scene, with_memory=not request.quick)
         for scene in dict.fromkeys((row.variant.count, row.variant.size) for row in rows)
     ]
-    for line in work_table(rows, works):
-        print(line)
-    print(others_line())
-    leave(request.out, "bench_splat", as_json(rows, works), lambda path: write_plot(rows, path))
+    lines = [*table(rows), *work_table(rows, works), others_line()]
+    leave(request.out, "bench_splat", lines, as_json(rows, works), lambda path: write_plot(rows, path))
 
 
 def as_json(rows: Sequence[Row], works: Sequence[Work]) -> dict[str, Any]:

@@ -37,13 +37,11 @@ class Row:
 
 
 def run(request: Request) -> None:
-    """Measure, print and write stability.json and stability.png."""
+    """Measure, print and write stability.json, stability.md and stability.png."""
     count = 16 if request.quick else 1000 if request.full else 200
     rows = measure(LATENTS[:4] if request.quick else LATENTS, CONDITIONS, count)
-    for line in table(rows):
-        print(line)
     found = {"gaussians": count, "rows": [asdict(row) for row in rows]}
-    leave(request.out, "stability", found, lambda path: write_plot(rows, path))
+    leave(request.out, "stability", table(rows), found, lambda path: write_plot(rows, path))
 
 
 def measure(latents: Sequence[int], conditions: Sequence[float], count: int) -> list[Row]:

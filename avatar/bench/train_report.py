@@ -16,14 +16,12 @@ def run(request: Request) -> None:
     """Measure, print and write; `quick` takes an avatar too small to say anything."""
     repeats = QUICK_REPEATS if request.quick else FULL_REPEATS if request.full else REPEATS
     rows = measure(request, repeats)
-    for line in table(rows):
-        print(line)
     content = {
         "folder": str(request.inputs[0]),
         "overrides": list(request.overrides),
         "rows": as_json(rows),
     }
-    leave(request.out, "bench_train", content, lambda path: write_plot(rows, path))
+    leave(request.out, "bench_train", table(rows), content, lambda path: write_plot(rows, path))
 
 
 def table(rows: Sequence[Row]) -> list[str]:

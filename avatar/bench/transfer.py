@@ -66,18 +66,17 @@ class Row:
 def run(request: Request) -> None:
     scale = QUICK if request.quick else USUAL
     rows = measure(scale, request.out, request.overrides)
-    print(
+    lines = [
         f"{'transfer':>12} {'PSNR full':>10} {'PSNR head':>10}   dB, {scale.driver_frames} frames of {scale.size} pixels"
-    )
-    for row in rows:
-        print(f"{row.transfer:>12} {row.full:10.2f} {row.head:10.2f}")
+    ]
+    lines += [f"{row.transfer:>12} {row.full:10.2f} {row.head:10.2f}" for row in rows]
     content = {
         "scale": asdict(scale),
         "neutral_bias": NEUTRAL_BIAS,
         "overrides": request.overrides,
         "rows": [asdict(row) for row in rows],
     }
-    leave(request.out, "bench_transfer", content)
+    leave(request.out, "bench_transfer", lines, content)
 
 
 def measure(scale: Scale, out: Path, overrides: Sequence[str] = ()) -> list[Row]:

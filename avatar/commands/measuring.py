@@ -12,12 +12,17 @@ from avatar.compute.choose import choose_device
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
+from avatar.evaluation.protocol import choose_protocols
 
 
 def run_eval(arguments: Namespace) -> int:
     run = open_run(arguments.run, arguments.head, arguments.folder)
     run.avatar.to(choose_device(arguments.device or "auto", print))
-    evaluate(run, arguments.protocol, write_frames=arguments.frames)
+    results = evaluate(run, arguments.protocol, write_frames=arguments.frames or arguments.verify)
+    if arguments.verify:
+        from avatar.evaluation.verify import verify  # imports scikit-image, which nothing else here needs
+
+        verify(results, [protocol.name for protocol in choose_protocols(arguments.protocol)])
     return OK
 
 

@@ -76,6 +76,11 @@ def build_parser() -> argparse.ArgumentParser:
         help="only this protocol, by name or as FILE.yaml; may be repeated",
     )
     evaluate.add_argument("--frames", action="store_true", help="write every render, truth and mask as PNG too")
+    evaluate.add_argument(
+        "--verify",
+        action="store_true",
+        help="write them, and compute PSNR and SSIM again from the files, with scikit-image",
+    )
     add_device(evaluate)
 
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")

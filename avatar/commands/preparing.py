@@ -12,6 +12,7 @@ from avatar.commands import OK
 from avatar.commands.opening import source_of
 from avatar.commands.outputs import check_outputs
 from avatar.config import load_config
+from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.train.cost import measure_cost
@@ -45,6 +46,9 @@ def run_check(arguments: Namespace) -> int:
         tracking=arguments.tracking,
         frame_offset=arguments.frame_offset,
         format=arguments.format,
+        fps=arguments.fps,
+        max_left_out=Source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
+        ignore_misfit=arguments.ignore_misfit,
         progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False),
     )
     print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))

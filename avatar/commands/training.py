@@ -14,6 +14,7 @@ from avatar.commands.opening import check_data, moved_source, source_of, split_s
 from avatar.compute.choose import choose_device
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
+from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
@@ -50,6 +51,7 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
         refuse_trained(run)
         chosen = choose_device(device or config.device, print)
         subject, assets = open_subject(source, split_sizes(config))
+        check_divided(subject.split)
         perceptual = choose_perceptual(config.trainer, print, device=chosen)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, subject.identity, config.model)

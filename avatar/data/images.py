@@ -1,4 +1,7 @@
-"""Decoding of image and mask files, with truncation found: decoders fill what is missing with grey and say nothing."""
+"""Decoding of image and mask files, with truncation found: decoders fill what is missing with grey and say nothing.
+
+The foreground matte of an image is a mask file, or the image itself: then its transparency is meant (`read_matte`).
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,14 @@ def read_mask(path: Path) -> np.ndarray:
     return decode_mask(read_bytes(path), path)
 
 
+def read_matte(path: Path, image: Path) -> np.ndarray:
+    """uint8 [H, W], 255 where `image` shows the person: the mask file `path`, or the transparency of the image itself.
+
+    Raises UserError as `read_image` does.
+    """
+    return (decode_transparency if path == image else decode_mask)(read_bytes(path), path)
+
+
 def decode_image(data: bytes, path: Path) -> np.ndarray:
     """`read_image` of bytes that were read already; `path` is for the message."""
     return cv2.cvtColor(_decode(data, path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
@@ -34,17 +45,35 @@ def decode_image(data: bytes, path: Path) -> np.ndarray:
 
 def decode_mask(data: bytes, path: Path) -> np.ndarray:
     """`read_mask` of bytes that were read already; `path` is for the message."""
-    if has_transparency(data):
-        channels = _decode(data, path, cv2.IMREAD_UNCHANGED)
-        matte = channels[..., -1] if channels.ndim == 3 else channels
-        if matte.dtype == np.uint8 and matte.min() < 255:
-            return np.ascontiguousarray(matte)
+    matte = _transparency(data, path)
+    if matte is not None and matte.min() < 255:
+        return matte
     return _decode(data, path, cv2.IMREAD_GRAYSCALE)
 
 
+def decode_transparency(data: bytes, path: Path) -> np.ndarray:
+    """uint8 [H, W]: an image's own transparency, 255 where it has none. Raises UserError as `read_image` does."""
+    matte = _transparency(data, path)
+    return np.full(_decode(data, path, cv2.IMREAD_GRAYSCALE).shape, 255, np.uint8) if matte is None else matte
+
+
 def has_transparency(data: bytes) -> bool:
-    """Whether the header is that of a PNG with an alpha channel."""
-    return data.startswith(_PNG_START) and len(data) > _PNG_COLOUR_TYPE and data[_PNG_COLOUR_TYPE] in (4, 6)
+    """Whether the header is that of a PNG with an alpha channel, or with transparent colours."""
+    if not data.startswith(_PNG_START) or len(data) <= _PNG_COLOUR_TYPE:
+        return False
+    return data[_PNG_COLOUR_TYPE] in (4, 6) or b"tRNS" in data[: max(data.find(b"IDAT"), 0)]
+
+
+def _transparency(data: bytes, path: Path) -> np.ndarray | None:
+    if not has_transparency(data):
+        return None
+    channels = _decode(data, path, cv2.IMREAD_UNCHANGED)
+    if channels.ndim != 3 or channels.shape[2] != 4:  # the decoder has no place for a transparent grey
+        return None
+    matte = channels[..., 3]
+    if matte.dtype == np.uint16:
+        matte = (matte.astype(np.float32) / 257).round()  # 65535 is 257 x 255
+    return np.ascontiguousarray(matte, np.uint8)
 
 
 def read_bytes(path: Path) -> bytes:

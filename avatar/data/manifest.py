@@ -14,7 +14,7 @@ from typing import Any
 
 from avatar.errors import UserError
 
-MANIFEST_VERSION = 2
+MANIFEST_VERSION = 3
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
 _MAX_BYTES = 2**28
 
@@ -26,7 +26,7 @@ class FrameRecord:
     name: str  # stem of the image
     image: str
     tracking: int  # number of the tracking frame
-    alpha: str | None
+    alpha: str | None  # the image itself: its transparency is the matte
     head_mask: str | None
     mouth_mask: str | None
 
@@ -45,7 +45,7 @@ class Manifest:
     offset_evidence: str  # how the offset was found, one sentence
     frames: tuple[FrameRecord, ...]
     train: tuple[int, ...]  # indices into frames
-    test: tuple[int, ...]
+    test: tuple[int, ...]  # empty where there is a single frame
     left_out: dict[str, str]  # image name -> reason
     notes: tuple[str, ...]  # what was assumed or found, one sentence each
     head_masks: str  # "source", "derived" (in the prepared folder) or "none"
@@ -98,7 +98,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         offset_evidence=_of(raw, "offset_evidence", str),
         frames=frames,
         train=parse_positions(raw["train"], "train", count),
-        test=parse_positions(raw["test"], "test", count),
+        test=parse_positions(raw["test"], "test", count) if raw["test"] != [] else (),  # a single frame is not divided
         left_out={str(k): str(v) for k, v in _of(raw, "left_out", dict).items()},
         notes=tuple(str(note) for note in _of(raw, "notes", list)),
         head_masks=_of(raw, "head_masks", str),

@@ -9,6 +9,8 @@ from typing import Any
 
 from avatar.errors import UserError
 
+DEFAULT_FPS = 25.0  # of FlashAvatar's protocol, where neither the folder nor a person says otherwise
+MAX_FPS = 1000.0
 DEFAULT_LEFT_OUT = 0.05  # of the frames: if more cannot be used, something is wrong with the whole, not with a frame
 
 

@@ -25,6 +25,12 @@ class SplitSizes(NamedTuple):
 DEFAULT_SIZES = SplitSizes()
 
 
+def check_divided(split: Split) -> None:
+    """Raises UserError, as `split_frames` does, for a subject of a single frame, which is enough to drive an avatar."""
+    if not split.test:
+        split_frames(len(split.train))
+
+
 def split_frames(count: int, sizes: SplitSizes = DEFAULT_SIZES) -> Split:
     """The last frames test, those right before them train.
 

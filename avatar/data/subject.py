@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from avatar.data.images import read_image, read_mask
+from avatar.data.images import read_image, read_mask, read_matte
 from avatar.data.manifest import TRACKS_FILE, FrameRecord, Manifest, read_manifest
 from avatar.data.recording import Recording, checked_tracks
 from avatar.data.split import Split
@@ -22,6 +22,11 @@ from avatar.errors import UserError
 from avatar.types import Camera, Frame, HeadParams
 
 FAINTEST_MATTE = 10  # of 255: below it a JPEG matte is noise, not foreground
+
+
+def head_of_matte(matte: np.ndarray) -> np.ndarray:
+    """uint8 [H, W], 255 where a matte has anything: as head mask it would count twice in `Frame.composite`."""
+    return np.where(matte >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))
 
 
 class FramePixels(NamedTuple):
@@ -126,10 +131,11 @@ class Subject:
         if not source.is_dir():
             raise UserError(f"the subject's frames are gone: {source} does not exist; prepare the subject again")
         image = self._same_size(read_image(source / record.image), source / record.image)
-        alpha = self._mask(source, record.alpha, shape, default=255)
+        alpha = np.full(shape, 255, np.uint8)
+        if record.alpha is not None:
+            alpha = self._same_size(read_matte(source / record.alpha, source / record.image), source / record.alpha)
         if record.head_mask is None:
-            # Where the matte has anything: the matte itself would count twice in `Frame.composite`.
-            head_mask = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))
+            head_mask = head_of_matte(alpha)
         else:
             root = self.folder if self.manifest.head_masks == "derived" else source
             head_mask = self._mask(root, record.head_mask, shape, default=255)

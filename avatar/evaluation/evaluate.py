@@ -22,6 +22,7 @@ import torch
 from tqdm import tqdm
 
 from avatar.data.loader import FrameLoader
+from avatar.errors import UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
@@ -29,7 +30,7 @@ from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import FrameMeasurer
 from avatar.evaluation.networks import find_networks
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
-from avatar.evaluation.protocol import SHARED_CHOICES, Protocol, choose_protocols
+from avatar.evaluation.protocol import HELD_OUT, SHARED_CHOICES, Protocol, choose_protocols
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import colour_name, frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
@@ -53,17 +54,22 @@ def evaluate(
     """Render the held-out frames, measure them by each protocol, write RUN/eval, say the table and where it is.
 
     protocols  names or paths as `choose_protocols` takes them; None: all that come with the program
-    Every frame is rendered once per background, and a figure that protocols share is measured once. Returns the path of
-    results.json, which is written last. Raises UserError for an unknown protocol, a frame that cannot be read, damaged
-    LPIPS weights, or a disk that refuses.
+    Every frame is rendered once per background, and a figure that protocols share is measured once. A protocol that has no
+    frame of this subject is left out, and that is said first. Returns the path of results.json, which is written last.
+    Raises UserError for an unknown protocol, where no protocol has a frame, for a frame that cannot be read, damaged LPIPS
+    weights, or a disk that refuses.
     """
-    chosen = choose_protocols(protocols)
-    folder = run.path / "eval"
     subject, data = run.subject, run.config.data
+    asked = choose_protocols(protocols)
+    indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in asked}
+    left_out = without_frames(asked, indices, subject.name)
+    for sentence in left_out.values():
+        say(f"Note: {sentence}")
+    chosen = [protocol for protocol in asked if protocol.name not in left_out]
+    folder = run.path / "eval"
     renderer = Renderer(run.avatar, torch.tensor(chosen[0].background))
     networks = find_networks((protocol.lpips_net for protocol in chosen), renderer.background.device)
     lpips: dict[Net, Lpips | None] = {net: found.network for net, found in networks.items()}
-    indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in chosen}
     order = sorted(set().union(*indices.values()))
     known = conditions(run.avatar.head, subject, order)
     results: dict[str, list[FrameResult]] = {protocol.name: [] for protocol in chosen}
@@ -104,7 +110,8 @@ def evaluate(
         "config": run.config.to_dict(),
         "versions": versions(),
         "shared_choices": SHARED_CHOICES,
-        "notes": [*background_notes(chosen, data.background), *region_notes(chosen, run)],
+        "notes": [*left_out.values(), *background_notes(chosen, data.background), *region_notes(chosen, run)],
+        "left_out": left_out,
         "rendering": speed(renderer, subject, order, data.size),
         "protocols": {
             protocol.name: summarise(protocol, results[protocol.name], networks[protocol.lpips_net], subject.fps)
@@ -126,6 +133,26 @@ def evaluate(
     places = {"Results": path, "Curves": folder / "curves.png", "Worst": folder / "worst.png", "Video": video}
     say("\n".join(f"{name:8} {place}" for name, place in places.items() if place.exists()))
     return path
+
+
+def without_frames(protocols: Sequence[Protocol], indices: Mapping[str, Sequence[int]], subject: str) -> dict[str, str]:
+    """Why a protocol cannot be measured on a subject, by its name. Raises UserError when none can."""
+    reasons = {
+        protocol.name: f"{protocol.name} is not measured: "
+        + (
+            f"no frame of {subject} is held out"
+            if protocol.frames == HELD_OUT
+            else f"none of the last {protocol.frames} frames of {subject} is held out"
+        )
+        for protocol in protocols
+        if not indices[protocol.name]
+    }
+    if len(reasons) == len(protocols):
+        raise UserError(
+            f"there is nothing to measure: {'; '.join(reasons.values())}; choose a protocol of other frames, or train with "
+            "data.test_frames so that the end of the video is held out"
+        )
+    return reasons
 
 
 def add_jitter(results: Sequence[FrameResult], meter: JitterMeter, run: Run) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import Any, Literal
 
 import torch
@@ -159,7 +160,7 @@ def _checked_options(
     pixels = check_region(region, camera.width, camera.height)
 
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
-    alpha_min, alpha_max, t_min = torch.tensor([alpha_min, alpha_max, max(t_min, T_MIN)], dtype=torch.float32).tolist()
+    alpha_min, alpha_max, t_min = struct.unpack("3f", struct.pack("3f", alpha_min, alpha_max, max(t_min, T_MIN)))
     return {
         "sh_degree": sh_degree,
         "alpha_min": alpha_min,
@@ -191,7 +192,8 @@ def _check_camera(camera: Camera) -> None:
     for name in ("R_cam_world", "t_cam_world"):
         if not (pose := getattr(camera, name)).is_cpu:
             raise ValueError(f"camera.{name} must be on the cpu, whatever the backend, got {pose.device}")
-    check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)
+    if not all(map(math.isfinite, (*camera.R_cam_world.flatten().tolist(), *camera.t_cam_world.tolist()))):
+        check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)  # names and counts them
     for name in ("fx", "fy"):
         value = getattr(camera, name)
         if not (value > 0 and math.isfinite(value)):

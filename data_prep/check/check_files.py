@@ -7,9 +7,8 @@ from collections import Counter
 from pathlib import Path
 
 from avatar.data.images import IMAGE_SUFFIXES
-from avatar.data.source import DEFAULT_LEFT_OUT
 from data_prep.check.clip import Clip
-from data_prep.check.findings import Finding, loss_severity
+from data_prep.check.findings import Finding, from_sentence, loss_severity
 from data_prep.check.view import HEAD, IMAGE
 from data_prep.frame_files import describe_numbers, gaps
 from data_prep.frame_offset import RADIUS
@@ -30,12 +29,6 @@ def check_files(clip: Clip) -> list[Finding]:
     ]
 
 
-def from_sentence(check: str, sentence: str) -> Finding:
-    """An error from a UserError's sentence, `what is wrong; what to do`."""
-    problem, _, advice = sentence.rpartition("; ")
-    return Finding("error", check, problem or sentence, advice if problem else "mend that, then check again")
-
-
 def _unreadable(clip: Clip) -> list[Finding]:
     findings = []
     for kind in clip.files.of_kind():
@@ -46,7 +39,7 @@ def _unreadable(clip: Clip) -> list[Finding]:
         rest = f" and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
         findings.append(
             Finding(
-                loss_severity(len(reasons), len(clip.views)),
+                loss_severity(len(reasons), len(clip.views), clip.max_left_out),
                 "unreadable",
                 f"{len(reasons)} of {len(clip.views)} files of {clip.files.title(kind)} cannot be read: "
                 f"{', '.join(shown)}{rest}",
@@ -108,7 +101,7 @@ def _mask_values(clip: Clip) -> list[Finding]:
         elif kind == HEAD and (empty := [n for n, value in values.items() if value == 0]):
             findings.append(
                 Finding(
-                    loss_severity(len(empty), len(clip.views)),
+                    loss_severity(len(empty), len(clip.views), clip.max_left_out),
                     "empty-mask",
                     f"the head mask is empty in {clip.phrase(empty)}: no head was found there",
                     "segment them again, or accept that they are left out of training",
@@ -126,7 +119,7 @@ def _missing_masks(clip: Clip) -> list[Finding]:
             continue
         findings.append(
             Finding(
-                loss_severity(len(missing), len(clip.files.images)),
+                loss_severity(len(missing), len(clip.files.images), clip.max_left_out),
                 "missing",
                 f"{clip.files.title(kind)} has no file for {len(missing)} of {len(clip.files.images)} images: "
                 f"{describe_numbers(missing, name=clip.name)}",
@@ -152,7 +145,7 @@ def _partners(clip: Clip) -> list[Finding]:
             continue
         # An offset leaves a few without partner at the ends; `prepare` refuses more.
         at_ends = not other or all(n < min(other) or n > max(other) for n in alone)
-        is_refused = len(alone) > max(DEFAULT_LEFT_OUT * len(have), RADIUS)
+        is_refused = len(alone) > max(clip.max_left_out * len(have), RADIUS)
         severity = "error" if is_refused else "note" if at_ends else "warning"
         shown = ", ".join(have[n].name for n in alone[:_SHOWN]) + (
             f" and {len(alone) - _SHOWN} more" if len(alone) > _SHOWN else ""
@@ -227,15 +220,15 @@ def _entries(folder: Path) -> list[Path]:
 def lost_frames(clip: Clip, reasons: dict[int, str]) -> list[Finding]:
     """An error where many small losses together are more than `prepare` accepts; `reasons` by image number."""
     total = len(clip.pairs())
-    if total == 0 or len(reasons) <= DEFAULT_LEFT_OUT * total:
+    if total == 0 or len(reasons) <= clip.max_left_out * total:
         return []
     return [
         Finding(
             "error",
             "left-out",
-            f"{len(reasons)} of {total} frames cannot be used, more than {DEFAULT_LEFT_OUT:.0%}: "
+            f"{len(reasons)} of {total} frames cannot be used, more than {clip.max_left_out:.0%}: "
             f"{describe_reasons(reasons, clip.name)}",
-            "mend what is named; training does not start before",
+            "mend what is named, or train without these frames: --max-left-out allows more",
             clip.names(reasons),
         )
     ]

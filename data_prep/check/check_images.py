@@ -10,7 +10,6 @@ import numpy as np
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding
 from data_prep.inspect_images import composited_background
-from data_prep.overlap import MIN_OVERLAP
 
 # Neighbours differ by at least half of the clip's median difference in clips without repeats; an encoder that repeats a
 # frame leaves far less.
@@ -56,12 +55,14 @@ def _repeated(clip: Clip) -> list[Finding]:
     ]
 
 
-def _composited(clip: Clip) -> list[Finding]:
-    if not clip.files.alphas:
-        return []
+def _flat_background(clip: Clip) -> str | None:
     bad = {n: "" for n in clip.files.images if not clip.is_whole(n)}
-    colour = composited_background(clip.files, bad)
-    if colour is None:
+    return composited_background(clip.files, bad) if clip.files.alphas else None
+
+
+def _composited(clip: Clip) -> list[Finding]:
+    colour = _flat_background(clip)
+    if colour is None or clip.files.is_transparent:  # a PNG keeps its colours whole beside its transparency
         return []
     return [
         Finding(
@@ -131,8 +132,8 @@ def _matte(clip: Clip) -> list[Finding]:
 
 
 def _mask_area(clip: Clip) -> list[Finding]:
-    ratios = {n: fit.mask_ratio for n, fit in clip.fits.items()}
-    if not ratios or np.median([fit.overlap for fit in clip.fits.values()]) < MIN_OVERLAP:
+    ratios = {n: fit.mask_ratio for n, fit in clip.fits.items() if np.isfinite(fit.mask_ratio)}
+    if not ratios or clip.judgement is None or clip.judgement.problem is not None:
         return []  # the mesh lies elsewhere: its area says nothing about the mask's
     usual = float(np.median(list(ratios.values())))
     if usual > MAX_MASK_RATIO:
@@ -191,7 +192,7 @@ def _exposure(clip: Clip) -> list[Finding]:
     if measured is None:
         return []
     numbers, head, background = measured
-    has_background = bool(np.isfinite(background).all()) and not _composited(clip)
+    has_background = bool(np.isfinite(background).all()) and _flat_background(clip) is None
     both = np.where(np.sign(head) == np.sign(background), np.sign(head), 0) * np.minimum(abs(head), abs(background))
     change = steady(both if has_background else head)
     low, high = int(np.argmin(change)), int(np.argmax(change))

@@ -10,11 +10,10 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
 from data_prep.check.clip import Clip
-from data_prep.check.findings import Finding, grouped, loss_severity
+from data_prep.check.findings import Finding, from_sentence, grouped, loss_severity
 from data_prep.check.motion import suddenness
 from data_prep.check.view import TRACKING
 from data_prep.frame_files import describe_numbers
-from data_prep.overlap import MIN_OVERLAP
 
 # A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
 # neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.
@@ -26,12 +25,6 @@ EXPRESSION_SPREADS = 2.0  # root mean square distance from the mean expression
 FOV_RANGE = 4.0, 90.0  # degrees; a head that fills the image from 4 m away; a wide-angle lens that nobody cropped
 MAX_ASPECT = 0.02  # fx against fy; cameras have square pixels
 MAX_OFF_CENTRE = 0.1  # of the image; cropping moves the principal point
-# Of the size of the projected head. On clips whose tracking error is known (0.15 degrees, 0.4 mm, 2%) lips are off by less
-# than 0.018 and the mesh sticks out of the mask by less than 0.01.
-MAX_MOUTH, MAX_OVERHANG = 0.05, 0.05
-MIN_INSIDE = 0.9  # of the mesh without neck; the same clips have 0.99
-_ROBUST_SD = 1.4826  # times the median absolute deviation: the standard deviation of a normal distribution
-_OUTLIER = 6.0  # robust standard deviations
 
 
 def check_tracking(clip: Clip) -> list[Finding]:
@@ -41,7 +34,6 @@ def check_tracking(clip: Clip) -> list[Finding]:
         *_offset(clip),
         *_camera(clip),
         *_jumps(clip),
-        *_residuals(clip),
     ]
 
 
@@ -53,7 +45,7 @@ def _unusable(clip: Clip) -> list[Finding]:
         detail = f"not finite: {', '.join(keys)} in {first.name}" if keys else reason
         findings.append(
             Finding(
-                loss_severity(len(numbers), len(clip.files.tracking)),
+                loss_severity(len(numbers), len(clip.files.tracking), clip.max_left_out),
                 "non-finite" if keys or "is not finite" in reason else "no-face" if "no face" in reason else "tracking",
                 f"the tracking cannot be used in {clip.phrase(numbers)} of {clip.files.title(TRACKING)}: {detail}",
                 "track these frames again, or accept that they are left out of training",
@@ -88,7 +80,7 @@ def _repeats(clip: Clip) -> list[Finding]:
         return []
     return [
         Finding(
-            loss_severity(len(repeated), len(clip.pairs())),
+            loss_severity(len(repeated), len(clip.pairs()), clip.max_left_out),
             "tracking-repeats",
             f"the tracking repeats that of the frame before while the image does not, in {clip.phrase(repeated)}",
             "the tracker lost the face there: track again, or accept that they are left out of training",
@@ -112,14 +104,7 @@ def repeated_tracking(clip: Clip) -> list[int]:
 def _offset(clip: Clip) -> list[Finding]:
     findings = []
     if clip.offset is None and clip.head is not None:
-        findings.append(
-            Finding(
-                "error",
-                "frame-offset",
-                clip.offset_evidence.partition("; ")[0].removesuffix(" Give --frame-offset to go on regardless"),
-                "look at the frames, then give --frame-offset (1 where images count from 1 and tracking from 0)",
-            )
-        )
+        findings.append(from_sentence("frame-offset", clip.offset_evidence))
     if clip.part_offsets is not None and clip.part_offsets[0] != clip.part_offsets[1]:
         first, last = clip.part_offsets
         findings.append(
@@ -212,71 +197,6 @@ def _jumps(clip: Clip) -> list[Finding]:
     return findings
 
 
-def _residuals(clip: Clip) -> list[Finding]:
-    if not clip.fits:
-        return []
-    numbers = list(clip.fits)
-    fits = list(clip.fits.values())
-    size = np.array([fit.size for fit in fits])
-    overlap, inside = (np.array([getattr(fit, name) for fit in fits]) for name in ("overlap", "inside"))
-    overhang, mouth = np.array([f.overhang for f in fits]) / size, np.array([f.mouth for f in fits]) / size
-    findings = []
-    if np.median(overlap) < MIN_OVERLAP:
-        findings.append(
-            Finding(
-                "error",
-                "residual",
-                f"the tracked head does not lie on the head masks: their overlap (IoU) is {np.median(overlap):.2f} in the "
-                "median",
-                "is the tracking of this video, the frame offset right, and the head model the one it was made with?",
-            )
-        )
-        return findings
-    for what, values, limit, region in (
-        ("the tracked head sticks out of the head mask", overhang, MAX_OVERHANG, "head"),
-        ("the tracked lips are away from the mouth mask", mouth, MAX_MOUTH, "mouth"),
-    ):
-        if not np.isfinite(values).any():
-            continue
-        pixels = values * size
-        usual = float(np.nanmedian(values))
-        if usual > limit:
-            findings.append(
-                Finding(
-                    "warning",
-                    "residual",
-                    f"{what} by {np.nanmedian(pixels):.1f} pixels in the median over the clip ({usual:.1%} of the head's "
-                    f"size)",
-                    f"compare mesh and {region} mask on the page of --out; the tracking or its camera is off",
-                )
-            )
-            continue
-        spread = _ROBUST_SD * float(np.nanmedian(np.abs(values - usual)))
-        off = [n for n, value in zip(numbers, values, strict=True) if value > max(limit, usual + _OUTLIER * spread)]
-        if off:
-            worst = int(np.nanargmax(values))
-            findings.append(
-                Finding(
-                    "warning",
-                    "residual",
-                    f"{what} in {clip.phrase(off)}: {pixels[worst]:.1f} pixels in {clip.name(numbers[worst])}, where "
-                    f"{np.nanmedian(pixels):.1f} is usual",
-                    "look at these frames: is the mask wrong or the tracking? Redo it, or remove the frames",
-                    clip.names(off),
-                )
-            )
-    if np.median(inside) < MIN_INSIDE and not findings:
-        findings.append(
-            Finding(
-                "warning",
-                "residual",
-                f"only {np.median(inside):.0%} of the tracked head (without neck) lies on the head mask, in the median",
-                "is the mask of the whole head with hair, or of the face alone? The rest is trained to be background",
-            )
-        )
-    return findings
-
-
 def behind_camera(clip: Clip) -> list[int]:
     """Image numbers whose tracked head lies behind the camera."""
     if clip.head is None:
@@ -291,7 +211,7 @@ def check_behind_camera(clip: Clip) -> list[Finding]:
         return []
     return [
         Finding(
-            loss_severity(len(behind), len(clip.pairs())),
+            loss_severity(len(behind), len(clip.pairs()), clip.max_left_out),
             "behind-camera",
             f"the tracked head is behind the camera in frames {describe_numbers(behind, name=clip.name)}",
             "track these frames again, or accept that they are left out of training",

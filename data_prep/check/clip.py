@@ -12,17 +12,19 @@ from typing import Protocol, TypeVar
 import numpy as np
 import torch
 
+from avatar.data.source import DEFAULT_FPS, DEFAULT_LEFT_OUT
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.check.findings import frames_phrase
-from data_prep.check.fit import Fit, MeshProjector, fit_of_masks
-from data_prep.check.masks import read_masks
 from data_prep.check.view import IMAGE, TRACKING, View, look_at
+from data_prep.fit import Fit, MeshProjector, fit_of_masks
 from data_prep.formats import METRICAL_TRACKER, open_tracked_folder
 from data_prep.frame_files import FrameFiles
 from data_prep.frame_offset import OffsetEstimate, detect_offset
+from data_prep.masks import read_masks
 from data_prep.metrical_tracker import read_tracking
+from data_prep.misfit import Judgement, judge, sample
 from data_prep.tracked_folder import TrackedFolder
 from data_prep.tracking import FrameTrack, Tracking, fit_coefficients
 
@@ -53,10 +55,26 @@ class Clip:
     views: dict[int, View] = field(default_factory=dict)  # by image number
     fits: dict[int, Fit] = field(default_factory=dict)  # by image number
     steps: dict[int, float] = field(default_factory=dict)  # image number -> mean grey-level change since the one before
+    given_fps: float | None = None
+    max_left_out: float = DEFAULT_LEFT_OUT  # share of the frames that may be unusable
+    ignore_misfit: bool = False  # a head that does not lie on the masks is no error
 
     @property
     def files(self) -> FrameFiles:
         return self.source.files
+
+    @property
+    def fps(self) -> float:
+        """Frames a second."""
+        return self.given_fps or self.source.fps or DEFAULT_FPS
+
+    @cached_property
+    def judgement(self) -> Judgement | None:
+        """What `prepare` says of head and lips against their masks; None where nothing was measured."""
+        if not self.fits:
+            return None
+        measured = [pair for pair in self.pairs() if pair[0] in self.fits]
+        return judge([self.fits[image] for image, _ in sample(measured)], self.files)
 
     @cached_property
     def _listed_names(self) -> dict[int, str]:
@@ -102,6 +120,10 @@ def read_clip(
     frame_offset: int | None,
     format: str | None = None,
     progress: Progress = silent,
+    *,
+    fps: float | None = None,
+    max_left_out: float = DEFAULT_LEFT_OUT,
+    ignore_misfit: bool = False,
 ) -> Clip:
     """Read everything. Raises UserError only when the folder's files cannot be listed."""
     complaints: list[tuple[str, str]] = []
@@ -123,7 +145,20 @@ def read_clip(
     offset, evidence = frame_offset, GIVEN
     if source.is_paired:
         offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
-    clip = Clip(source, tracks, tuple(complaints), head, offset, evidence, None, views, steps=steps)
+    clip = Clip(
+        source,
+        tracks,
+        tuple(complaints),
+        head,
+        offset,
+        evidence,
+        None,
+        views,
+        steps=steps,
+        given_fps=fps,
+        max_left_out=max_left_out,
+        ignore_misfit=ignore_misfit,
+    )
     if head is None or not clip.files.images:
         return clip
     if not source.is_paired:
@@ -167,8 +202,7 @@ def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, 
     project = MeshProjector(head, next(iter(clip.tracking.frames.values())).intrinsics)
 
     def measure(number: int) -> Fit | None:
-        mask, mouth = read_masks(clip.files, number)
-        return None if mask is None else fit_of_masks(project, tracks[number], mask, mouth)
+        return fit_of_masks(project, tracks[number], *read_masks(clip.files, number))
 
     with ThreadPoolExecutor(max_workers=2) as pool:  # as do matrix products
         fits = pool.map(measure, tracks)
@@ -196,14 +230,9 @@ def _with_offset(clip: Clip, head: HeadModel, given: int | None) -> Clip:
 def _estimate(clip: Clip, head: HeadModel, numbers: list[int]) -> OffsetEstimate | str:
     """The offset of these tracking frames, or the sentence that says why it is not clear."""
     tracks = {n: clip.tracking.frames[n] for n in numbers}
-    images, heads, mouths = (
-        {n: path for n, path in found.items() if clip.is_whole(n)}
-        for found in (clip.files.images, clip.files.head_masks or clip.files.alphas, clip.files.mouth_masks)
-    )
-    if not images:
-        return "no image can be read"
+    without = {n for n in clip.files.images if not clip.is_whole(n)}
     try:
-        return detect_offset(head, tracks, next(iter(tracks.values())).intrinsics, images, heads, mouths)
+        return detect_offset(head, tracks, clip.files, without, clip.ignore_misfit)
     except UserError as error:
         return str(error)
 

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.data.split import Split, SplitSizes
+from avatar.data.split import Split, SplitSizes, check_divided
 from avatar.errors import UserError
 from data_prep.check.clip import Clip
-from data_prep.check.findings import Finding
+from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.motion import HeadAngles, head_angles
 from data_prep.tracked_folder import divide
 
 MIN_TEST_FRAMES = 2
-SHORT_CLIP = 250  # frames: ten seconds; published clips have 1,000 to 3,000
+SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120
 NARROW_YAW = 20.0  # degrees; with less, ears and the sides of the nose are never seen
 FAR_ANGLE = 5.0  # degrees to the nearest training frame
 FAR_EXPRESSION = 1.5  # times the training frames' own range along a principal direction
@@ -39,9 +39,9 @@ def measure_coverage(clip: Clip, usable: list[int], sizes: SplitSizes) -> Covera
     """`usable` are image numbers. A Finding where they cannot be split."""
     try:
         split, _ = divide(clip.source.division, usable, sizes)
+        check_divided(split)
     except UserError as error:
-        problem, _, advice = str(error).rpartition("; ")
-        return Finding("error", "too-few-frames", problem, advice)
+        return from_sentence("too-few-frames", str(error))
     tracks = dict(clip.tracked())
     angles = head_angles(np.stack([tracks[n].R for n in usable]))
     expressions = np.stack([tracks[n].expression for n in usable])
@@ -72,12 +72,13 @@ def check_coverage(clip: Clip, coverage: Coverage) -> list[Finding]:
     """Notes: nothing is wrong with the files, but the avatar cannot know what the video does not show."""
     findings = []
     count = len(coverage.images)
-    if count < SHORT_CLIP:
+    seconds = count / clip.fps
+    if seconds < SHORT_CLIP:
         findings.append(
             Finding(
                 "note",
                 "short-clip",
-                f"there are {count} usable frames, {count / 25:.0f} seconds at 25 per second",
+                f"there are {count} usable frames, {seconds:.0f} seconds at {clip.fps:g} per second",
                 "record half a minute to two minutes with speech, smiles, closed eyes and head turns",
             )
         )
@@ -92,7 +93,7 @@ def check_coverage(clip: Clip, coverage: Coverage) -> list[Finding]:
                 "expect the avatar to hold in front views only, or record slow turns to both sides",
             )
         )
-    sizes = [fit.size for fit in clip.fits.values()]
+    sizes = [fit.size for fit in clip.fits.values() if np.isfinite(fit.size)]
     if sizes and np.median(sizes) < SMALL_HEAD:
         findings.append(
             Finding(

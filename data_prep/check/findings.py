@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from avatar.data.source import DEFAULT_LEFT_OUT
 from data_prep.frame_files import describe_numbers
 
 Severity = Literal["error", "warning", "note"]
@@ -43,9 +42,15 @@ def count_phrase(findings: Sequence[Finding]) -> str:
     return ", ".join(f"{count} {severity}{'s' * (count != 1)}" for count, severity in counts)
 
 
-def loss_severity(lost: int, total: int) -> Severity:
+def loss_severity(lost: int, total: int, share: float) -> Severity:
     """Frames that cannot be used are left out, up to the share above which `prepare` refuses the folder."""
-    return "error" if lost > DEFAULT_LEFT_OUT * total else "warning"
+    return "error" if lost > share * total else "warning"
+
+
+def from_sentence(check: str, sentence: str) -> Finding:
+    """An error from a UserError's sentence, `what is wrong; what to do`."""
+    problem, _, advice = sentence.rpartition("; ")
+    return Finding("error", check, problem or sentence, advice if problem else "mend that, then check again")
 
 
 def frames_phrase(numbers: Sequence[int], name: Callable[[int], str]) -> str:

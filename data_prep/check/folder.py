@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from avatar.data.source import DEFAULT_LEFT_OUT
 from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
-from data_prep.check.check_files import check_files, from_sentence, lost_frames
+from data_prep.check.check_files import check_files, lost_frames
+from data_prep.check.check_fit import check_fit
 from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
 from data_prep.check.check_tracking import behind_camera, check_behind_camera, check_tracking, repeated_tracking
 from data_prep.check.clip import Clip, Progress, read_clip, silent
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
-from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status
+from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
 from data_prep.check.view import HEAD, TRACKING
 from data_prep.pairing import describe_reasons
 
@@ -58,10 +60,16 @@ def check_tracked_folder(
     tracking: Path | None = None,
     frame_offset: int | None = None,
     format: str | None = None,
+    fps: float | None = None,
+    max_left_out: float = DEFAULT_LEFT_OUT,
+    ignore_misfit: bool = False,
     split: SplitSizes = DEFAULT_SIZES,
     progress: Progress = silent,
 ) -> Check:
-    """Check a tracked folder as `prepare` would read it. A folder that is not there or has no head model is a finding."""
+    """Check a tracked folder as `prepare` would read it, with the options of a `Source`.
+
+    A folder that is not there or has no head model is a finding.
+    """
     findings: list[Finding] = []
     assets = None
     try:
@@ -69,11 +77,22 @@ def check_tracked_folder(
     except UserError as error:
         findings.append(from_sentence("head-model", str(error)))
     try:
-        clip = read_clip(folder.resolve(), assets, tracking, frame_offset, format, progress)
+        clip = read_clip(
+            folder.resolve(),
+            assets,
+            tracking,
+            frame_offset,
+            format,
+            progress,
+            fps=fps,
+            max_left_out=max_left_out,
+            ignore_misfit=ignore_misfit,
+        )
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     findings += [] if assets is None else check_head(assets)
-    findings += check_files(clip) + check_tracking(clip) + check_behind_camera(clip) + check_images(clip)
+    findings += check_files(clip) + check_tracking(clip) + check_fit(clip)
+    findings += check_behind_camera(clip) + check_images(clip)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     lost = left_out(clip)
     if not any(finding.severity == "error" for finding in findings):
@@ -122,6 +141,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
             found[f"files in {clip.files.title(kind)}"] = len(paths)
     if (size := clip.size()) is not None:
         found["image size"] = f"{size[0]}x{size[1]}"
+    found["frames a second"] = f"{clip.fps:g}{'' if clip.given_fps or clip.source.fps else ' (assumed)'}"
     found |= {"frame offset": clip.offset, "offset found": clip.offset_evidence}
     first = next(iter(clip.tracking.frames.values()), None)
     if first is not None:
@@ -132,6 +152,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
         for name, title in (
             ("overlap", "overlap of mesh and head mask (IoU), median"),
             ("overhang", "mesh sticks out of the head mask, median, pixels"),
+            ("lips", "overlap of lips and mouth mask (IoU), median"),
             ("mouth", "lips to mouth mask, median, pixels"),
         ):
             values = np.array([getattr(fit, name) for fit in clip.fits.values()])

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.data.images import read_image, read_mask
+from avatar.data.images import read_image, read_matte
+from avatar.data.subject import head_of_matte
 from avatar.types import Camera, Frame
 from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage
+from data_prep.masks import read_masks
 from data_prep.projection import head_params
 
 
@@ -24,24 +24,25 @@ def first_training_frame(clip: Clip, coverage: Coverage) -> tuple[Frame, Float[T
 
 def _frame(clip: Clip, number: int) -> Frame:
     track = dict(clip.tracked())[number]
-    image = torch.from_numpy(read_image(clip.files.images[number])).float() / 255
+    files = clip.files
+    image = read_image(files.images[number])
     height, width = image.shape[:2]
-
-    def mask(found: dict[int, Path], default: float) -> torch.Tensor:
-        if number not in found:
-            return torch.full((height, width), default)
-        return torch.from_numpy(read_mask(found[number])).float() / 255
-
+    alpha = np.full((height, width), 255, np.uint8)
+    if number in files.alphas:
+        alpha = read_matte(files.alphas[number], files.images[number])
+    head, mouth = read_masks(files, number)
+    if head is None or not (files.head_masks or files.parsing):
+        head = head_of_matte(alpha)
+    mouth = np.zeros_like(alpha) if mouth is None else mouth
     R, t = (torch.from_numpy(value).float() for value in (track.R, track.t))
     fx, fy, cx, cy = track.intrinsics.tolist()
-    files = clip.files
     return Frame(
         index=0,
         name=files.images[number].stem,
         camera=Camera(R, t, fx, fy, cx, cy, width, height),
         params=head_params(track),
-        image=image,
-        alpha=mask(files.alphas, 1.0),
-        head_mask=mask(files.head_masks, 1.0),
-        mouth_mask=mask(files.mouth_masks, 0.0),
+        **{
+            name: torch.from_numpy(pixels).float() / 255
+            for name, pixels in (("image", image), ("alpha", alpha), ("head_mask", head), ("mouth_mask", mouth))
+        },
     )

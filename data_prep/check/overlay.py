@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from skimage.segmentation import find_boundaries
 
 from avatar.data.images import read_image
 from avatar.errors import UserError
 from data_prep.check.clip import Clip
-from data_prep.check.fit import Mesh, MeshProjector
-from data_prep.check.masks import read_masks
+from data_prep.fit import Mesh, MeshProjector
+from data_prep.masks import read_masks
 from data_prep.projection import filled_lips
 
 SHOWN = 8
@@ -35,7 +36,10 @@ def choose_frames(clip: Clip) -> list[int]:
 
     def misfit(number: int) -> float:
         fit = clip.fits.get(number)
-        return 0.0 if fit is None else float(np.nan_to_num(fit.mouth) + fit.overhang) / fit.size
+        if fit is None:
+            return 0.0
+        away = np.nan_to_num(fit.mouth) + np.nan_to_num(fit.overhang)
+        return float(away / fit.size) if np.isfinite(fit.size) else np.inf  # not in the picture
 
     worst = sorted((n for n in drawable if n not in spread), key=misfit, reverse=True)
     apart: list[int] = []
@@ -68,7 +72,7 @@ def draw_overlays(clip: Clip) -> list[Overlay]:
                 continue
             outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
         if len(mesh.lip_faces):
-            outline(canvas, filled_lips(mesh.screen, mesh.lip_faces, width, height) > 0, LIPS)
+            outline(canvas, filled_lips(mesh.screen, mesh.lip_faces, width, height), LIPS)
         overlays.append(Overlay(canvas, _caption(clip, number)))
     return overlays
 
@@ -91,8 +95,8 @@ def draw_mesh(image: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 
 def outline(canvas: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(canvas, contours, -1, colour, 1, cv2.LINE_AA)
+    """Draw the outer pixels of the mask's pieces, and those around its holes, on the canvas."""
+    canvas[find_boundaries(mask, mode="inner")] = colour
 
 
 def _caption(clip: Clip, number: int) -> str:
@@ -100,5 +104,6 @@ def _caption(clip: Clip, number: int) -> str:
     fit = clip.fits.get(number)
     if fit is None:
         return name
+    head = "" if np.isnan(fit.overhang) else f": overlap {fit.overlap:.2f}, sticks out {fit.overhang:.1f} px"
     lips = "" if np.isnan(fit.mouth) else f", lips off by {fit.mouth:.1f} px"
-    return f"{name}: overlap {fit.overlap:.2f}, sticks out {fit.overhang:.1f} px{lips}"
+    return f"{name}{head}{lips}"

@@ -9,17 +9,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from skimage.measure import label
 
-from avatar.data.images import decode_image, decode_mask, read_bytes
-from avatar.data.subject import FAINTEST_MATTE
+from avatar.data.images import decode_image, decode_mask, decode_transparency, read_bytes
+from avatar.data.subject import head_of_matte
 from avatar.errors import UserError
 from data_prep import face_parsing
 from data_prep.face_parsing import mask_of
+from data_prep.fit import measured_size
+from data_prep.projection import filled
 
 # As FrameFiles.of_kind names them.
 IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
 PARSING, TRACKING = "face parsing", "checkpoint"
-MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distances are given in the frame's own pixels
 FAR = 0.05  # of the image width: further from the person than soft hair reaches
 _ON = 127
 Decode = Callable[[bytes, Path], np.ndarray]
@@ -32,7 +34,7 @@ class Matte:
 
     covered: float  # share of the image with a weight above one half
     haze: float  # mean weight far from the person; 0 where the background is gone
-    holes: float  # share of the inner head mask that the matte makes transparent
+    holes: float  # share of the inner head mask that the matte makes transparent; of the person where there is none
     specks: float  # area of everything but the largest piece / area of the largest piece
 
 
@@ -48,11 +50,6 @@ class View:
     matte: Matte | None = None
 
 
-def measured_size(width: int, height: int) -> tuple[int, int]:
-    scale = min(1.0, MEASURED_WIDTH / width)
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
 def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> View:
     """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing.
 
@@ -63,6 +60,8 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     digest = b""
     for kind, path in paths.items():
         decode: Decode = decode_image if kind == IMAGE else decode_parsing if kind == PARSING else decode_mask
+        if kind == ALPHA and path == paths.get(IMAGE):
+            decode = decode_transparency
         try:
             data = read_bytes(path)
             pixels[kind] = decode(data, path)
@@ -85,13 +84,14 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
         if array.shape[:2] == (height, width)
     }
     image, alpha, head = small[IMAGE], small.get(ALPHA), small.get(HEAD)
-    if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
-        head = np.where(alpha >= FAINTEST_MATTE, np.uint8(255), np.uint8(0))  # as data/subject.py does
     matte = None
-    if alpha is not None and head is not None:
-        matte = measure_matte(alpha, head)
+    if head is None and alpha is not None and not {HEAD, PARSING} & paths.keys():
+        head = head_of_matte(alpha)
+        matte = measure_matte(alpha, head, filled(alpha > _ON))  # its soft rim is no hole
+    elif alpha is not None and head is not None:
+        matte = measure_matte(alpha, head, head > _ON)
     elif head is not None and ALPHA not in paths:
-        matte = measure_matte(np.full_like(head, 255), head)
+        matte = measure_matte(np.full_like(head, 255), head, head > _ON)
     return View(
         problems,
         sizes,
@@ -104,15 +104,15 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     )
 
 
-def measure_matte(alpha: np.ndarray, head: np.ndarray) -> Matte:
-    """From the matte and the head mask, uint8 [h, w]."""
+def measure_matte(alpha: np.ndarray, head: np.ndarray, solid: np.ndarray) -> Matte:
+    """From matte and head mask, uint8 [h, w], and where the matte should have no hole, bool [h, w]."""
     weight = alpha.astype(np.float32) * head * (1 / 255**2)
-    on = (weight > 0.5).astype(np.uint8)
-    far = cv2.distanceTransform(1 - on, cv2.DIST_L2, 3) > FAR * weight.shape[1] if on.any() else on == 0
+    on = weight > 0.5
+    apart = cv2.distanceTransform((~on).astype(np.uint8), cv2.DIST_L2, 3)
+    far = apart > FAR * weight.shape[1] if on.any() else ~on
     border = max(3, round(0.04 * weight.shape[1])) | 1
-    inner = cv2.erode((head > _ON).astype(np.uint8), np.ones((border, border), np.uint8)) > 0
-    _, _, stats, _ = cv2.connectedComponentsWithStats(on)
-    areas = np.sort(stats[1:, cv2.CC_STAT_AREA])[::-1]
+    inner = cv2.erode(solid.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
+    areas = np.sort(np.bincount(np.asarray(label(on)).ravel())[1:])[::-1]  # of the pieces; 0 is what lies around
     return Matte(
         covered=float(on.mean()),
         haze=float(weight[far].mean()) if far.any() else 0.0,

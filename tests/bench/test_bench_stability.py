@@ -76,5 +76,8 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     written = json.loads((tmp_path / "stability.json").read_text())
     assert {row["form"] for row in written["rows"]} == set(FORMS)
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.split()[:1] in (["trick"], ["direct"])]
-    assert len(lines) == len(FORMS) * 4
+    printed = capsys.readouterr().out.splitlines()
+    assert len([line for line in printed if line.split()[:1] in (["trick"], ["direct"])]) == len(FORMS) * 4
+    page = (tmp_path / "stability.md").read_text().splitlines()
+    table = page[page.index("```") + 1 : -1]
+    assert page[0] == "# `avatar bench stability`" and table == printed[: len(table)] and len(table) > len(FORMS) * 4

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from preparing import edit, prepare_folder
 from tracked_folder import write_tracked_folder
 
 from avatar.data.images import read_mask
-from avatar.data.manifest import read_manifest
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
-from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
@@ -27,21 +21,12 @@ from data_prep.prepare import prepare
 from data_prep.projection import filled_lips
 
 
-def prepare_folder(
-    folder: Path, out: Path, split: SplitSizes | None = None, **options: Any
-) -> tuple[Subject, list[str]]:
-    said: list[str] = []
-    head_path = folder / "head_model"
-    source = Source(folder, head_path, **options)
-    prepared = prepare(source, load_head_assets(head_path), out=out, split=split, say=said.append)
-    return Subject.open(prepared), said
-
-
 def test_the_prepared_head_lies_on_the_masks(tmp_path: Path) -> None:
     """Every convention at once: pairing, cameras, 6D rotations, sizes. The renderer of the fixture is the witness."""
     folder = write_tracked_folder(tmp_path / "subject", frames=8, size=80, height=64, offset=2)
     subject, said = prepare_folder(folder, tmp_path / "out", frame_offset=2)
-    assert said[:2] == ["format: metrical-tracker", "image offset 2, given with --frame-offset"]
+    assert said[0] == "format: metrical-tracker"
+    assert said[1].startswith("image offset 2, given with --frame-offset: head overlap 1.000, lips overlap 1.000")
     head = HeadModel(load_head_assets(folder / "head_model"), subject.identity)
     for index in range(len(subject)):
         for size in (None, 40):
@@ -89,56 +74,6 @@ def test_images_come_back_red_first(tmp_path: Path) -> None:
     lips = frame.image[frame.mouth_mask > 0]
     assert len(lips) > 5 and (lips[:, 0] > 1.5 * lips[:, 1]).all()
     assert frame.image[0, 0].tolist() == pytest.approx([90 / 255, 110 / 255, 130 / 255])
-
-
-def edit(path: Path, section: str, **changes: np.ndarray) -> None:
-    content = torch.load(path, weights_only=False)
-    content[section] |= changes
-    torch.save(content, path)
-
-
-@pytest.mark.parametrize("kind", ["no face", "not finite", "repeated", "cut short", "image cut short", "no mouth mask"])
-def test_one_bad_frame_is_left_out_with_a_warning(kind: str, tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", frames=24)
-    file = folder / "checkpoint" / "00010.frame"
-    if kind == "no face":
-        edit(file, "opencv", R=np.zeros((1, 3, 3)), t=np.zeros((1, 3)))
-        reason = "all zero: the tracker found no face"
-    elif kind == "not finite":
-        edit(file, "flame", exp=np.full((1, 10), np.inf))
-        reason = "flame.exp is not finite (10 of 10 values)"
-    elif kind == "repeated":
-        before = torch.load(folder / "checkpoint" / "00009.frame", weights_only=False)
-        torch.save(before | {"frame_id": "00010"}, file)
-        reason = "the tracking repeats that of the frame before, while the image does not"
-    elif kind == "cut short":
-        file.write_bytes(file.read_bytes()[:400])
-        reason = "is damaged or cut short (File is not a zip file); write or copy it again"
-    elif kind == "image cut short":
-        image = folder / "imgs" / "00011.jpg"
-        image.write_bytes(image.read_bytes()[:300])
-        reason = f"{image} is cut short; write or copy it again"
-    else:
-        (folder / "parsing" / "00011_mouth.png").unlink()
-        reason = "it has no mouth mask"
-    subject, said = prepare_folder(folder, tmp_path / "out")
-    assert subject.manifest.left_out == {"00011": reason}
-    assert f"warning: left out 1 of 24 frames: 00011 ({reason})" in said
-    assert [f.name for f in subject.manifest.frames] == [f"{n:05d}" for n in range(1, 25) if n != 11]
-    np.testing.assert_array_equal(
-        subject.params(10).expression,
-        torch.load(folder / "checkpoint" / "00011.frame", weights_only=False)["flame"]["exp"][0],
-    )
-    assert (len(subject.split.train), len(subject.split.test)) == (18, 5)
-
-
-def test_a_still_video_may_repeat_its_tracking(tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", frames=24)
-    before = torch.load(folder / "checkpoint" / "00009.frame", weights_only=False)
-    torch.save(before | {"frame_id": "00010"}, folder / "checkpoint" / "00010.frame")
-    shutil.copy(folder / "imgs" / "00010.jpg", folder / "imgs" / "00011.jpg")
-    subject, _ = prepare_folder(folder, tmp_path / "out")
-    assert subject.manifest.left_out == {}
 
 
 def test_a_slightly_inexact_rotation_is_made_orthonormal(tmp_path: Path) -> None:
@@ -201,16 +136,6 @@ def test_images_that_were_composited_before_are_noticed(tmp_path: Path) -> None:
     assert any(s.startswith("note: the images seem to be composited on white already: ") for s in said)
 
 
-def test_gaps_and_odd_counts_are_named(tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", frames=24)
-    (folder / "imgs" / "00013.jpg").unlink()
-    subject, said = prepare_folder(folder, tmp_path / "out")
-    assert "note: imgs skips the numbers 00013" in said
-    assert "note: alpha has 24 files for 23 images" in said
-    assert "note: there are 23 images and 24 tracking frames" in said
-    assert len(subject) == 23 and subject.manifest.frames[12].tracking == 13
-
-
 def test_numbers_are_ordered_as_numbers(tmp_path: Path) -> None:
     """1.jpg ... 12.JPG without padding, as some extraction tools write them."""
     folder = write_tracked_folder(tmp_path / "subject", frames=12)
@@ -236,75 +161,6 @@ def test_tracking_in_another_folder(tmp_path: Path) -> None:
     for tracking in (tmp_path / "tracker", tmp_path / "tracker" / "checkpoint"):
         subject, _ = prepare_folder(folder, tmp_path / "out", tracking=tracking)
         assert len(subject) == 12
-
-
-def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
-    folder = write_tracked_folder(tmp_path / "subject", frames=12)
-    head_path = folder / "head_model"
-    head = load_head_assets(head_path)
-
-    def run(split: SplitSizes | None = None) -> tuple[Path, str, bool]:
-        said: list[str] = []
-        prepared = prepare(Source(folder, head_path), head, split=split, say=said.append)
-        assert prepared.is_relative_to(tmp_path / "cache" / "subjects")
-        return prepared, read_manifest(prepared).data_hash, said == [f"using the prepared subject {prepared}"]
-
-    first, first_hash, reused = run()
-    assert not reused
-    assert run() == (first, first_hash, True)
-
-    image = folder / "imgs" / "00003.jpg"
-    os.utime(image, ns=(1, 1))  # looked at again, and found to be the same
-    assert run() == (first, first_hash, False)
-    assert run() == (first, first_hash, True)
-
-    shutil.copy(folder / "imgs" / "00004.jpg", image)
-    _, changed_hash, reused = run()
-    assert not reused and changed_hash != first_hash
-
-    other, _, reused = run(split=SplitSizes(test=2))
-    assert not reused and other != first and len(read_manifest(other).test) == 2
-
-    (first / "manifest.json").write_text("{")
-    assert not run()[2] and run()[2]
-    (first / "tracks.safetensors").unlink()
-    assert not run()[2] and run()[2]
-    assert sorted(p.name for p in (tmp_path / "cache" / "subjects").iterdir()) == sorted([first.name, other.name])
-
-
-def test_a_failed_preparation_keeps_the_old_one(tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", frames=12)
-    subject, _ = prepare_folder(folder, tmp_path / "out")
-    shutil.rmtree(folder / "imgs")
-    with pytest.raises(UserError, match="has no frames"):
-        prepare_folder(folder, tmp_path / "out")
-    assert Subject.open(tmp_path / "out").data_hash == subject.data_hash
-
-
-@pytest.mark.parametrize("offsets", [(1, 1), (0, 1)])
-def test_several_at_once_all_succeed(offsets: tuple[int, int], tmp_path: Path) -> None:
-    """As trainings that are started together on a new subject do; one's folder stays, whole."""
-    folder = write_tracked_folder(tmp_path / "subject", frames=12, mouth_masks=False)
-    head_path = folder / "head_model"
-    head = load_head_assets(head_path)
-
-    def run(offset: int) -> Path:
-        return prepare(Source(folder, head_path, frame_offset=offset), head, out=tmp_path / "out", say=str)
-
-    with ThreadPoolExecutor(max_workers=4) as pool:
-        assert list(pool.map(run, offsets * 6)) == [tmp_path / "out"] * 12
-    subject = Subject.open(tmp_path / "out")
-    assert subject.frame(len(subject) - 1).mouth_mask.max() > 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "subject"]
-
-
-def test_the_data_hash_does_not_depend_on_the_place(tmp_path: Path) -> None:
-    a = write_tracked_folder(tmp_path / "a" / "one", frames=12)
-    shutil.copytree(a, tmp_path / "b" / "two")
-    first, _ = prepare_folder(a, tmp_path / "out1")
-    second, _ = prepare_folder(tmp_path / "b" / "two", tmp_path / "out2")
-    assert first.data_hash == second.data_hash and first.manifest.input_hash != second.manifest.input_hash
 
 
 @pytest.mark.shared

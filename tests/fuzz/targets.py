@@ -19,7 +19,7 @@ from small_runs import run_info
 from tracked_folder import write_tracked_folder
 
 from avatar.config import load_config
-from avatar.data.images import decode_image, decode_mask
+from avatar.data.images import decode_image, decode_mask, decode_transparency
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import refuse
@@ -98,7 +98,7 @@ def make_targets(place: Path) -> dict[str, Target]:
         return Subject.open(folder).frame(0)
 
     def image(data: bytes) -> object:
-        return decode_image(data, Path("x.png")), decode_mask(data, Path("x.png"))
+        return [decode(data, Path("x.png")) for decode in (decode_image, decode_mask, decode_transparency)]
 
     faces, V = head.faces.numpy(), head.num_vertices
     parameters = folders["vhap"].parent / "flame_param" / "00002.npz"

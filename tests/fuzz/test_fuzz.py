@@ -1,7 +1,8 @@
 """Damaged and hostile files: every reader answers with the data or with one sentence, soon, in bounded memory.
 
 AVATAR_FUZZ_CASES sets the number of mutated files of all readers together; the default is a short run for every day. A case
-is found again by the reader's name and its number, which a failure prints.
+is found again by the reader's name and its number, which a failure prints. AVATAR_FUZZ_TABLE names a file for the table
+of all readers (`make fuzz`: docs/bench/fuzz.md).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import pickletools
 import random
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -48,9 +49,21 @@ def test_all_readers_are_fuzzed(targets: dict[str, Target]) -> None:
     assert tuple(targets) == NAMES
 
 
+@pytest.fixture(scope="module")
+def rows() -> Iterator[list[str]]:
+    """Of the table: one for each reader that has passed."""
+    rows: list[str] = []
+    yield rows
+    if (table := os.environ.get("AVATAR_FUZZ_TABLE")) and len(rows) == len(NAMES):
+        head = ["# `make fuzz`", "", f"{CASES:,} damaged files; none did anything but be read or be refused.", ""]
+        head += ["| reader | files | read | refused | slowest, ms |", "|---|---|---|---|---|"]
+        Path(table).parent.mkdir(parents=True, exist_ok=True)
+        Path(table).write_text("\n".join([*head, *rows, ""]), encoding="utf-8")
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("name", NAMES)
-def test_reader(name: str, targets: dict[str, Target]) -> None:
+def test_reader(name: str, targets: dict[str, Target], rows: list[str]) -> None:
     target = targets[name]
     for seed in target.seeds:
         assert is_read(target, target.wrap(seed), name), "the starting points themselves are good"
@@ -63,6 +76,7 @@ def test_reader(name: str, targets: dict[str, Target]) -> None:
         accepted += is_read(target, data, f"{name}, case {case}")
         slowest = max(slowest, time.monotonic() - begin)
         assert slowest < SECONDS, f"{name}, case {case} took {slowest:.1f} s"
+    rows.append(f"| {name} | {cases:,} | {accepted:,} | {cases - accepted:,} | {1000 * slowest:.0f} |")
     print(f"{name}: {cases} files, {accepted} read, {cases - accepted} refused, slowest {1000 * slowest:.0f} ms")
 
 

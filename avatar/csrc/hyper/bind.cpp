@@ -100,6 +100,7 @@ void bind_hyper(nb::module_& m) {
             check_shape("cells", cells, {N, 4});
             check_shape("weights", weights, {N, 4});
             check_shape("out", out, {N, n});
+            avatar::check_indices("cells", cells, G.value);
             avatar::check_threads(threads);
             const Kernels& kernels = select_kernels(simd.c_str());
             const Corners corners{cells.data(), weights.data()};
@@ -121,7 +122,8 @@ void bind_hyper(nb::module_& m) {
             check_shape("begins", begins, {G.value + 1});
             check_shape("gaussians", gaussians, {corners});
             check_shape("weights", weights, {corners});
-            avatar::check_within("the last value of begins", begins.data()[G.value], corners.value, corners.value);
+            avatar::check_begins("begins", begins, corners.value);
+            avatar::check_indices("gaussians", gaussians, N.value);
             avatar::check_threads(threads);
             const Kernels& kernels = select_kernels(simd.c_str());
             const Touching touching{begins.data(), gaussians.data(), weights.data()};

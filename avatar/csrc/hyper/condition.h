@@ -10,7 +10,7 @@
 // A lane is a Gaussian. kBlock of them lie side by side in the parameters, so that all heads of a block are one stream of
 // rows through memory, read and written without a shuffle; latents and offsets, which others use too, are transposed on
 // the way. Included only by kernels.cpp.
-#include "hyper/exponential.h"
+#include "exponential.h"
 #include "hyper/kernels.h"
 
 namespace avatar::hyper {
@@ -70,7 +70,7 @@ template <int M>
 inline void solve_upper(const float* lower, Floats* s) {
     for (int i = M - 1; i >= 0; --i) {
         for (int j = i + 1; j < M; ++j) s[i] -= row(lower, lower_row(j, i)) * s[j];
-        s[i] *= exponential(-row(lower, lower_row(i, i)));
+        s[i] *= exponential_unfused(-row(lower, lower_row(i, i)));
     }
 }
 
@@ -123,7 +123,7 @@ inline void solve_lower(const float* lower, const float* x, Floats* g, float* gr
     for (int i = 0; i < M; ++i) {
         Floats residual = -g[i];  // w times the diagonal
         for (int j = 0; j < i; ++j) residual -= row(lower, lower_row(i, j)) * g[j];
-        g[i] = residual * exponential(-row(lower, lower_row(i, i)));
+        g[i] = residual * exponential_unfused(-row(lower, lower_row(i, i)));
         if constexpr (kParameters) {
             const Floats of_x = -row(x, i);
             for (int j = 0; j < i; ++j) set_row(grad_lower, lower_row(i, j), of_x * g[j]);

@@ -1,22 +1,12 @@
 #pragma once
 // The folded heads: one affine map of the latent for each Gaussian. Included only by kernels.cpp.
-#include <cstring>
-
 #include "hyper/kernels.h"
+#include "simd.h"
 
 namespace avatar::hyper {
 namespace {
 
-// Four floats, which every instruction set has. With wider ones a Gaussian's ten values fit no better.
-typedef float Four __attribute__((vector_size(16)));
-
-inline Four load_four(const float* p) {
-    Four v;
-    std::memcpy(&v, p, sizeof v);
-    return v;
-}
-inline void store_four(float* p, Four v) { std::memcpy(p, &v, sizeof v); }
-
+// In vectors of four floats, which every instruction set has: with wider ones a Gaussian's ten values fit no better.
 void apply(const float* matrix, const float* bias, const float* latents, std::int64_t n, std::int64_t begin,
            std::int64_t end, float* out) {
     for (std::int64_t g = begin; g < end; ++g) {

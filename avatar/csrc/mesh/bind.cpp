@@ -18,6 +18,7 @@ void bind_mesh(nb::module_& m) {
             check_shape("face_id", face_id, {H, W});
             check_shape("barycentric", barycentric, {H, W, 3});
             check_shape("depth", depth, {H, W});
+            avatar::check_indices("faces", faces, V.value);
             const nb::gil_scoped_release unlocked;
             avatar::rasterize_mesh(screen.data(), faces.data(), F.value, H.as_int(), W.as_int(), face_id.data(),
                                    barycentric.data(), depth.data());

@@ -8,7 +8,7 @@ namespace avatar {
 // face -1 and zeros. Ties in depth go to the lower face index, so the result does not depend on anything but the input.
 //
 //   screen  [vertices * 3]  x and y in pixels, z depth (> 0); barycentrics are perspective-correct in z
-//   faces   [num_faces * 3] vertex indices, already checked to be in range
+//   faces   [num_faces * 3] vertex indices, in range
 //   face_id [height * width], barycentric [height * width * 3], depth [height * width]  outputs
 void rasterize_mesh(const float* screen, const std::int32_t* faces, std::int64_t num_faces, int height, int width,
                     std::int32_t* face_id, float* barycentric, float* depth);

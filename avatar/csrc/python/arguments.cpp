@@ -22,6 +22,13 @@ Lend find_lender(PyTypeObject* type) noexcept {
     return table != nullptr && table->major == 1 ? table->lend : nullptr;
 }
 
+template <typename T>
+std::int64_t size_of(const Array<T>& array) {
+    std::size_t size = 1;
+    for (std::size_t axis = 0; axis < array.ndim(); ++axis) size *= array.shape(axis);
+    return static_cast<std::int64_t>(size);
+}
+
 }  // namespace
 
 Lend lender_of(PyTypeObject* type) noexcept {
@@ -47,6 +54,30 @@ bool is_in_c_order(const nanobind::dlpack::dltensor& tensor) noexcept {
         expected *= tensor.shape[axis];
     }
     return ordered;
+}
+
+void check_indices(const std::string& name, const Array<const std::int32_t>& indices, std::int64_t rows) {
+    const std::int64_t size = size_of(indices);
+    const auto limit = static_cast<std::uint32_t>(rows);  // fits: check_shape lets no more through
+    const auto is_wrong = [&](std::int64_t i) { return static_cast<std::uint32_t>(indices.data()[i]) >= limit; };
+    std::uint32_t any = 0;  // first without a branch, so that what is right is seen to be so in microseconds
+    for (std::int64_t i = 0; i < size; ++i) any |= is_wrong(i);
+    for (std::int64_t i = 0; any != 0 && i < size; ++i)
+        if (is_wrong(i))
+            throw std::invalid_argument(name + " has the index " + std::to_string(indices.data()[i]) + " as value " +
+                                        std::to_string(i) + ", but there are " + std::to_string(rows) + " rows");
+}
+
+void check_begins(const std::string& name, const Array<const std::int64_t>& begins, std::int64_t end) {
+    const std::int64_t size = size_of(begins);
+    std::int64_t before = 0;
+    for (std::int64_t i = 0; i < size; ++i) {
+        if (begins.data()[i] < before || begins.data()[i] > end)
+            throw std::invalid_argument(name + " must rise within 0 to " + std::to_string(end) + ", but value " +
+                                        std::to_string(i) + " is " + std::to_string(begins.data()[i]));
+        before = begins.data()[i];
+    }
+    check_within("the last value of " + name, before, end, end);
 }
 
 }  // namespace avatar

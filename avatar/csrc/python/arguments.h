@@ -11,8 +11,8 @@
 #include <vector>
 
 // What the compiled functions demand of their arguments, so that none can read or write beyond an array. The order of its
-// values, its type and its device are demanded by the type Array; ranks and sizes here, in the words of avatar/check.py.
-// Indices that arrays hold are not looked at again: who makes them in Python keeps them in range.
+// values, its type and its device are demanded by the type Array; ranks, sizes and the range of indices here, in the words
+// of avatar/check.py.
 namespace avatar {
 
 // An array in C order on the CPU that a caller lends for the time of a call.
@@ -104,6 +104,12 @@ inline void check_within(const std::string& name, std::int64_t value, std::int64
     const std::string range = low == high ? std::to_string(low) : std::to_string(low) + " to " + std::to_string(high);
     throw std::invalid_argument(name + " must be " + range + ", got " + std::to_string(value));
 }
+
+// Of indices into the first axis of something with so many rows.
+void check_indices(const std::string& name, const Array<const std::int32_t>& indices, std::int64_t rows);
+
+// Of the places where one part after the other begins, the last one ending at `end`.
+void check_begins(const std::string& name, const Array<const std::int64_t>& begins, std::int64_t end);
 
 inline void check_threads(int threads) { check_within("threads", threads, 1, 1024); }  // as avatar/native.py
 

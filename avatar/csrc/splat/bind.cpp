@@ -96,7 +96,7 @@ void bind_splat(nb::module_& m) {
             const int sh_degree = drawing.view.settings.sh_degree;
             const Camera& camera = drawing.view.camera;
             check_gaussians("", means, quats, scales, opacities, sh, sh_degree, N, K);
-            const auto drawn = static_cast<std::int64_t>(drawing.rank_of.size());
+            const auto drawn = static_cast<std::int64_t>(drawing.lists.slot_begin.size()) - 1;
             avatar::check_within("the number of Gaussians", N.value, drawn, drawn);
             check_gaussians("grad_", grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, sh_degree, N, K);
             check_shape("grad_background", grad_background, {3});

@@ -3,13 +3,12 @@
 
 #include "splat/scene.h"
 
-// Compositing of the tiles, forward and backward. The kernels are compiled for several instruction sets and chosen when
-// the program runs.
+// Compositing of the tiles, forward and backward: what the kernels (kernels.h) take and give.
 namespace avatar::splat {
 
 // What both directions read.
 struct Raster {
-    const Splat* splats;
+    const Splat* splats;  // [N]
     const Pair* pairs;
     const std::int64_t* tile_begin;
     TileGrid grid;
@@ -20,41 +19,28 @@ struct Raster {
 
 // What drawing one tile took; see Counts in splat.h.
 struct TileCounts {
-    std::int64_t pixels_evaluated, pixels_composited;
+    std::int64_t pairs_processed, pixels_evaluated, pixels_composited;
     std::int32_t blocks, blocks_stopped;
 };
 
-// The kernels work on blocks of as many pixels as a vector has lanes; at least 4.
-constexpr int kMaxBlocks = kTilePixels / 4;
-constexpr int kNeverStops = 0x7fffffff;
+constexpr int kNeverStops = 0x7fffffff;  // a pair's number
 
-// The forward pass on a tile ends after `processed` pairs, when all its pairs are done or all its blocks have stopped.
-struct TileEnd {
-    std::uint32_t processed, stopped_blocks;
-};
-
-// All pixels of `block` have stopped when pair `at` of the tile, which none of them shows, has been looked at.
-struct BlockStop {
-    std::uint32_t at, block;
-};
+typedef unsigned long long Word;  // of a set of blocks, as bits
 
 // Written at the pixels of the region only.
 struct ForwardTarget {
-    float* image;               // [height * width * 3]
-    float* alpha;               // [height * width]
-    float* transmittance;       // [tiles * kTilePixels], in the kernels' own order, as is the next
-    int* stops;                 // the pair of the tile from which on the pixel shows none, 0 outside the region
-    TileEnd* ends;              // [tiles]
-    BlockStop* block_stops;     // [tiles * kMaxBlocks], the first `stopped_blocks` of each tile, by `at`
-    TileCounts* counts;         // [tiles]; written by count_tile only, as is the next
-    unsigned char* composited;  // [pairs], by slot: whether any pixel shows the splat
+    float* image;  // [height * width * 3]
+    float* alpha;  // [height * width]
+    // [tiles * 2 * kTilePixels], in the kernels' own order, the transmittance behind all splats, and the bits of a number:
+    // the pair of the tile from which on the pixel shows none, 0 outside the region.
+    float* ends;
+    Word* blocks;        // [pairs * Kernels::words] that were looked at; from count_tile: that show the splat
+    TileCounts* counts;  // [tiles]; written by count_tile only
 };
 
 struct BackwardSource {
-    const float* transmittance;
-    const int* stops;
-    const TileEnd* ends;
-    const BlockStop* block_stops;
+    const float* ends;
+    const Word* blocks;
     const float* grad_image;  // may be null
     const float* grad_alpha;  // may be null
 };
@@ -63,14 +49,5 @@ struct BackwardTarget {
     float* moments;           // [pairs * kMoments], by slot
     double* grad_background;  // [tiles * 3]
 };
-
-struct Kernels {
-    void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
-    void (*count_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);  // draws as forward_tile and counts
-    void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
-};
-
-// The kernels for a name that choose_instruction_set() takes.
-const Kernels& select_kernels(const char* name);
 
 }  // namespace avatar::splat

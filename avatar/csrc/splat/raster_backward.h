@@ -4,6 +4,34 @@
 namespace avatar::splat {
 namespace {
 
+// (u, v) at the pixels of a block.
+class Coordinates {
+public:
+    explicit Coordinates(const Local& s) : s_(s), u_lane_(s.u_lane()), v_lane_(s.v_lane()) {
+        store(first_row_, s.first_row_u());
+    }
+
+    Floats u(int block) const {
+        const int x = block % kBlocksAcross;
+        Floats first = s_.u(row_of(block), broadcast(first_row_[x % kLanes]));
+        if constexpr (kLanes < kBlocksAcross) first += s_.u_to_column(x - x % kLanes);
+        return first + u_lane_;
+    }
+    Floats v(int block) const { return s_.v(row_of(block)) + v_lane_; }
+
+private:
+    static Floats row_of(int block) {
+        static constexpr float numbers[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
+                                              16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
+        static_assert(kBlocksDown <= 32);
+        return broadcast(numbers[block / kBlocksAcross]);
+    }
+
+    const Local s_;
+    const Floats u_lane_, v_lane_;
+    alignas(64) float first_row_[kLanes];
+};
+
 // Back to front, from the last splat that each pixel shows. With g = dL/dcolour of a pixel, T_k the transmittance in
 // front of splat k and A = 1 - T_end the alpha output, splat k's alpha has the gradient
 //     T_k g.c_k - behind_k / (1 - alpha_k) = (T_{k+1} g.c_k - behind_k) / (1 - alpha_k),
@@ -12,76 +40,82 @@ namespace {
 // of about 1e-7 for each splat, however small it is: 1 - alpha is exact or nearly so, and t_min keeps T_end in range.
 void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& source, const BackwardTarget& target) {
     const TileArea area(r, tile);
-    alignas(64) float transmittance[kTilePixels], behind[kTilePixels] = {};
-    alignas(64) float grad_red[kTilePixels] = {}, grad_green[kTilePixels] = {}, grad_blue[kTilePixels] = {};
-    alignas(64) int stops[kTilePixels];
-    __builtin_memcpy(transmittance, source.transmittance + tile * kTilePixels, sizeof transmittance);
-    __builtin_memcpy(stops, source.stops + tile * kTilePixels, sizeof stops);
-
-    area.for_each_pixel(r.width, [&](int i, std::int64_t pixel) {
-        if (source.grad_image != nullptr) {
-            const float* g = source.grad_image + 3 * pixel;
-            grad_red[i] = g[0], grad_green[i] = g[1], grad_blue[i] = g[2];
+    enum { kTransmittance, kStops, kBehind, kGradient, kVectors = kGradient + 3 };
+    Pixels<kVectors> pixels;
+    const float* const ends = source.ends + tile * 2 * kTilePixels;
+    for (int block = 0; block < kBlocks; ++block) {
+        float* const p = pixels.of(block);
+        for (int k = 0; k < 2; ++k) store(p + k * kLanes, load_anywhere(ends + (2 * block + k) * kLanes));
+        for (int k = kBehind; k < kVectors; ++k) store(p + k * kLanes, Floats{});
+    }
+    area.for_each_row<kVectors>(r.width, [&](int i, std::int64_t pixel, int count) {
+        float *const gradient = pixels.values + i + kGradient * kLanes;
+        float *const behind = pixels.values + i + kBehind * kLanes;
+        if (source.grad_image != nullptr && count == 4) {
+            Four red, green, blue;
+            load_interleaved(source.grad_image + 3 * pixel, red, green, blue);
+            store_four(gradient, red);
+            store_four(gradient + kLanes, green);
+            store_four(gradient + 2 * kLanes, blue);
+        } else if (source.grad_image != nullptr) {
+            for (int k = 0; k < count; ++k)
+                for (int c = 0; c < 3; ++c) gradient[k + c * kLanes] = source.grad_image[3 * (pixel + k) + c];
         }
-        if (source.grad_alpha != nullptr) behind[i] = source.grad_alpha[pixel];
+        if (source.grad_alpha != nullptr)
+            for (int k = 0; k < count; ++k) behind[k] = source.grad_alpha[pixel + k];
     });
     Floats ground_red{}, ground_green{}, ground_blue{};
-    for (int i = 0; i < kTilePixels; i += kLanes) {
-        const Floats t = load(transmittance + i);
-        const Floats g_red = load(grad_red + i), g_green = load(grad_green + i), g_blue = load(grad_blue + i);
+    for (int block = 0; block < kBlocks; ++block) {
+        float* const p = pixels.of(block);
+        const Floats t = load(p + kTransmittance * kLanes), g_red = load(p + kGradient * kLanes),
+                     g_green = load(p + (kGradient + 1) * kLanes), g_blue = load(p + (kGradient + 2) * kLanes);
         ground_red = fma(t, g_red, ground_red);
         ground_green = fma(t, g_green, ground_green);
         ground_blue = fma(t, g_blue, ground_blue);
         const Floats g_ground = fma(g_red, broadcast(r.background[0]),
                                     fma(g_green, broadcast(r.background[1]), g_blue * broadcast(r.background[2])));
-        store(behind + i, t * (g_ground - load(behind + i)));
+        store(p + kBehind * kLanes, t * (g_ground - load(p + kBehind * kLanes)));
     }
     const Four ground = sums(ground_red, ground_green, ground_blue, ground_blue);
     for (int c = 0; c < 3; ++c) target.grad_background[3 * tile + c] = ground[c];
 
-    const TileEnd tile_end = source.ends[tile];
-    const BlockStop* block_stops = source.block_stops + tile * kMaxBlocks;
-    std::uint32_t stopped = tile_end.stopped_blocks;
-    Word alive[kWords];
-    area.blocks(alive);
-    for (std::uint32_t k = 0; k < stopped; ++k)
-        alive[block_stops[k].block / 64] &= ~(Word{1} << (block_stops[k].block % 64));
-
     const Floats alpha_min = broadcast(r.alpha_min), alpha_max = broadcast(r.alpha_max), one = broadcast(1.0f);
     const std::int64_t begin = r.tile_begin[tile], count = r.tile_begin[tile + 1] - begin;
-    for (std::int64_t at = count - 1; at >= tile_end.processed; --at) {
-        float* moments = target.moments + std::int64_t{r.pairs[begin + at].slot} * kMoments;
-        for (int k = 0; k < kMoments; ++k) moments[k] = 0.0f;
-    }
-    for (std::int64_t at = std::int64_t{tile_end.processed} - 1; at >= 0; --at) {
-        for (; stopped > 0 && block_stops[stopped - 1].at > at; --stopped) {
-            const std::uint32_t block = block_stops[stopped - 1].block;
-            alive[block / 64] |= Word{1} << (block % 64);
-        }
+    const Word* const blocks_of_pairs = source.blocks + begin * kWords;
+    for (std::int64_t at = count - 1; at >= 0; --at) {
         const Pair pair = r.pairs[begin + at];
+        float* const moments = target.moments + std::int64_t{pair.slot} * kMoments;
+        const Word* const blocks = blocks_of_pairs + at * kWords;
+        if (is_empty(blocks)) {
+            for (int k = 0; k < kMoments; ++k) moments[k] = 0.0f;
+            continue;
+        }
         if (at >= kAhead) __builtin_prefetch(r.splats + r.pairs[begin + at - kAhead].splat);
         const Splat& s = r.splats[pair.splat];
-        const SplatInTile splat(s, area);
-        const Floats s_red = broadcast(s.red), s_green = broadcast(s.green), s_blue = broadcast(s.blue);
+        const Coordinates coordinates(Local(s, area));
+        const Floats opacity = broadcast(s.opacity), s_red = broadcast(s.red), s_green = broadcast(s.green),
+                     s_blue = broadcast(s.blue);
         const Ints now = Ints{} + static_cast<int>(at);
         Floats moment[kMoments];
 #pragma GCC unroll 9
         for (int k = 0; k < kMoments; ++k) moment[k] = Floats{};  // not {}: GCC calls on a slow instruction for that
         for (int w = 0; w < kWords; ++w) {
-            for (Word bits = splat.blocks[w] & alive[w]; bits != 0; bits &= bits - 1) {
-                const int block = 64 * w + first_bit(bits), i = block * kLanes;
-                const Floats u = splat.u(block), v = splat.v(block);
-                const Floats falloff = SplatInTile::falloff(u, v), unclamped = splat.opacity * falloff;
+            for (Word bits = blocks[w]; bits != 0; bits &= bits - 1) {
+                const int block = 64 * w + first_bit(bits);
+                float* const p = pixels.of(block);
+                const Floats u = coordinates.u(block), v = coordinates.v(block);
+                const Floats falloff = falloff_at(u, v), unclamped = opacity * falloff;
                 const Floats clamped = min(unclamped, alpha_max);
-                const Ints drawn = (clamped >= alpha_min) & (now < load(stops + i));
+                const Ints drawn = (clamped >= alpha_min) & (now < (Ints)load(p + kStops * kLanes));
                 const Floats alpha = (Floats)((Ints)clamped & drawn);
-                const Floats g_red = load(grad_red + i), g_green = load(grad_green + i), g_blue = load(grad_blue + i);
+                const Floats g_red = load(p + kGradient * kLanes), g_green = load(p + (kGradient + 1) * kLanes),
+                             g_blue = load(p + (kGradient + 2) * kLanes);
                 const Floats g_colour = fma(g_red, s_red, fma(g_green, s_green, g_blue * s_blue));
 
-                const Floats pass = one / (one - alpha), after = load(transmittance + i), before = after * pass;
-                const Floats shown = before * alpha, hidden = load(behind + i);
-                store(transmittance + i, before);
-                store(behind + i, fma(shown, g_colour, hidden));
+                const Floats pass = one / (one - alpha), after = load(p), before = after * pass;
+                const Floats shown = before * alpha, hidden = load(p + kBehind * kLanes);
+                store(p, before);
+                store(p + kBehind * kLanes, fma(shown, g_colour, hidden));
                 const Floats grad_alpha = pass * fma(after, g_colour, -hidden);
                 const Floats weight = (Floats)((Ints)(grad_alpha * falloff) & drawn & (unclamped <= alpha_max));
 
@@ -97,7 +131,6 @@ void backward_tile(const Raster& r, std::int64_t tile, const BackwardSource& sou
                 moment[kBlue] = fma(shown, g_blue, moment[kBlue]);
             }
         }
-        float* moments = target.moments + std::int64_t{pair.slot} * kMoments;
         for (int k = 0; k + 4 <= kMoments; k += 4) {
             const Four four = sums(moment[k], moment[k + 1], moment[k + 2], moment[k + 3]);
             __builtin_memcpy(moments + k, &four, sizeof four);

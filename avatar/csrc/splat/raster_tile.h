@@ -1,8 +1,8 @@
 #pragma once
 // What the forward and the backward kernel share: the pixels of a tile, and the alpha of a splat at them. Both
 // directions must make the same decisions (skipped, drawn) to the last bit, so both get them here.
+#include "exponential.h"
 #include "splat/raster.h"
-#include "simd.h"
 
 namespace avatar::splat {
 namespace {
@@ -13,18 +13,17 @@ constexpr int kBlockWidth = 4, kBlockHeight = kLanes / kBlockWidth;
 constexpr int kBlocksAcross = kTileWidth / kBlockWidth, kBlocksDown = kTileHeight / kBlockHeight;
 constexpr int kBlocks = kBlocksAcross * kBlocksDown;
 constexpr int kWords = kBlocks / 64;  // sets of blocks are kept as bits
-static_assert(kBlocksAcross == 8 && kLanes <= 2 * kBlocksAcross && kBlocks % 64 == 0 && kBlocks <= kMaxBlocks);
-
-// The per-pixel arrays of a tile hold block after block, rows of blocks from the top.
-inline int pixel_at(int row, int column) {
-    const int block = row / kBlockHeight * kBlocksAcross + column / kBlockWidth;
-    return block * kLanes + row % kBlockHeight * kBlockWidth + column % kBlockWidth;
-}
+static_assert(kBlocksAcross == 8 && kLanes <= 2 * kBlocksAcross && kBlocks % 64 == 0);
 
 constexpr int kAhead = 4;  // pairs, for which a splat is fetched before it is needed: they lie all over the memory
 
-typedef unsigned long long Word;
 inline int first_bit(Word bits) { return __builtin_ctzll(bits); }
+
+inline bool is_empty(const Word set[kWords]) {
+    Word any = 0;
+    for (int w = 0; w < kWords; ++w) any |= set[w];
+    return any == 0;
+}
 
 struct TileArea {
     TileArea(const Raster& r, std::int64_t tile)
@@ -41,14 +40,6 @@ struct TileArea {
         return first_column == 0 && first_row == 0 && end_column == kTileWidth && end_row == kTileHeight;
     }
 
-    // Calls visit(index in the tile's arrays, index in the image) for the pixels of the region.
-    template <typename Visit>
-    void for_each_pixel(std::int64_t image_width, const Visit& visit) const {
-        for (int row = first_row; row < end_row; ++row)
-            for (int column = first_column; column < end_column; ++column)
-                visit(pixel_at(row, column), (top + row) * image_width + left + column);
-    }
-
     // The blocks that have a pixel in the region.
     void blocks(Word set[kWords]) const {
         const Word columns = (2u << ((end_column - 1) / kBlockWidth)) - (1u << (first_column / kBlockWidth));
@@ -57,70 +48,60 @@ struct TileArea {
             set[y * kBlocksAcross / 64] |= columns << (y * kBlocksAcross % 64);
     }
 
+    // Calls visit(i, pixel, count) for every row of a block that has `count` pixels in the region: where the block's first
+    // vector (see Pixels) has the first of them, and its index in the image.
+    template <int kVectors, typename Visit>
+    void for_each_row(std::int64_t image_width, const Visit& visit) const {
+        for (int row = first_row; row < end_row; ++row) {
+            const int blocks = row / kBlockHeight * kBlocksAcross, lane = row % kBlockHeight * kBlockWidth;
+            for (int x = first_column / kBlockWidth; x * kBlockWidth < end_column; ++x) {
+                const int column = x * kBlockWidth, first = first_column > column ? first_column : column;
+                const int end = end_column < column + kBlockWidth ? end_column : column + kBlockWidth;
+                visit((blocks + x) * kVectors * kLanes + lane + first - column,
+                      (top + row) * image_width + left + first, end - first);
+            }
+        }
+    }
+
     int left, top;                                     // of the tile in the image
     int first_column, first_row, end_column, end_row;  // the part of the tile inside the region
 };
 
-// One splat as seen from one tile.
-struct SplatInTile {
-    Floats opacity;
-    Floats u_lane, v_lane;  // (u, v) of a pixel is that of its block's first pixel plus that of its lane
-    alignas(64) float u_block[kBlocks], v_block[kBlocks];
-    Word blocks[kWords];  // those that may have a pixel where alpha reaches alpha_min
+// Some vectors for each block of a tile while it is worked on, those of a block side by side. Rows of blocks are stored
+// from the top.
+template <int kVectors>
+struct alignas(64) Pixels {
+    float values[kVectors * kTilePixels];
 
-    SplatInTile(const Splat& s, const TileArea& area) {
+    float* of(int block) { return values + block * kVectors * kLanes; }
+};
+
+// One splat as seen from one tile: (u, v) of a pixel is (u0 + a d_x + b d_y, v0 + c d_y) at distance d from the centre
+// of the tile's first pixel. That is found in two steps, for the first pixel of the pixel's block and from there.
+struct Local {
+    Local(const Splat& s, const TileArea& area) : a(float(s.a)), b(float(s.b)), c(float(s.c)) {
         const double dx = area.left + 0.5 - s.x, dy = area.top + 0.5 - s.y;
-        const float a = float(s.a), b = float(s.b), c = float(s.c);
-        opacity = broadcast(s.opacity);
-        u_lane = fma(broadcast(b), lane_rows(), broadcast(a) * lane_columns());
-        v_lane = broadcast(c) * lane_rows();
-
-        // The ranges of u and v in a block (a and c are above 0), and their values nearest to the splat's centre.
-        const float b_height = b * (kBlockHeight - 1);
-        const Floats u_less = broadcast(b_height < 0.0f ? b_height : 0.0f);
-        const Floats u_more = broadcast(a * (kBlockWidth - 1) + (b_height > 0.0f ? b_height : 0.0f));
-        const Floats v_more = broadcast(c * (kBlockHeight - 1));
-        const Floats b_step = broadcast(b * kBlockHeight), c_step = broadcast(c * kBlockHeight);
-        const Floats u0 = broadcast(float(s.a * dx + s.b * dy)), v0 = broadcast(float(s.c * dy));
-        const Floats reach = broadcast(s.reach), zero{};
-        for (int w = 0; w < kWords; ++w) blocks[w] = 0;
-        const Floats u_first = fma(broadcast(a * kBlockWidth), remainders(kBlocksAcross), u0);
-        const auto test_rows = [&](int row) {  // this row of blocks, and the next where a vector holds two
-            const Floats y = quotients(kBlocksAcross) + broadcast(float(row));
-            const Floats v = fma(c_step, y, v0), nearest_v = max(v, zero) + min(v + v_more, zero);
-            for (int column = 0; column < kBlocksAcross; column += kLanes) {
-                const int block = row * kBlocksAcross + column;
-                const Floats u = fma(b_step, y, u_first) + broadcast(a * (kBlockWidth * column));
-                store(u_block + block, u);
-                store(v_block + block, v);
-                const Floats nearest_u = max(u + u_less, zero) + min(u + u_more, zero);
-                const Ints reached = fma(nearest_u, nearest_u, nearest_v * nearest_v) <= reach;
-                blocks[block / 64] |= Word(signs(reached)) << (block % 64);
-            }
-        };
-        if (kLanes > kBlocksAcross) {
-            for (int row = 0; row < kBlocksDown; row += 2) test_rows(row);
-        } else {
-            Word rows = 0;  // by v alone: most splats are much smaller than a tile
-            for (int y = 0; y < kBlocksDown; y += kLanes) {
-                const Floats v = fma(c_step, remainders(kLanes) + broadcast(float(y)), v0);
-                const Floats nearest_v = max(v, zero) + min(v + v_more, zero);
-                rows |= Word(signs(nearest_v * nearest_v <= reach)) << y;
-            }
-            for (; rows != 0; rows &= rows - 1) test_rows(first_bit(rows));
-        }
+        u0 = float(s.a * dx + s.b * dy);
+        v0 = float(s.c * dy);
     }
 
-    Floats u(int block) const { return broadcast(u_block[block]) + u_lane; }
-    Floats v(int block) const { return broadcast(v_block[block]) + v_lane; }
+    // At the first pixels of blocks in these rows. The first row's u is that of as many columns as a vector has lanes.
+    Floats first_row_u() const { return fma(broadcast(a * kBlockWidth), remainders(kBlocksAcross), broadcast(u0)); }
+    Floats u(Floats row, Floats first_row) const { return fma(broadcast(b * kBlockHeight), row, first_row); }
+    Floats u_to_column(int column) const { return broadcast(a * float(kBlockWidth * column)); }
+    Floats v(Floats row) const { return fma(broadcast(c * kBlockHeight), row, broadcast(v0)); }
 
-    // Times the opacity it is the alpha before clamping.
-    static Floats falloff(Floats u, Floats v) { return exp2_negative(fma(-u, u, -(v * v))); }
+    // What is added in the lanes of a block.
+    Floats u_lane() const {
+        return fma(broadcast(b), quotients(kBlockWidth), broadcast(a) * remainders(kBlockWidth));
+    }
+    Floats v_lane() const { return broadcast(c) * quotients(kBlockWidth); }
 
-private:
-    static Floats lane_columns() { return remainders(kBlockWidth); }
-    static Floats lane_rows() { return quotients(kBlockWidth); }
+    float a, b, c, u0, v0;
 };
+
+// Times the opacity it is the alpha before clamping.
+inline Floats falloff_at(Floats u, Floats v) { return exp2_negative(fma(-u, u, -(v * v))); }
 
 }  // namespace
 }  // namespace avatar::splat

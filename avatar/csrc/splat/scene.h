@@ -46,7 +46,7 @@ struct Settings {
 
 constexpr double kHalfLog2E = 0.72134752044448170368;  // log2(e) / 2
 
-// A visible Gaussian on the image plane; one cache line.
+// A visible Gaussian on the image plane; one line of the caches.
 //
 // With d = pixel - (x, y), u = a d_x + b d_y and v = c d_y, the splat's alpha is opacity * 2^-(u^2 + v^2): (a, b; 0, c)
 // is the Cholesky-type factor of the inverse covariance, times sqrt(kHalfLog2E). Squares of whitened coordinates do
@@ -58,11 +58,11 @@ struct Splat {
     float opacity;
     float reach;  // alpha can reach alpha_min only where u^2 + v^2 <= reach; rounded up, infinite for alpha_min = 0
     float red, green, blue;
-    std::uint32_t index;  // of the Gaussian
+    float unused;
 };
 static_assert(sizeof(Splat) == 64);
 
-// One splat in one tile. `slot` counts the pairs splat by splat, front to back, so that all pairs of a splat are
+// One splat, by its Gaussian, in one tile. `slot` counts the pairs Gaussian by Gaussian, so that all pairs of a splat are
 // adjacent there: where the backward pass leaves what it finds, to be summed in a fixed order.
 struct Pair {
     std::uint32_t splat, slot;

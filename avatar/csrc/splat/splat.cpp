@@ -2,7 +2,8 @@
 
 #include <algorithm>
 #include <atomic>
-#include <cstring>
+#include <numeric>
+#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -11,33 +12,20 @@
 namespace avatar::splat {
 namespace {
 
-// 8 bytes a pair in the forward pass and 36 more in the backward pass: 3 GB at most.
+// 12 bytes and a set of blocks, of 8 to 32 bytes, a pair in the forward pass and 36 more in the backward pass: 6 GB at most.
 constexpr std::int64_t kMaxPairs = std::int64_t{1} << 26;
-constexpr std::int64_t kGrain = 256;  // Gaussians handed to a thread at a time
-constexpr std::int64_t kAhead = 8;    // Gaussians, for which moments are fetched early: they lie by depth
 constexpr std::int64_t kRows = 64;    // rows of the image handed to a thread at a time
 
-bool all_finite(const float* values, std::int64_t count) {
-    // On the bits, so that it is vectorised and cannot be optimised away.
-    std::uint32_t bad = 0;
-    for (std::int64_t i = 0; i < count; ++i) {
-        std::uint32_t bits;
-        std::memcpy(&bits, values + i, sizeof bits);
-        bad |= (bits & 0x7f800000u) == 0x7f800000u ? 1u : 0u;
-    }
-    return bad == 0;
-}
-
-bool all_finite(const Gaussians& g, std::int64_t begin, std::int64_t end) {
+bool all_finite(const Kernels& kernels, const Gaussians& g, std::int64_t begin, std::int64_t end) {
     const std::int64_t count = end - begin, sh = 3 * static_cast<std::int64_t>(g.coefficients);
-    return all_finite(g.means + 3 * begin, 3 * count) && all_finite(g.quats + 4 * begin, 4 * count) &&
-           all_finite(g.scales + 3 * begin, 3 * count) && all_finite(g.opacities + begin, count) &&
-           all_finite(g.sh + sh * begin, sh * count);
+    return kernels.all_finite(g.means + 3 * begin, 3 * count) && kernels.all_finite(g.quats + 4 * begin, 4 * count) &&
+           kernels.all_finite(g.scales + 3 * begin, 3 * count) && kernels.all_finite(g.opacities + begin, count) &&
+           kernels.all_finite(g.sh + sh * begin, sh * count);
 }
 
 Raster raster_of(const Drawing& d) {
     const Settings& settings = d.view.settings;
-    return {d.splats.data(),
+    return {d.splats.get(),
             d.lists.pairs.get(),
             d.lists.tile_begin.data(),
             TileGrid(d.view.region),
@@ -90,78 +78,94 @@ void add_outside(const Drawing& drawing, const float* grad_image, double grad_ba
     for (std::size_t i = 0; i < rows.size(); ++i) grad_background[i % 3] += rows[i];
 }
 
-void count_hidden(const std::vector<Visibility>& visibility, Counts& counts) {
+void count_drawing(const Drawing& drawing, const std::vector<Visibility>& visibility,
+                   const std::vector<TileCounts>& tile_counts, Counts& counts) {
     constexpr Visibility reasons[4] = {Visibility::kTransparent, Visibility::kNear, Visibility::kFlat,
                                        Visibility::kOutside};
     for (int k = 0; k < 4; ++k) counts.hidden[k] = std::count(visibility.begin(), visibility.end(), reasons[k]);
-}
-
-void count_drawing(const Drawing& drawing, const std::vector<TileCounts>& tile_counts,
-                   const std::vector<unsigned char>& composited, Counts& counts) {
+    counts.visible = std::count(visibility.begin(), visibility.end(), Visibility::kVisible);
     const TileLists& lists = drawing.lists;
-    counts.visible = static_cast<std::int64_t>(drawing.splats.size());
-    for (std::int64_t i = 0; i < counts.visible; ++i) {
-        const auto begin = composited.begin() + lists.slot_begin[i], end = composited.begin() + lists.slot_begin[i + 1];
-        counts.without_effect += std::find(begin, end, 1) == end;
+    const TileGrid grid(drawing.view.region);
+    std::vector<bool> shown(visibility.size());
+    const std::int64_t words = drawing.kernels->words;
+    for (std::int64_t k = 0; k < lists.pair_count; ++k)
+        for (std::int64_t w = 0; w < words; ++w)
+            if (drawing.blocks[k * words + w] != 0) shown[lists.pairs[k].splat] = true;
+    counts.without_effect = counts.visible - std::count(shown.begin(), shown.end(), true);
+    for (std::size_t i = 0; i < visibility.size(); ++i) {
+        if (visibility[i] != Visibility::kVisible) continue;
+        counts.pairs_in_boxes += tiles_of_box(drawing.splats[i], grid);
+        counts.pairs_in_squares += tiles_of_square(drawing.splats[i], grid);
     }
     counts.tiles = static_cast<std::int64_t>(tile_counts.size());
-    for (std::int64_t tile = 0; tile < counts.tiles; ++tile) {
-        const TileCounts& t = tile_counts[tile];
+    for (const TileCounts& t : tile_counts) {
         counts.tiles_stopped += t.blocks == t.blocks_stopped;
         counts.blocks += t.blocks;
         counts.blocks_stopped += t.blocks_stopped;
-        counts.pairs_processed += drawing.ends[tile].processed;
+        counts.pairs_processed += t.pairs_processed;
         counts.pixels_evaluated += t.pixels_evaluated;
         counts.pixels_composited += t.pixels_composited;
     }
     counts.pairs = lists.pair_count;
-    const TileGrid grid(drawing.view.region);
-    for (const Splat& splat : drawing.splats) {
-        counts.pairs_in_boxes += tiles_of_box(splat, grid);
-        counts.pairs_in_squares += tiles_of_square(splat, grid);
-    }
 }
 
-// Projects all Gaussians and keeps the visible ones in depth order. False when an input is not finite.
-bool project_all(const Gaussians& gaussians, Drawing& drawing, Counts* counts) {
-    const std::int64_t count = gaussians.count;
-    const std::unique_ptr<Splat[]> projected(new Splat[count]);
-    std::vector<double> depths(count);
+std::vector<std::uint32_t> tiles_in(const TileSpans* spans_of, std::int64_t count, std::int64_t tile_count) {
+    std::vector<std::uint32_t> tiles(tile_count);
+    std::uint32_t* next = tiles.data();
+    for (std::int64_t i = 0; i < count; ++i)
+        for (std::uint32_t k = 0; k < spans_of[i].count; ++k)
+            for (std::uint32_t tile = spans_of[i].spans[k].first; tile <= spans_of[i].spans[k].last; ++tile)
+                *next++ = tile;
+    return tiles;
+}
+
+// Projects all Gaussians and makes the tile lists of the visible ones, whose visibility it gives. Empty when an input is
+// not finite.
+std::optional<std::vector<Visibility>> project_all(const Gaussians& gaussians, Drawing& drawing) {
+    const std::int64_t count = gaussians.count, ranges = (count + kRange - 1) / kRange;
+    const Kernels& kernels = *drawing.kernels;
+    const TileGrid grid(drawing.view.region);
+    TileLists& lists = drawing.lists;
+    drawing.splats.reset(new Splat[count]);  // not initialised, as the next: written where they are read
+    const std::unique_ptr<double[]> depths(new double[count]);
     std::vector<Visibility> visibility(count);
-    std::atomic<bool> finite{all_finite(drawing.background, 3)};
-    parallel_for(drawing.threads, count, kGrain, [&](std::int64_t begin, std::int64_t end) {
-        if (!all_finite(gaussians, begin, end)) {
+    lists.slot_begin.resize(count + 1);
+    std::vector<std::vector<std::uint32_t>> tiles_of(ranges);
+    std::atomic<std::int64_t> kept{0};  // pairs whose tiles are
+    std::atomic<bool> finite{kernels.all_finite(drawing.background, 3)};
+    parallel_for(drawing.threads, count, kRange, [&](std::int64_t begin, std::int64_t end) {
+        if (!all_finite(kernels, gaussians, begin, end)) {
             finite = false;
             return;
         }
-        for (std::int64_t i = begin; i < end; ++i) {
-            visibility[i] = project(drawing.view, gaussians, i, projected[i], depths[i]);
-            projected[i].index = static_cast<std::uint32_t>(i);
-        }
+        SpanStore store;
+        TileSpans spans[kRange];
+        std::uint32_t* const pairs_of = lists.slot_begin.data() + 1;
+        kernels.project(drawing.view, gaussians, begin, end,
+                        {grid, drawing.splats.get(), depths.get(), visibility.data(), spans, pairs_of, SpanStore::take,
+                         &store});
+        const std::int64_t pairs = std::accumulate(pairs_of + begin, pairs_of + end, std::int64_t{0});
+        if (kept.fetch_add(pairs) + pairs > kMaxPairs) return;  // refused below: only their number still matters
+        tiles_of[begin / kRange] = tiles_in(spans, end - begin, pairs);
     });
-    if (!finite) return false;
+    if (!finite) return std::nullopt;
 
-    std::vector<double> visible_depths;
-    std::vector<std::uint32_t> visible;
-    visible.reserve(count);
-    visible_depths.reserve(count);
+    std::int64_t pairs = 0;
     for (std::int64_t i = 0; i < count; ++i) {
         if (visibility[i] == Visibility::kColourOverflow)
             throw std::invalid_argument("sh gives splat " + std::to_string(i) +
                                         " a colour beyond the range of float32");
-        if (visibility[i] != Visibility::kVisible) continue;
-        visible.push_back(static_cast<std::uint32_t>(i));
-        visible_depths.push_back(depths[i]);
+        pairs += lists.slot_begin[i + 1];
+        lists.slot_begin[i + 1] = static_cast<std::uint32_t>(pairs);
     }
-    if (counts != nullptr) count_hidden(visibility, *counts);
-    const std::vector<std::uint32_t> order = depth_order(visible_depths);
-    drawing.splats.resize(order.size());
-    drawing.rank_of.assign(count, -1);
-    for (std::size_t rank = 0; rank < order.size(); ++rank) {
-        drawing.splats[rank] = projected[visible[order[rank]]];
-        drawing.rank_of[visible[order[rank]]] = static_cast<std::int32_t>(rank);
-    }
-    return true;
+    if (pairs > kMaxPairs)
+        throw std::length_error("drawing needs " + std::to_string(pairs) + " pairs of a tile of " +
+                                std::to_string(kTileWidth) + "x" + std::to_string(kTileHeight) +
+                                " pixels and a splat, the limit is " + std::to_string(kMaxPairs) +
+                                "; are the scales too large for this camera?");
+    const std::vector<std::uint32_t> order = depth_order(depths.get(), visibility.data(), count);
+    fill_tile_lists(order, tiles_of, grid, drawing.threads, lists);
+    return visibility;
 }
 
 }  // namespace
@@ -176,37 +180,26 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                                  {},
                                                  {},
                                                  {},
-                                                 {},
-                                                 {},
-                                                 {},
                                                  {}});
-    if (!project_all(gaussians, *drawing, counts)) return nullptr;
-    const auto visible = static_cast<std::int64_t>(drawing->splats.size());
-    const TileGrid grid(region);
-    drawing->lists = build_tile_lists(drawing->splats.data(), visible, grid, kMaxPairs, threads);
+    const std::optional<std::vector<Visibility>> visibility = project_all(gaussians, *drawing);
+    if (!visibility) return nullptr;
 
-    const std::int64_t tiles = grid.count();
+    const std::int64_t tiles = TileGrid(region).count();
     // Not initialised: the kernels write all that they read.
-    drawing->transmittance.reset(new float[tiles * kTilePixels]);
-    drawing->stops.reset(new int[tiles * kTilePixels]);
-    drawing->ends.reset(new TileEnd[tiles]);
-    drawing->block_stops.reset(new BlockStop[tiles * kMaxBlocks]);
+    drawing->ends.reset(new float[tiles * 2 * kTilePixels]);
+    drawing->blocks.reset(new Word[drawing->lists.pair_count * kernels.words]);
     const Raster raster = raster_of(*drawing);
     std::vector<TileCounts> tile_counts(counts != nullptr ? tiles : 0);
-    std::vector<unsigned char> composited(counts != nullptr ? drawing->lists.pair_count : 0, 0);
     const ForwardTarget target{image,
                                alpha,
-                               drawing->transmittance.get(),
-                               drawing->stops.get(),
                                drawing->ends.get(),
-                               drawing->block_stops.get(),
-                               tile_counts.data(),
-                               composited.data()};
+                               drawing->blocks.get(),
+                               tile_counts.data()};
     const auto draw_tile = counts != nullptr ? kernels.count_tile : kernels.forward_tile;
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t k = begin; k < end; ++k) draw_tile(raster, drawing->lists.tile_order[k], target);
     });
-    if (counts != nullptr) count_drawing(*drawing, tile_counts, composited, *counts);
+    if (counts != nullptr) count_drawing(*drawing, *visibility, tile_counts, *counts);
     if (!is_whole_image(drawing->view)) draw_outside(*drawing, image, alpha);
     return drawing;
 }
@@ -218,8 +211,8 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
     std::vector<double> tile_backgrounds(3 * tiles);
     const Raster raster = raster_of(drawing);
-    const BackwardSource source{drawing.transmittance.get(), drawing.stops.get(), drawing.ends.get(),
-                                drawing.block_stops.get(),   grad_image,          grad_alpha};
+    const BackwardSource source{drawing.ends.get(), drawing.blocks.get(), grad_image,
+                                grad_alpha};
     const BackwardTarget target{moments.get(), tile_backgrounds.data()};
     parallel_for(drawing.threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t k = begin; k < end; ++k)
@@ -231,29 +224,9 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     if (grad_image != nullptr && !is_whole_image(drawing.view)) add_outside(drawing, grad_image, total);
     for (int c = 0; c < 3; ++c) grad_background[c] = static_cast<float>(total[c]);
 
-    const int sh = 3 * gaussians.coefficients;
-    parallel_for(drawing.threads, gaussians.count, kGrain, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t i = begin; i < end; ++i) {
-            const std::int32_t rank = drawing.rank_of[i];
-            if (i + kAhead < end && drawing.rank_of[i + kAhead] >= 0) {
-                const float* next = &moments[lists.slot_begin[drawing.rank_of[i + kAhead]] * kMoments];
-                __builtin_prefetch(next);
-                __builtin_prefetch(next + kMoments);
-            }
-            double sums[kMoments] = {};
-            if (rank >= 0)
-                for (std::int64_t slot = lists.slot_begin[rank]; slot < lists.slot_begin[rank + 1]; ++slot)
-                    for (int k = 0; k < kMoments; ++k) sums[k] += moments[slot * kMoments + k];
-            if (std::all_of(sums, sums + kMoments, [](double sum) { return sum == 0.0; })) {  // hidden, or behind all
-                std::fill_n(gradients.means + 3 * i, 3, 0.0f);
-                std::fill_n(gradients.quats + 4 * i, 4, 0.0f);
-                std::fill_n(gradients.scales + 3 * i, 3, 0.0f);
-                gradients.opacities[i] = 0.0f;
-                std::fill_n(gradients.sh + sh * i, sh, 0.0f);
-                continue;
-            }
-            project_backward(drawing.view, gaussians, i, sums, gradients);
-        }
+    parallel_for(drawing.threads, gaussians.count, kRange, [&](std::int64_t begin, std::int64_t end) {
+        drawing.kernels->project_backward(drawing.view, gaussians, begin, end, lists.slot_begin.data(), moments.get(),
+                                          gradients);
     });
 }
 

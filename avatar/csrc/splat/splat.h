@@ -3,8 +3,7 @@
 #include <vector>
 
 #include "splat/bin.h"
-#include "splat/project.h"
-#include "splat/raster.h"
+#include "splat/kernels.h"
 #include "splat/scene.h"
 
 // The whole splatter without Python: what avatar/splat/__init__.py documents, in two calls.
@@ -30,13 +29,10 @@ struct Drawing {
     float background[3];
     const Kernels* kernels;
     int threads;
-    std::vector<Splat> splats;          // visible, front to back
-    std::vector<std::int32_t> rank_of;  // [N] position of each Gaussian in `splats`, -1: hidden
+    std::unique_ptr<Splat[]> splats;  // [N], written where the Gaussian is visible
     TileLists lists;
-    std::unique_ptr<float[]> transmittance;  // this and the rest: see ForwardTarget
-    std::unique_ptr<int[]> stops;
-    std::unique_ptr<TileEnd[]> ends;
-    std::unique_ptr<BlockStop[]> block_stops;
+    std::unique_ptr<float[]> ends;  // this and the next: see ForwardTarget
+    std::unique_ptr<Word[]> blocks;
 };
 
 // Draws the region into image [height * width * 3] and alpha [height * width]; the rest of them shows the background.

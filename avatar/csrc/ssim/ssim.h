@@ -11,8 +11,8 @@ namespace avatar::ssim {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kChannels = 3;
 constexpr int kReach = 2 * kRadius * kChannels;  // from a window's first value to its last in a row
-constexpr int kMaxLanes = 8;                     // rows are padded so that a kernel may read and write whole vectors
-constexpr int kPadding = kReach + 2 * kMaxLanes;
+constexpr int kMaxDoubles = 8;                   // rows are padded so that a kernel may read and write whole vectors
+constexpr int kPadding = kReach + 2 * kMaxDoubles;
 
 // What slides down the frame: the last kTaps rows of pixels and of windows, row y in place y % kTaps. A row holds `values`
 // doubles, three a pixel, and `stride` may be read and written.

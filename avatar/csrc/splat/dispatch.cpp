@@ -1,5 +1,5 @@
 #include "dispatch.h"
-#include "splat/raster.h"
+#include "splat/kernels.h"
 
 namespace avatar::splat {
 AVATAR_DEFINE_SELECT_KERNELS

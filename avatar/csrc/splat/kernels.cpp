@@ -1,0 +1,16 @@
+// Compiled once for each instruction set; AVATAR_KERNELS says which.
+#include "splat/kernels.h"
+
+#include "splat/project_backward.h"
+#include "splat/project_forward.h"
+#include "splat/raster_backward.h"
+#include "splat/raster_forward.h"
+
+namespace avatar::splat {
+
+extern const Kernels AVATAR_KERNELS;
+const Kernels AVATAR_KERNELS = {kWords,           all_finite,          project,
+                                project_backward, forward_tile<false>, forward_tile<true>,
+                                backward_tile};
+
+}  // namespace avatar::splat

@@ -1,0 +1,195 @@
+"""PSNR and SSIM computed a second time, by scikit-image, from the PNG files that an evaluation has written.
+
+Nothing of the first computation is used: other code reads the files, weighs the masks and runs the windows of SSIM. What
+agrees can be recomputed by anybody who has the pictures.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from skimage.io import imread
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from tqdm import tqdm
+
+from avatar.errors import UserError
+from avatar.evaluation.pictures import MASK_FOLDERS
+from avatar.evaluation.protocol import column
+from avatar.files.atomic import write_atomically
+
+TOLERANCE = 2e-6  # frames.csv is rounded to 5e-7; both sides compute in float64
+MEASURES = ("psnr", "ssim")  # LPIPS needs its network, jitter its neighbours
+_LEVELS = 255
+_RADIUS = 5  # of SSIM's window of 11 x 11: a window whose centre is nearer to the border does not count
+
+Row = Mapping[str, str]  # of frames.csv
+Figures = dict[str, float]  # by column of frames.csv
+
+
+class Difference(NamedTuple):
+    size: float
+    figure: str
+    where: str  # "frame 00012" or "the mean"
+
+
+def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[[str], None] = print) -> None:
+    """Check RUN/eval/results.json and every frames.csv against the pictures; note in results.json that they agree.
+
+    protocols  names; None: all that results.json has
+    Says one line for each protocol. Raises UserError naming the first frame and figure that differ by more than
+    `TOLERANCE`, a picture that is missing, or a table that results.json was not made from.
+    """
+    summary = json.loads(_bytes(results))
+    for name, entry in summary["protocols"].items():
+        if protocols is not None and name not in protocols:
+            continue
+        if entry["choices"]["levels"] == "float":
+            say(f"{name}: not verified, because it measures floats, which no PNG file holds (levels: float)")
+            continue
+        worst, frames = verify_protocol(results.parent / name, entry)
+        entry["verified"] = {
+            "by": f"scikit-image {version('scikit-image')}",
+            "frames": frames,
+            "tolerance": TOLERANCE,
+            "largest_difference": worst.size,
+        }
+        say(
+            f"{name}: {' and '.join(m.upper() for m in MEASURES)} of {frames} frames verified from their pictures; largest "
+            f"difference {worst.size:.1e} ({worst.figure} of {worst.where})"
+        )
+    write_atomically(results, json.dumps(summary, indent=2, allow_nan=False).encode())
+
+
+def verify_protocol(folder: Path, entry: Mapping[str, Any]) -> tuple[Difference, int]:
+    """The largest difference between a protocol's figures and its pictures, and the number of its frames.
+
+    `entry` is its part of results.json. Raises as `verify` does.
+    """
+    table = folder / "frames.csv"
+    content = _bytes(table)
+    if hashlib.sha256(content).hexdigest() != entry["frames_sha256"]:
+        raise UserError(f"{table} is not the table that results.json was made from; evaluate again")
+    rows = list(csv.DictReader(content.decode().splitlines()))
+    seen: list[Figures] = []
+    worst = Difference(0.0, "psnr", f"frame {rows[0]['name']}")
+    for row in tqdm(rows, desc=f"verify {folder.name}", unit="frame", leave=False, disable=None):
+        figures = recompute(folder, int(row["frame"]), entry["choices"])
+        seen.append(figures)
+        for found in differences({name: float(row[name]) for name in figures}, figures, f"frame {row['name']}", table):
+            worst = max(worst, found)
+    means = {name: _mean([figures[name] for figures in seen]) for name in seen[0]}
+    recorded = {name: math.nan if entry["means"][name] is None else entry["means"][name] for name in means}
+    for found in differences(recorded, means, "the mean", folder.parent / "results.json"):
+        worst = max(worst, found)
+    return worst, len(rows)
+
+
+def differences(recorded: Figures, seen: Figures, where: str, file: Path) -> Iterator[Difference]:
+    """Of each figure that both have. Raises UserError for one that is too large, or that only one side has."""
+    for name, value in seen.items():
+        if recorded[name] == value or (math.isnan(recorded[name]) and math.isnan(value)):
+            continue
+        size = abs(recorded[name] - value)
+        if not size <= TOLERANCE:  # a NaN on one side only is too large
+            raise UserError(
+                f"{name} of {where} is {recorded[name]:.6f} in {file}, but its pictures give {value:.6f} "
+                f"({size:.1e} apart, {TOLERANCE:g} allowed): a file was changed, or a figure is wrong; evaluate again"
+            )
+        yield Difference(size, name, where)
+
+
+def recompute(folder: Path, index: int, choices: Mapping[str, Any]) -> Figures:
+    """PSNR and SSIM of one frame, main and by region, by column of frames.csv; NaN for a region without a pixel.
+
+    choices  of the protocol: `mask` and `regions`
+    """
+    render, truth, head = (_read(folder / kind / f"{index:05d}.png") for kind in ("renders", "gt", "masks"))
+    regions: Sequence[str] = choices["regions"]
+    masks = {region: _mask(folder, region, index, head.shape) for region in regions}
+    if choices["mask"] == "multiply":
+        weight = head[..., None] / _LEVELS
+        figures = _of_frame(render * weight, truth * weight)
+    else:
+        figures = _of_frame(render, truth)
+    error, similarity = _maps(render, truth)
+    if choices["mask"] == "only":
+        figures = _of_region(error, similarity, head, None)
+    for region, mask in masks.items():
+        figures |= _of_region(error, similarity, mask, region)
+    return figures
+
+
+def _of_frame(render: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]) -> Figures:
+    with np.errstate(divide="ignore"):  # equal pictures: infinite
+        psnr = float(peak_signal_noise_ratio(truth, render, data_range=_LEVELS))
+    return {"psnr": psnr, "ssim": float(_similarity(render, truth)[0])}
+
+
+def _maps(
+    render: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]
+) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    """Squared error of values in [0, 1] and SSIM, means of the channels."""
+    return np.square((render - truth) / _LEVELS).mean(axis=2), _similarity(render, truth)[1].mean(axis=2)
+
+
+def _similarity(a: Float[np.ndarray, "H W 3"], b: Float[np.ndarray, "H W 3"]) -> tuple[float, np.ndarray]:
+    return structural_similarity(  # type: ignore[return-value]
+        a,
+        b,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=_LEVELS,
+        channel_axis=2,
+        full=True,
+    )
+
+
+def _of_region(
+    error: Float[np.ndarray, "H W"],
+    similarity: Float[np.ndarray, "H W"],
+    mask: Float[np.ndarray, "H W"],
+    region: str | None,
+) -> Figures:
+    inside = np.s_[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+    with np.errstate(divide="ignore"):
+        psnr = -10.0 * np.log10(_weighted(error, mask))
+    return {column("psnr", region): float(psnr), column("ssim", region): _weighted(similarity[inside], mask[inside])}
+
+
+def _weighted(values: Float[np.ndarray, "H W"], weights: Float[np.ndarray, "H W"]) -> float:
+    return float(np.average(values, weights=weights)) if weights.any() else math.nan
+
+
+def _mask(folder: Path, region: str, index: int, shape: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
+    """Nothing where the head model does not show the region and no masks of it were written."""
+    masks = folder / MASK_FOLDERS[region]
+    return _read(masks / f"{index:05d}.png") if masks.is_dir() else np.zeros(shape)
+
+
+def _read(path: Path) -> Float[np.ndarray, "H W ..."]:
+    try:
+        return imread(path).astype(np.float64)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise UserError(f"{path} cannot be read ({error}); evaluate again with --verify") from None
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}); evaluate again with --verify") from None
+
+
+def _mean(values: Sequence[float]) -> float:
+    finite = [value for value in values if math.isfinite(value)]
+    return math.fsum(finite) / len(finite) if finite else math.nan

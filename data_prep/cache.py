@@ -1,0 +1,42 @@
+"""Where prepared subjects are kept, and from which inputs one was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+from avatar.data.manifest import MANIFEST_VERSION
+from data_prep.frame_files import FrameFiles
+
+
+def cache_folder() -> Path:
+    """Where prepared subjects are kept: $AVATAR_CACHE, else ~/.cache/avatar."""
+    given = os.environ.get("AVATAR_CACHE")
+    return Path(given).expanduser() if given else Path.home() / ".cache" / "avatar"
+
+
+def default_location(files: FrameFiles, options: dict[str, object]) -> Path:
+    tracking = next(iter(files.tracking.values())).parent
+    key = hashlib.sha256(json.dumps([str(files.folder), str(tracking), options]).encode()).hexdigest()[:12]
+    return cache_folder() / "subjects" / f"{files.folder.name}-{key}"
+
+
+def input_hash(files: FrameFiles, options: dict[str, object]) -> str:
+    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), options]).encode())
+    for kind, found in files.of_kind().items():
+        for number, path in found.items():
+            digest.update(f"{kind} {number} {path} {_stamp(path)}\n".encode(errors="surrogateescape"))
+    for path in files.listings:
+        digest.update(f"{path} {_stamp(path)}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+def _stamp(path: Path) -> str:
+    """Size and time, by which a change is noticed; a file that is named but not there is noticed when it comes."""
+    try:
+        status = path.stat()
+    except OSError:
+        return "missing"
+    return f"{status.st_size} {status.st_mtime_ns}"

@@ -1,0 +1,74 @@
+"""Findings about how the tracked head lies on the masks: over the clip, and in single frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_prep.check.clip import Clip
+from data_prep.check.findings import Finding
+from data_prep.misfit import ADVICE
+
+# Of the size of the projected head. On clips whose tracking error is known (0.15 degrees, 0.4 mm, 2%) lips are off by less
+# than 0.018 and the mesh sticks out of the mask by less than 0.01.
+MAX_MOUTH, MAX_OVERHANG = 0.05, 0.05
+MIN_INSIDE = 0.9  # of the mesh without neck; the same clips have 0.99
+_ROBUST_SD = 1.4826  # times the median absolute deviation: the standard deviation of a normal distribution
+_OUTLIER = 6.0  # robust standard deviations
+IGNORED = "nothing, if you are sure: --ignore-misfit lets training start; compare mesh and masks on the page of --out"
+
+
+def check_fit(clip: Clip) -> list[Finding]:
+    if not clip.fits or clip.judgement is None:
+        return []
+    if clip.judgement.problem is not None:
+        severity, advice = ("warning", IGNORED) if clip.ignore_misfit else ("error", ADVICE)
+        return [Finding(severity, "residual", clip.judgement.problem, advice)]
+    numbers = list(clip.fits)
+    fits = list(clip.fits.values())
+    size = np.array([fit.size for fit in fits])
+    inside = np.array([fit.inside for fit in fits])
+    overhang, mouth = np.array([f.overhang for f in fits]) / size, np.array([f.mouth for f in fits]) / size
+    findings = []
+    for what, values, limit, region in (
+        ("the tracked head sticks out of the head mask", overhang, MAX_OVERHANG, "head"),
+        ("the tracked lips are away from the mouth mask", mouth, MAX_MOUTH, "mouth"),
+    ):
+        if not np.isfinite(values).any():
+            continue
+        pixels = values * size
+        usual = float(np.nanmedian(values))
+        if usual > limit:
+            findings.append(
+                Finding(
+                    "warning",
+                    "residual",
+                    f"{what} by {np.nanmedian(pixels):.1f} pixels in the median over the clip ({usual:.1%} of the head's "
+                    f"size)",
+                    f"compare mesh and {region} mask on the page of --out; the tracking or its camera is off",
+                )
+            )
+            continue
+        spread = _ROBUST_SD * float(np.nanmedian(np.abs(values - usual)))
+        off = [n for n, value in zip(numbers, values, strict=True) if value > max(limit, usual + _OUTLIER * spread)]
+        if off:
+            worst = int(np.nanargmax(values))
+            findings.append(
+                Finding(
+                    "warning",
+                    "residual",
+                    f"{what} in {clip.phrase(off)}: {pixels[worst]:.1f} pixels in {clip.name(numbers[worst])}, where "
+                    f"{np.nanmedian(pixels):.1f} is usual",
+                    "look at these frames: is the mask wrong or the tracking? Redo it, or remove the frames",
+                    clip.names(off),
+                )
+            )
+    if np.isfinite(inside).any() and np.nanmedian(inside) < MIN_INSIDE and not findings:
+        findings.append(
+            Finding(
+                "warning",
+                "residual",
+                f"only {np.nanmedian(inside):.0%} of the tracked head (without neck) lies on the head mask, in the median",
+                "is the mask of the whole head with hair, or of the face alone? The rest is trained to be background",
+            )
+        )
+    return findings

@@ -1,0 +1,67 @@
+"""Head and mouth mask of a frame: from their own files, from its face parsing, or from the projected head."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from avatar.data.images import read_bytes, read_mask, read_matte
+from avatar.data.manifest import Manifest
+from avatar.head.model import HeadModel
+from data_prep.face_parsing import HEAD, MOUTH, mask_of
+from data_prep.frame_files import FrameFiles
+from data_prep.projection import filled_lips, project_head, region_faces
+from data_prep.tracking import Tracking
+
+
+def read_masks(files: FrameFiles, number: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Head and mouth mask, uint8 [H, W], or None; the matte stands in where the folder has no head masks.
+
+    Raises UserError naming the file when one cannot be read.
+    """
+    if number in files.parsing:
+        path = files.parsing[number]
+        classes = files.decode_parsing(read_bytes(path), path)
+        return mask_of(classes, HEAD), mask_of(classes, MOUTH)
+    head = None
+    if files.head_masks:
+        head = read_mask(files.head_masks[number]) if number in files.head_masks else None
+    elif number in files.alphas:
+        head = read_matte(files.alphas[number], files.images[number])
+    return head, read_mask(files.mouth_masks[number]) if number in files.mouth_masks else None
+
+
+def derive_masks(
+    building: Path,
+    manifest: Manifest,
+    files: FrameFiles,
+    model: HeadModel,
+    tracks: Tracking,
+    pairs: Sequence[tuple[int, int]],
+) -> None:
+    """Write the masks that the source does not have into `building`: from its face parsing, else the projected lips.
+
+    pairs  image number and tracking number of each of the manifest's frames
+    """
+    for record in manifest.frames[:1]:
+        for path, kind in ((record.head_mask, manifest.head_masks), (record.mouth_mask, manifest.mouth_masks)):
+            if kind == "derived":
+                (building / str(path)).parent.mkdir()
+    lips = region_faces(model, "lips")
+    size = manifest.width, manifest.height
+    for record, (image, number) in zip(manifest.frames, pairs, strict=True):
+        head, mouth = read_masks(files, image) if image in files.parsing else (None, None)
+        if manifest.head_masks == "derived" and head is not None:
+            _write(building / str(record.head_mask), head)
+        if manifest.mouth_masks == "derived":
+            if mouth is None:
+                screen = project_head(model, tracks.frames[number], np.array(manifest.intrinsics), *size)
+                mouth = filled_lips(screen, lips, *size).astype(np.uint8) * 255
+            _write(building / str(record.mouth_mask), mouth)
+
+
+def _write(path: Path, mask: np.ndarray) -> None:
+    path.write_bytes(cv2.imencode(".png", mask)[1].tobytes())  # cv2.imwrite does not notice a full disk

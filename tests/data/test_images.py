@@ -1,0 +1,83 @@
+"""Image and mask files as pixels: every way in which a PNG can be transparent means the same matte."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from avatar.data.images import read_image, read_mask, read_matte
+
+MATTE = np.array([[0, 1, 9, 10], [40, 128, 254, 255]], np.uint8)
+COLOUR = np.full((2, 4, 3), (10, 120, 200), np.uint8)  # blue first, as OpenCV writes
+
+
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def palette_png(matte: np.ndarray) -> bytes:
+    """One palette entry per level of the matte, all of the same colour."""
+    levels = np.unique(matte)
+    rows = b"".join(b"\0" + np.searchsorted(levels, row).astype(np.uint8).tobytes() for row in matte)
+    header = struct.pack(">IIBBBBB", matte.shape[1], matte.shape[0], 8, 3, 0, 0, 0)
+    parts = (
+        (b"IHDR", header),
+        (b"PLTE", bytes((200, 120, 10)) * len(levels)),
+        (b"tRNS", levels.tobytes()),
+        (b"IDAT", zlib.compress(rows)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def grey_alpha_png(matte: np.ndarray) -> bytes:
+    rows = b"".join(b"\0" + np.stack((np.full_like(row, 120), row), axis=1).tobytes() for row in matte)
+    header = struct.pack(">IIBBBBB", matte.shape[1], matte.shape[0], 8, 4, 0, 0, 0)
+    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def rgba_png(matte: np.ndarray, kind: type = np.uint8) -> bytes:
+    scale = kind(np.iinfo(kind).max // 255)
+    return cv2.imencode(".png", np.dstack((COLOUR, matte)).astype(kind) * scale)[1].tobytes()
+
+
+TRANSPARENT = {
+    "8 bits a channel": rgba_png(MATTE),
+    "16 bits a channel": rgba_png(MATTE, np.uint16),
+    "grey with alpha": grey_alpha_png(MATTE),
+    "a palette with transparent colours": palette_png(MATTE),
+}
+
+
+@pytest.mark.parametrize("kind", TRANSPARENT)
+def test_the_transparency_of_a_png_is_the_matte(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "00001.png"
+    path.write_bytes(TRANSPARENT[kind])
+    np.testing.assert_array_equal(read_mask(path), MATTE)
+    np.testing.assert_array_equal(read_matte(path, path), MATTE)
+    expected = (120, 120, 120) if kind == "grey with alpha" else (200, 120, 10)
+    assert (read_image(path) == expected).all()
+
+
+def test_16_bits_are_rounded_to_the_nearest_of_8(tmp_path: Path) -> None:
+    levels = np.array([[0, 128, 129, 32767, 32768, 65406, 65407, 65535]], np.uint16)
+    pixels = np.dstack([np.zeros_like(levels)] * 3 + [levels])
+    assert cv2.imwrite(str(tmp_path / "x.png"), pixels)
+    assert read_mask(tmp_path / "x.png").tolist() == [[0, 0, 1, 127, 128, 254, 255, 255]]
+
+
+def test_an_opaque_mask_file_is_its_luminance_and_an_opaque_image_is_all_foreground(tmp_path: Path) -> None:
+    path = tmp_path / "x.png"
+    path.write_bytes(rgba_png(np.full_like(MATTE, 255)))
+    grey = cv2.cvtColor(COLOUR, cv2.COLOR_BGR2GRAY)
+    np.testing.assert_array_equal(read_mask(path), grey)
+    np.testing.assert_array_equal(read_matte(path, tmp_path / "image.png"), grey)
+    assert (read_matte(path, path) == 255).all()
+    assert cv2.imwrite(str(tmp_path / "x.jpg"), COLOUR)
+    assert (read_matte(tmp_path / "x.jpg", tmp_path / "x.jpg") == 255).all()

@@ -1,0 +1,31 @@
+"""A tracked folder, prepared, with what was said about it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from avatar.data.source import Source
+from avatar.data.split import SplitSizes
+from avatar.data.subject import Subject
+from avatar.head.assets import load_head_assets
+from data_prep.prepare import prepare
+
+
+def prepare_folder(
+    folder: Path, out: Path, split: SplitSizes | None = None, **options: Any
+) -> tuple[Subject, list[str]]:
+    said: list[str] = []
+    head_path = folder / "head_model"
+    source = Source(folder, head_path, **options)
+    prepared = prepare(source, load_head_assets(head_path), out=out, split=split, say=said.append)
+    return Subject.open(prepared), said
+
+
+def edit(path: Path, section: str, **changes: np.ndarray) -> None:
+    content = torch.load(path, weights_only=False)
+    content[section] |= changes
+    torch.save(content, path)
