@@ -88,9 +88,7 @@ class Frame:
     alpha: Float[Tensor, "H W"]  # foreground matte; ones where the subject has none
     head_mask: Float[Tensor, "H W"]  # head and neck; ones where the subject has none
     mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth
-    head_box: tuple[slice, slice] | None = (
-        None  # rows and columns that hold the head mask, where they are known already
-    )
+    head_box: tuple[slice, slice] | None = None  # rows and columns that hold the head mask, if they are known already
 
     def composite(self, background: Float[Tensor, 3]) -> Float[Tensor, "H W 3"]:
         """The training target: matte over the background, then the head mask over the background again.

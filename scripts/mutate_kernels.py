@@ -144,7 +144,7 @@ def main() -> int:
     chosen = [m for m in MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
     for mutation in chosen:
         mutated(mutation)
-    areas = {id(tests_of(m.module)): m.module for m in chosen}.values()
+    areas = {id(tests_of(m.module)): m.module for m in reversed(chosen)}.values()  # the first module of each
     tasks: list[tuple[str, Mutation | None]] = [(module, None) for module in areas]
     tasks += [(mutation.module, mutation) for mutation in chosen]
     import_all()
