@@ -77,7 +77,8 @@ def test_gsplat_is_asked_for_the_same_picture(monkeypatch: pytest.MonkeyPatch) -
     view, intrinsics, width, height = asked["rest"]
     point = torch.cat((SHELL.means[0], torch.ones(1)))
     assert torch.allclose((view[0] @ point)[:3], camera.R_cam_world @ SHELL.means[0] + camera.t_cam_world)
-    assert intrinsics[0].tolist() == [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    wanted = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    assert torch.equal(intrinsics[0], wanted)
     assert (width, height, asked["named"]["sh_degree"]) == (SIZE, SIZE, 3)
     assert asked["colors"].shape == (40, 16, 3) and asked["opacities"].shape == (40,)
 
