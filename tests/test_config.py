@@ -36,6 +36,13 @@ def test_later_overrides_win_and_survive_a_round_trip() -> None:
     assert config_from_dict(config.to_dict()) == config
 
 
+def test_a_configuration_says_where_it_computes() -> None:
+    assert load_config([]).device == "auto" and load_config(["device=cuda:1"]).device == "cuda:1"
+    older = load_config([]).to_dict()
+    del older["device"]
+    assert config_from_dict(older).device == "auto"
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -52,6 +59,7 @@ def test_later_overrides_win_and_survive_a_round_trip() -> None:
         ("model.latent_dim=0", "model.latent_dim=0 is out of range"),
         ("data.background=[1,2,3]", "three values from 0 to 1"),
         ("data.background=[1,2]", "data.background"),
+        ("device=gpu", "device=gpu is not one of auto, cpu, cuda, cuda:N"),
         ("protocol=strict", "no configuration key 'protocol'"),
         ("size", "'size' is not of the form key=value"),
         ("trainer.iterations=[1", "cannot be composed"),

@@ -33,9 +33,15 @@ def run_train(arguments: Namespace) -> int:
     overrides = config_overrides(arguments)
     if arguments.resume:
         refuse_changes(run, read_run_info(run), arguments, overrides)
-        return resume_run(run, arguments.head, arguments.folder, arguments.device)
+        return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
     load_config(overrides)  # a mistake in it before one in the folder
     return train_new(source_of(arguments), overrides, run, arguments.device)
+
+
+def asked_device(overrides: list[str]) -> str | None:
+    """What the command line says of `device`, the one key of a configuration that a run may change."""
+    own = [override for override in overrides if override.partition("=")[0] == "device"]
+    return load_config(own).device if own else None
 
 
 def default_run(folder: Path | None) -> Path:
