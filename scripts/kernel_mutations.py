@@ -46,7 +46,7 @@ MUTATIONS = [
         "-x * (4 * z * z - x * x - y * y) * C31 * on, sh, 13",
         "x * (4 * z * z - x * x - y * y) * C31 * on, sh, 13",
     ),
-    Mutation("bin", "lists are made although there is no room", "(slot < total) & (total <= capacity)", "slot < total"),
+    Mutation("bin", "a slot without a record claims one", "tl.where(live, place, -1)", "place"),
     Mutation(
         "bin",
         "the search for a slot's splat ends a step too early",
@@ -146,7 +146,7 @@ MUTATIONS = [
         "_put(grads, at + 12, q9 * from_mean, all_lanes)",
         "_put(grads, at + 12, q9 * from_mean, mask)",
     ),
-    Mutation("place_backward", "a node's list is read one entry too far", "at < end)[:, None]", "at <= end)[:, None]"),
+    Mutation("place_backward", "a node's list ends an entry early", "begins + node + 1)", "begins + node + 1) - 1"),
     Mutation("activations", "tanh is wrong where it saturates", "tl.where(x < 0.0, -far, far)", "far"),
     # Posing and losses.
     Mutation(

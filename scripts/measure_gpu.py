@@ -123,7 +123,9 @@ def tune(scene: Scene, repeats: int, quick: bool) -> list[tuple[gpu_draw.Tuning,
         for tuning in [usual, *tunings][: 2 if quick else None]:
             gpu_draw.TUNING = tuning
             CAPACITIES.forget()  # other tiles, other numbers of pairs
-            times = paired_medians({"forward": scene.forward, "backward": scene.backward}, repeats, warm_up=3)
+            times = paired_medians(
+                {"forward": scene.forward, "backward": scene.backward}, repeats, warm_up=min(3, repeats)
+            )
             rows.append((tuning, times["forward"], times["backward"]))
     finally:
         gpu_draw.TUNING = usual
@@ -150,7 +152,7 @@ def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: 
         "a training step, first half": settled(lambda: rehearsal.train(STAND_IN, late=False)),
         "a training step with D-SSIM": settled(lambda: rehearsal.train(STAND_IN, late=True)),
     }
-    return paired_medians(functions, repeats, warm_up=3)
+    return paired_medians(functions, repeats, warm_up=min(3, repeats))
 
 
 def report(

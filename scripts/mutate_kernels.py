@@ -45,7 +45,7 @@ SPLATTER = [
     CAPACITY + "test_room_for_exactly_the_pairs_is_enough_and_one_less_makes_the_image_nan",
     CAPACITY + "test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits",
     HOSTILE + "test_the_same_bits_and_whole_bands[17x33]",
-    HOSTILE + "test_the_same_bits_and_whole_bands[opaque]",
+    HOSTILE + "test_the_same_bits_and_whole_bands[walls]",
     f"{REFERENCE}[thresholds-gpu]",
 ]
 PLACING = [

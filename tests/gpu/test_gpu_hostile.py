@@ -57,7 +57,8 @@ def everything_compared(copy: Callable[[Tensor], Tensor]) -> list[Tensor]:
 
 CASES: dict[str, Callable[[Callable[[Tensor], Tensor]], list[Tensor]]] = {
     **{
-        name: lambda copy, name=name: everything_of(name, copy) for name in ("17x33", "opaque", "thresholds", "needles")
+        name: lambda copy, name=name: everything_of(name, copy)
+        for name in ("17x33", "opaque", "walls", "thresholds", "needles")
     },
     "placed": everything_placed,
     "posed": everything_posed,

@@ -56,6 +56,8 @@ def test_right_kernels_pass_and_every_field_was_compared() -> None:
 def faint_scene_only(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("placed", "opaque_scene"):
         monkeypatch.setattr(module, name, lambda _: {})
+    monkeypatch.setattr(module, "COUNT", 60)
+    monkeypatch.setattr(module, "SIZE", 32)
 
 
 @pytest.mark.usefixtures("faint_scene_only")

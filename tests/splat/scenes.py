@@ -104,6 +104,10 @@ SCENES: dict[str, Scene] = {
     "32x32": Scene(random_gaussians(60, seed=8), camera(32, 32)),
     "33x65": Scene(random_gaussians(60, seed=18), camera(33, 65)),
     "opaque": Scene(random_gaussians(150, seed=9)._replace(opacities=torch.ones(150)), camera(64, 48)),
+    # Every pixel is full long before its list of splats ends.
+    "walls": Scene(
+        random_gaussians(150, seed=19, spread=0.03, size=0.3)._replace(opacities=torch.ones(150)), camera(20, 20)
+    ),
     "dense": Scene(random_gaussians(3000, seed=10, spread=0.08), camera(40, 40)),
     "thresholds": Scene(threshold_gaussians(), camera(80, 60)),
     "one": Scene(random_gaussians(1, seed=11, spread=0.01), camera(31, 29)),
