@@ -94,7 +94,8 @@ def measure(scale: Scale, out: Path, overrides: Sequence[str] = ()) -> list[Row]
         driver, _ = open_subject(Source(driver_folder, target_folder / "head_model", frame_offset=1), assets=assets)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, target.identity, config.model)
-        train(avatar, target, config, Path(scratch) / "run", choose_perceptual(config.trainer, print))
+        term = choose_perceptual(config.trainer, print, size=target.image_size(config.data.size))
+        train(avatar, target, config, Path(scratch) / "run", term)
         tracked = [driver.params(i) for i in range(len(driver))]
         repertoire = learn_repertoire(target.recording.motion(target.split.train), avatar.head)
         driver_head = HeadModel(assets, driver.identity)

@@ -104,6 +104,14 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
     reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
     reenact.add_argument("--transfer", choices=("raw", "relative", "mean", "pca"), default="relative")
+    reenact.add_argument(
+        "--neutral",
+        metavar="N",
+        help="training frame with the avatar's neutral face, by its name or number (12 is 00012; default: found)",
+    )
+    reenact.add_argument(
+        "--driver-neutral", metavar="N", help="frame of DRIVER with the driver's neutral face, likewise"
+    )
     reenact.add_argument("--strength", type=float, default=1.0, metavar="S", help="scales the departure from neutral")
     reenact.add_argument(
         "--smoothing", type=float, default=0.0, metavar="FRAMES", help="Gaussian over time (default: off)"

@@ -11,7 +11,10 @@ import torch
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
+from avatar.commands.outputs import check_run_folder
 from avatar.compute.choose import choose_device
+from avatar.compute.device import free_bytes
+from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
 from avatar.data.split import check_divided
@@ -21,6 +24,7 @@ from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
+from avatar.runs.footprint import training_needs
 from avatar.runs.lock import locked
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.step import PerceptualTerm, choose_perceptual
@@ -35,7 +39,9 @@ def run_train(arguments: Namespace) -> int:
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
     load_config(overrides)  # a mistake in it before one in the folder
-    return train_new(source_of(arguments), overrides, run, arguments.device)
+    source = source_of(arguments)
+    check_run_folder(run, [source.folder, source.head, source.tracking])
+    return train_new(source, overrides, run, arguments.device)
 
 
 def asked_device(overrides: list[str]) -> str | None:
@@ -58,9 +64,9 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
         chosen = choose_device(device or config.device, print)
         subject, assets = open_subject(source, split_sizes(config))
         check_divided(subject.split)
-        perceptual = choose_perceptual(config.trainer, print, device=chosen)
-        torch.manual_seed(config.trainer.seed)
-        avatar = Avatar(assets, subject.identity, config.model)
+        size = subject.image_size(config.data.size)
+        perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
+        avatar = new_avatar(assets, subject, config, perceptual.name, chosen)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
         return finish_training(avatar, subject, config, run, perceptual, chosen)
 
@@ -85,7 +91,7 @@ def go_on(
             f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
             f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
         )
-    avatar = Avatar(assets, subject.identity, config.model)
+    avatar = new_avatar(assets, subject, config, info.perceptual)
     if checkpoint.step >= config.trainer.iterations:
         leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
@@ -93,9 +99,21 @@ def go_on(
     chosen = choose_device(device or config.device, print)
     if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
         print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; the result is the same to rounding")
-    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, device=chosen)
+    size = subject.image_size(config.data.size)
+    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, size=size, device=chosen)
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
     return finish_training(avatar, subject, config, run, perceptual, chosen, checkpoint)
+
+
+def new_avatar(assets: HeadAssets, subject: Subject, config: Config, perceptual: str, device: torch.device) -> Avatar:
+    """An avatar with its initial parameters. Raises UserError, before any is made, when training it needs more memory than
+    there is."""
+    size = subject.image_size(config.data.size)
+    frames = len(subject.split.train)
+    needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual)
+    check_memory("training", needs, free_bytes(device))
+    torch.manual_seed(config.trainer.seed)
+    return Avatar(assets, subject.identity, config.model)
 
 
 def finish_training(

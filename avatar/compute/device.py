@@ -32,3 +32,8 @@ def brought(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type == "cuda" and tensor.is_cpu and not tensor.requires_grad:
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
+
+
+def free_bytes(device: torch.device) -> float | None:
+    """What is free of a GPU's memory; None for the CPU, whose `avatar.compute.memory.available_bytes` tells."""
+    return float(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else None

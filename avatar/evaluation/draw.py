@@ -13,12 +13,12 @@ import torch
 from jaxtyping import UInt8
 
 from avatar.compute.device import brought
+from avatar.data.background import Colour
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
-from avatar.evaluation.protocol import Colour, Look
+from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
-from avatar.render import Renderer
-from avatar.splat import splat
+from avatar.render import Renderer, drawn
 from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
 from avatar.types import Frame
@@ -38,8 +38,8 @@ def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, 
     for look in looks:
         if look.background not in images:
             colour = torch.tensor(look.background)
-            drawn = with_room(partial(splat, gaussians, frame.camera, brought(colour, device)))
-            images[look.background] = Pair(drawn.image, brought(frame.composite(colour), device))
+            picture = with_room(partial(drawn, gaussians, frame.camera, brought(colour, device)))
+            images[look.background] = Pair(picture.image, brought(frame.composite(colour), device))
         pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
     return pairs
 

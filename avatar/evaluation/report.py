@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from avatar.evaluation.conditions import Conditions
-from avatar.evaluation.protocol import COLOURS, MEASURES, REGIONS, Region, column
+from avatar.evaluation.protocol import MEASURES, REGIONS, Region, column
 from avatar.evaluation.results import FrameResult
 
 MAIN_TITLE = "by the protocol"
@@ -103,11 +103,6 @@ def frames_csv(columns: Sequence[str], rows: Iterable[FrameResult]) -> str:
         values = (*(row.figures[key] for key in columns), *row.conditions)
         writer.writerow((row.index, row.name, *(f"{value:.6f}" for value in values)))
     return text.getvalue()
-
-
-def colour_name(colour: Sequence[float]) -> str:
-    """`white` where a colour has a name, else its values."""
-    return next((name for name, values in COLOURS.items() if values == tuple(colour)), str(list(colour)))
 
 
 def _name_width(protocols: Mapping[str, Any]) -> int:

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from avatar.compute.device import on_gpu
 from avatar.splat.counters import Counters
-from avatar.splat.cpu import count_cpu, splat_cpu
+from avatar.splat.cpu import CannotDraw, count_cpu, splat_cpu
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["Counters", "counters", "splat"]
+__all__ = ["CannotDraw", "Counters", "counters", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
@@ -66,9 +66,9 @@ def splat(
 
     The image and alpha of the "cpu" backend are the same to the last bit for any number of threads. The camera stays on the
     CPU for all backends.
-    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device, for non-finite values
-    (with count and first index), for colours that overflow, and for scenes beyond the kernel's stated limits. The "gpu"
-    backend learns of the last three when nobody waits for it any more: image and alpha are then NaN wherever it draws.
+    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
+    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. The
+    "gpu" backend learns of the last three when nobody waits for it any more: image and alpha are then NaN wherever it draws.
     """
     chosen = backend or _backend_for(gaussians.means)
     options = _checked_options(
@@ -86,7 +86,10 @@ def splat(
         region=region,
     )
     if chosen == "reference":
-        check_finite(**gaussians._asdict(), background=background)
+        try:
+            check_finite(**gaussians._asdict(), background=background)
+        except ValueError as error:
+            raise CannotDraw(str(error)) from None
         return splat_reference(gaussians, camera, background, **options)
     if chosen == "gpu":
         from avatar.splat.gpu import splat_gpu  # imports Triton, which takes a second and is not there on every machine

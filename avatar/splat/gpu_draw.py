@@ -17,6 +17,7 @@ from avatar.kernels.project import POISON, project
 from avatar.kernels.project_backward import project_backward
 from avatar.kernels.start import start
 from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Kind
+from avatar.splat.cpu import CannotDraw
 from avatar.splat.region import Region
 from avatar.tensors import check_finite
 from avatar.types import Gaussians, Rendering
@@ -251,15 +252,19 @@ def tile_numbers(tiles: int, dtype: torch.dtype, device: torch.device) -> Int[Te
 def needed_pairs(
     gaussians: Gaussians, background: Float[Tensor, " 3"], boxes: Int[Tensor, "4 N"], ends: Int[Tensor, " N"]
 ) -> int:
-    """The number of pairs, waited for. Raises ValueError, as the "cpu" backend does, where nothing can be drawn."""
+    """The number of pairs, waited for. Raises CannotDraw, as the "cpu" backend does, where nothing can be drawn."""
     needed = int(ends[-1])
-    check_finite(background=background)
+    try:
+        check_finite(background=background)
+        if needed >= POISON.value:
+            check_finite(**gaussians._asdict())
+    except ValueError as error:
+        raise CannotDraw(str(error)) from None
     if needed >= POISON.value:
-        check_finite(**gaussians._asdict())
         if bool((spoilt := boxes[3] == POISON.value).any()):
-            raise ValueError(f"sh gives splat {int(spoilt.nonzero()[0])} a colour beyond the range of float32")
+            raise CannotDraw(f"sh gives splat {int(spoilt.nonzero()[0])} a colour beyond the range of float32")
     if needed > MAX_PAIRS:
-        raise ValueError(
+        raise CannotDraw(
             f"drawing needs {needed} pairs of a tile of {TUNING.tile}x{TUNING.tile} pixels and a splat, the limit is "
             f"{MAX_PAIRS}; are the scales too large for this camera?"
         )

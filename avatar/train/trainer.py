@@ -22,7 +22,7 @@ from avatar.model import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
-from avatar.splat import splat
+from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
 from avatar.train.ahead import Ahead, Prompt, Spoilt
 from avatar.train.colours import colour_from_frames
@@ -30,7 +30,7 @@ from avatar.train.log import TrainingLog
 from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.posed import PosedMeshes
-from avatar.train.step import Objective, PerceptualTerm, training_step
+from avatar.train.step import Objective, PerceptualTerm, stopped, training_step
 
 
 def train(
@@ -48,8 +48,8 @@ def train(
     The avatar is moved to `device`; what `perceptual` holds has to be there already.
 
     Returns the number of steps done when it ends, which is less than `trainer.iterations` after an interruption (Ctrl-C
-    or SIGTERM; the state is saved first). Raises UserError, leaving the last good checkpoint, when a loss or gradient is
-    not finite.
+    or SIGTERM; the state is saved first). Raises UserError, leaving the last good checkpoint, when the avatar cannot be
+    drawn any more or a loss or gradient is not finite.
     """
     trainer = config.trainer
     start = 0
@@ -104,7 +104,7 @@ def train(
                     if shows or saves or interrupted():
                         progress.settle()
                     if shows:
-                        log.preview(step, *render_held_out(avatar, loader, subject, background))
+                        log.preview(step, *render_held_out(avatar, loader, subject, background, step))
                     if saves:
                         save(step)
                         saved = step
@@ -128,10 +128,15 @@ def leave_avatar(
 
 
 @torch.no_grad()
-def render_held_out(avatar: Avatar, loader: FrameLoader, subject: Subject, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Truth and render of the first held-out frame."""
+def render_held_out(
+    avatar: Avatar, loader: FrameLoader, subject: Subject, background: Tensor, step: int
+) -> tuple[Tensor, Tensor]:
+    """Truth and render of the first held-out frame after `step` steps. Raises UserError when it cannot be drawn."""
     frame = next(iter(loader.frames([subject.split.test[0]])))
-    drawn = with_room(lambda: splat(avatar(frame.params), frame.camera, background))
+    try:
+        drawn = with_room(lambda: splat(avatar(frame.params), frame.camera, background))
+    except CannotDraw as error:
+        raise stopped(step, frame, str(error)) from error
     return frame.composite(background), drawn.image
 
 

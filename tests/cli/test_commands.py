@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import io
 import json
 import re
 import shutil
@@ -19,25 +17,13 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
-from avatar.cli import main
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 
 QUICK = [*SMALL, "trainer.iterations=16"]
-
-
-def avatar(*arguments: object, status: int = 0) -> str:
-    """Run `avatar ...` in this process; returns stdout and stderr together after checking the exit status."""
-    output = io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-        try:
-            returned = main([str(argument) for argument in arguments])
-        except SystemExit as stop:  # argparse: --help, --version, usage
-            returned = int(stop.code or 0)
-    assert returned == status, output.getvalue()
-    return output.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +126,8 @@ def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, dr
         "smoothing": 1.5,
         "camera": "driver",
         "intrinsics": "target",
+        "neutral": None,
+        "driver_neutral": None,
     }
     assert recorded["driver"] == {"name": "driver", "frames": 8, "fps": 25.0, "has_cameras": True}
     assert recorded["intrinsics"]["shown"]["fx"] == recorded["intrinsics"]["avatar"]["fx"]
