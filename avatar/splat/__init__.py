@@ -68,7 +68,7 @@ def splat(
     CPU for all backends.
     Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
     for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. The
-    "gpu" backend learns of the last three when nobody waits for it any more: image and alpha are then NaN wherever it draws.
+    "gpu" backend learns of those when nobody waits for it any more: image and alpha are then NaN wherever it draws.
     """
     chosen = backend or _backend_for(gaussians.means)
     options = _checked_options(

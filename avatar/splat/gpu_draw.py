@@ -260,9 +260,8 @@ def needed_pairs(
             check_finite(**gaussians._asdict())
     except ValueError as error:
         raise CannotDraw(str(error)) from None
-    if needed >= POISON.value:
-        if bool((spoilt := boxes[3] == POISON.value).any()):
-            raise CannotDraw(f"sh gives splat {int(spoilt.nonzero()[0])} a colour beyond the range of float32")
+    if needed >= POISON.value and bool((spoilt := boxes[3] == POISON.value).any()):
+        raise CannotDraw(f"sh gives splat {int(spoilt.nonzero()[0])} a colour beyond the range of float32")
     if needed > MAX_PAIRS:
         raise CannotDraw(
             f"drawing needs {needed} pairs of a tile of {TUNING.tile}x{TUNING.tile} pixels and a splat, the limit is "

@@ -328,24 +328,3 @@ def test_prepare_says_what_it_found(tracked_folder: Path, tmp_path: Path) -> Non
     output = avatar("prepare", tracked_folder, "--out", tmp_path / "prepared")
     assert "image offset 1" in output and "30 frames of 48x48, 24 to train, 6 to test" in output
     assert (tmp_path / "prepared" / "manifest.json").is_file()
-
-
-def test_a_full_gpu_is_a_sentence_that_says_what_to_lower(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> int:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
-
-    monkeypatch.setattr("avatar.commands.run_command", full)
-    output = avatar("doctor", status=1)
-    assert (
-        output.startswith("avatar: the GPU's memory is full: lower --size or model.uv_size")
-        and "Traceback" not in output
-    )
-
-
-def test_other_errors_of_torch_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> int:
-        raise RuntimeError("something else")
-
-    monkeypatch.setattr("avatar.commands.run_command", broken)
-    with pytest.raises(RuntimeError, match="something else"):
-        main(["doctor"])
