@@ -13,7 +13,7 @@ from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
 from avatar.commands.outputs import check_run_folder
 from avatar.compute.choose import choose_device
-from avatar.compute.device import free_bytes
+from avatar.compute.device import CPU, free_bytes
 from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
@@ -91,12 +91,13 @@ def go_on(
             f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
             f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
         )
-    avatar = new_avatar(assets, subject, config, info.perceptual)
-    if checkpoint.step >= config.trainer.iterations:
+    is_complete = checkpoint.step >= config.trainer.iterations
+    chosen = CPU if is_complete else choose_device(device or config.device, print)
+    avatar = new_avatar(assets, subject, config, info.perceptual, chosen)
+    if is_complete:
         leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
         return OK
-    chosen = choose_device(device or config.device, print)
     if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
         print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; the result is the same to rounding")
     size = subject.image_size(config.data.size)
