@@ -116,7 +116,7 @@ def test_a_gpu_that_is_asked_for_by_name_is_used_or_refused(
         ("train", own_folder, "--out", begun.parent / "new"),
     ):
         output = avatar(*command, *way, status=1)
-        assert output.startswith("avatar: ") and "Resuming" not in output
+        assert "\navatar: " in f"\n{output}" and "Resuming" not in output
     assert newest_checkpoint(begun).step == 8 and not list((begun.parent / "new").rglob("*.safetensors"))
 
 
