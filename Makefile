@@ -11,9 +11,9 @@ DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup demo test stress fuzz sanitize wasm arm64 check format smoke wheel clean
+.PHONY: help setup demo test stress fuzz sanitize wasm arm64 gpu-check check format smoke wheel clean
 help: ## show this list
-	@sed -n 's/^\([a-z0-9]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z0-9-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
 setup: $(VENV)/.installed ## make .venv with pinned packages and the compiled core
 
@@ -37,6 +37,9 @@ wasm: ## compile the core to WebAssembly for avatar/web (Debian: emscripten)
 
 arm64: ## compile the core for 64-bit ARM with a cross compiler (Debian: g++-aarch64-linux-gnu)
 	scripts/check_arm64.sh
+
+gpu-check: setup ## verify the GPU's kernels without a GPU (installs Triton, 700 MB)
+	PIP_FLAGS="$(PIP_FLAGS)" scripts/check_gpu_kernels.sh
 
 check: setup ## lint, formatting and types
 	$(BIN)/ruff check .

@@ -39,6 +39,11 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
         place = "" if error.filename is None else f"{error.filename}: "
         return _failed(f"{place}{error.strerror or error}")
     except (MemoryError, RuntimeError) as error:
+        if type(error).__name__ == "OutOfMemoryError":  # torch's for a GPU, which need not be imported yet
+            return _failed(
+                "the GPU's memory is full: lower --size or model.uv_size, end other programs that use it, or take "
+                "--device cpu"
+            )
         if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for it
             raise
         return _failed(f"there is not enough memory ({str(error).splitlines()[0] if str(error) else 'out of memory'})")

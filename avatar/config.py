@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,6 +100,7 @@ class Config:
     data: DataConfig
     model: ModelConfig
     trainer: TrainerConfig
+    device: str
 
     def to_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -108,6 +110,8 @@ MAX_OVERRIDE = 1000  # characters; a message quotes the override
 MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 
+LATER_KEYS = {"device": "auto"}  # which files of earlier versions do not have
+DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 CHOICES: dict[str, tuple[str, ...]] = {
     "model.name": ("hypergaussians", "flashavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
@@ -206,6 +210,7 @@ def config_from_dict(values: dict[str, Any]) -> Config:
         check_choice(key, flat[key], choices)
     for key, (low, high) in RANGES.items():
         check_range(key, flat[key], low, high)
+    check_device(config.device)
     return config
 
 
@@ -216,6 +221,8 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
     kinds = get_type_hints(schema)
     if unknown := [key for key in values if key not in kinds]:
         raise _no_such_key(f"{prefix}{unknown[0]}")
+    if schema is Config:
+        values = {**LATER_KEYS, **values}
     if missing := [key for key in kinds if key not in values]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(
@@ -226,6 +233,11 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
             for name, kind in kinds.items()
         }
     )
+
+
+def check_device(name: str) -> None:
+    if not DEVICE.fullmatch(name):
+        raise UserError(f"device={name} is not one of auto, cpu, cuda, cuda:N (such as cuda:0)")
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:

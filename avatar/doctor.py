@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 import avatar
+from avatar.compute.choose import check_gpu, describe_gpu
 from avatar.config import config_dir
 from avatar.errors import UserError
 from avatar.files.third_party import TRACKING_FILES, require
@@ -30,6 +31,7 @@ def diagnose(say: Callable[[str], None] = print) -> int:
         try_finding("configuration", lambda: str(config_dir()), say),
     ]
     try_finding("video encoder", find_encoder, say)
+    try_finding("GPU", find_gpu, say)
     try_finding("head model", find_default_head, say)
     for file in TRACKING_FILES:
         try_finding(Path(file.name).stem[:16], lambda file=file: f"found ({require(file)})", say)
@@ -79,6 +81,12 @@ def find_mediapipe() -> str:
         return version("mediapipe")
     except PackageNotFoundError:
         return "not installed, so videos cannot be tracked: pip install 'hyperavatar[track]'"
+
+
+def find_gpu() -> str:
+    device = torch.device("cuda", 0)
+    check_gpu(device)
+    return f"{describe_gpu(device)}: computes what the CPU does"
 
 
 def find_default_head() -> str:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from avatar.compute.device import brought, on_gpu
 from avatar.config import ModelConfig
 from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.deformation import DeformationMLP
@@ -15,7 +18,7 @@ from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
-from avatar.head.model import HeadModel
+from avatar.head.model import HeadModel, PoseTensors
 from avatar.types import Gaussians, HeadParams
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
@@ -27,6 +30,9 @@ class Avatar(nn.Module):
     `name = "hypergaussians"`: the network gives each Gaussian a latent, its HyperGaussians turn that into offsets. With
     `latent_grid` the network is evaluated on that grid over the UV map and its latents are interpolated to the Gaussians.
     `name = "flashavatar"`: the network gives the offsets itself; they are not smooth over the map, so no grid is used.
+
+    `to(device)` moves all that drawing needs. `head` stays on the CPU, for those who look at the mesh; cameras and head
+    parameters may be on either side.
     """
 
     code: Tensor
@@ -62,6 +68,7 @@ class Avatar(nn.Module):
         coefficients = (config.sh_degree + 1) ** 2
         self.sh_dc = nn.Parameter(torch.zeros(N, 1, 3))
         self.sh_rest = nn.Parameter(torch.zeros(N, coefficients - 1, 3))
+        self._pose: PoseTensors | None = None  # for posing on a GPU
 
     def __len__(self) -> int:
         """The number of Gaussians."""
@@ -69,18 +76,45 @@ class Avatar(nn.Module):
 
     def forward(self, params: HeadParams, vertices: Float[Tensor, "V 3"] | None = None) -> Gaussians:
         """The Gaussians of one frame, world space. `vertices`: the head posed by `params` already, metres."""
-        points = self.embedding.points(self.head.vertices(params) if vertices is None else vertices)
-        raw = self.deformation(self.code, self.condition(params))
-        if self.grid is not None:
-            raw = self.grid.interpolate(raw)
-        if self.hyper is not None:
-            raw = self.hyper(raw)
+        vertices = self.vertices(params) if vertices is None else vertices
+        values = self.deformation(self.code, self.condition(params))
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
-        return compose_raw(points, self.quats, self.log_scales, self.opacity_logits, sh, raw)
+        base = self.quats, self.log_scales, self.opacity_logits, sh
+        if on_gpu(values) and values.dtype == torch.float32:
+            from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
+
+            grid = None if self.grid is None else self.grid.interpolate
+            packed = None if self.hyper is None else self.hyper.packed
+            return place_gpu(vertices, values, packed, *base, self.embedding, grid)
+        if self.grid is not None:
+            values = self.grid.interpolate(values)
+        if self.hyper is not None:
+            values = self.hyper(values)
+        return compose_raw(self.embedding.points(vertices), *base, values)
+
+    def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
+        """The posed head where the avatar is, metres; on a GPU without gradients."""
+        device = self.code.device
+        if not on_gpu(self.code):
+            return self.head.vertices(params)
+        if self._pose is None or self._pose.shape.device != device:
+            self._pose = self.head.pose_tensors(device)
+        if self._pose is None:
+            return brought(self.head.vertices(params.to(torch.device("cpu"))), device)
+        from avatar.head.pose_gpu import pose_gpu
+
+        return pose_gpu(self._pose, params.to(device))
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Avatar:
+        super()._apply(fn, recurse)
+        self.embedding.move(self.code.device)
+        if self.grid is not None:
+            self.grid.interpolate.move(self.code.device)
+        return self
 
     def condition(self, params: HeadParams) -> Float[Tensor, " D"]:
         """The network's input, with expression coefficients that the frame does not carry as zeros."""
-        condition = params.condition()
+        condition = brought(params.condition(), self.code.device)
         missing = self.deformation.condition_size - len(condition)
         if missing == 0:
             return condition

@@ -1,8 +1,9 @@
 """A trained avatar's pictures as fast as possible: what never changes is computed once, and frames are drawn side by side.
 
-`Renderer` gives what `splat(avatar(params), camera, background)` gives, to rounding, without autograd. Computed once: the
-first layer's product with the positional code, the colours, and each HyperGaussian, which for inference is an affine map
-of its latent: n multiply-adds for each of ten offsets remain.
+`Renderer` gives what `splat(avatar(params), camera, background)` gives, to rounding, without autograd, where the avatar is.
+Computed once: the first layer's product with the positional code, the colours and, on a CPU, each HyperGaussian, which for
+inference is an affine map of its latent: n multiply-adds for each of ten offsets remain. On a GPU the launches count, and
+one does all that follows the network.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose, split_offsets
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
+from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 AHEAD_PER_WORKER = 2  # frames begun before the first of them is asked for
+AHEAD_ON_GPU = 3  # frames whose copies are on their way
 
 
 class Renderer:
@@ -36,10 +40,12 @@ class Renderer:
 
     @torch.no_grad()
     def __init__(self, avatar: Avatar, background: Float[Tensor, " 3"]) -> None:
-        self.background = background.detach().clone()
+        self.background = brought(background.detach().clone(), avatar.code.device)
         self._avatar = avatar
         self._network = FoldedNetwork(avatar)
-        self._heads = None if avatar.hyper is None else avatar.hyper.fold()
+        self._on_gpu = on_gpu(avatar.code)
+        self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
+        self._packed = None if avatar.hyper is None else avatar.hyper.packed.detach().clone() if self._on_gpu else None
         self._base = {
             name: getattr(avatar, name).detach().clone() for name in ("quats", "log_scales", "opacity_logits")
         }
@@ -48,6 +54,19 @@ class Renderer:
     @torch.no_grad()
     def gaussians(self, params: HeadParams) -> Gaussians:
         """What `avatar(params)` gives, to rounding."""
+        if self._on_gpu:
+            from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
+
+            avatar, grid = self._avatar, self._avatar.grid
+            values = self._network(avatar.condition(params))
+            return place_gpu(
+                self.vertices(params),
+                values,
+                self._packed,
+                **self._base,
+                embedding=avatar.embedding,
+                grid=None if grid is None else grid.interpolate,
+            )
         return self.place(self.points(self.vertices(params)), self.offsets(self.latents(params)))
 
     @torch.no_grad()
@@ -58,10 +77,14 @@ class Renderer:
     def stream(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         """Many frames in order, as many per second as possible: each is drawn by one thread, several at a time.
 
-        `frames` may be endless; a few of them are taken ahead. An exception of a frame is raised when its turn comes.
+        `frames` may be endless; a few of them are taken ahead. An exception of a frame is raised when its turn comes. The
+        pictures are on the CPU; a GPU draws the next ones while one is copied.
         """
+        if self.background.is_cuda:
+            yield from self._stream_from_gpu(frames)
+            return
         workers = thread_count()
-        if workers == 1:
+        if workers == 1 or self._on_gpu:
             yield from (self.render(*frame) for frame in frames)
             return
         source = iter(frames)
@@ -78,11 +101,29 @@ class Renderer:
                 for future in pending:
                     future.cancel()
 
+    def _stream_from_gpu(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
+        pending: deque[tuple[tuple[HeadParams, Camera], Rendering, torch.cuda.Event]] = deque()
+        for frame in frames:
+            copies = Rendering(*(t.to("cpu", non_blocking=True) for t in self.render(*frame)))
+            arrived = torch.cuda.Event()
+            arrived.record()
+            pending.append((frame, copies, arrived))
+            if len(pending) > AHEAD_ON_GPU:
+                yield self._arrived(*pending.popleft())
+        while pending:
+            yield self._arrived(*pending.popleft())
+
+    def _arrived(self, frame: tuple[HeadParams, Camera], copies: Rendering, arrived: torch.cuda.Event) -> Rendering:
+        arrived.synchronize()
+        if bool(copies.alpha.isnan().any()):  # the buffers were too small
+            copies = Rendering(*(t.cpu() for t in with_room(lambda: self.render(*frame))))
+        return copies
+
     # The steps of `gaussians`, apart so that they can be timed; without autograd where their caller is.
 
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
         """The posed mesh, metres."""
-        return self._avatar.head.vertices(params)
+        return self._avatar.vertices(params)
 
     def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
         """Where the Gaussians are bound on the mesh, metres."""

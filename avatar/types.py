@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import brought
+
 IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
@@ -65,6 +67,14 @@ class HeadParams:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""
         return torch.cat((self.expression, self.jaw, self.eyes, self.eyelids))
 
+    def to(self, device: torch.device) -> HeadParams:
+        """The same on another device, brought there in one copy."""
+        if self.jaw.device == device:
+            return self
+        parts = (self.expression, self.jaw, self.eyes, self.eyelids, self.neck)
+        expression, jaw, eyes, eyelids, neck = brought(torch.cat(parts), device).split([len(part) for part in parts])
+        return HeadParams(expression, jaw, eyes, eyelids, neck)
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -78,6 +88,7 @@ class Frame:
     alpha: Float[Tensor, "H W"]  # foreground matte; ones where the subject has none
     head_mask: Float[Tensor, "H W"]  # head and neck; ones where the subject has none
     mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth
+    head_box: tuple[slice, slice] | None = None  # rows and columns that hold the head mask, if they are known already
 
     def composite(self, background: Float[Tensor, 3]) -> Float[Tensor, "H W 3"]:
         """The training target: matte over the background, then the head mask over the background again.

@@ -39,6 +39,13 @@ def test_later_overrides_win_and_survive_a_round_trip() -> None:
     assert config_from_dict(config.to_dict()) == config
 
 
+def test_a_configuration_says_where_it_computes() -> None:
+    assert load_config([]).device == "auto" and load_config(["device=cuda:1"]).device == "cuda:1"
+    older = load_config([]).to_dict()
+    del older["device"]
+    assert config_from_dict(older).device == "auto"
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -71,6 +78,7 @@ def test_later_overrides_win_and_survive_a_round_trip() -> None:
         ("data.background=#ff00", "data.background=#ff00 is not valid: it must be a colour"),
         ("data.background=", "data.background= is not valid: it must be a colour"),
         ("data.background=null", "data.background=null is not valid: it must be a colour"),
+        ("device=gpu", "device=gpu is not one of auto, cpu, cuda, cuda:N"),
         ("protocol=strict", "no configuration key 'protocol'"),
         ("trainer.learning_rates=1", "no configuration key 'trainer.learning_rates'"),
         ("size", "'size' is not of the form key=value"),

@@ -17,6 +17,7 @@ from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import available_simd, limited_to
 from avatar.bench.plain import splat_plain
 from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
+from avatar.bench.splat_gpu import ON_GPU, device_of, gpu_backends, settle, splat_gsplat
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.types import Gaussians, Rendering
@@ -33,7 +34,7 @@ OWN_SIZE = 128  # pixels, at most, where a variant with its own cut-offs is comp
 
 @dataclass(frozen=True)
 class Variant:
-    backend: Literal["cpu", "plain", "reference"]
+    backend: Literal["cpu", "gpu", "gsplat", "plain", "reference"]
     count: int  # splats
     size: int  # pixels, width and height
     threads: int
@@ -112,7 +113,8 @@ def all_variants(
 
     Every size with `count` splats and every count at `size`, with one thread and with all; at (`count`, `size`) also the
     numbers of threads between (with `all_threads`), the other instruction sets, other cut-offs, and the float64 reference.
-    The plain splatter draws `count` splats with one thread: its many small operations have little for a second one.
+    The plain splatter draws `count` splats with one thread: its many small operations have little for a second one. Where
+    there is a GPU, every scene is drawn there too.
     """
     *others, best = available_simd()
     most = torch.get_num_threads()
@@ -124,6 +126,7 @@ def all_variants(
     variants += [Variant("cpu", count, size, t, simd) for simd in others for t in threads]
     variants += [Variant("cpu", count, size, most, best, alpha_min=value) for value in OTHER_ALPHA_MINS]
     variants += [Variant("cpu", count, size, most, best, t_min=value) for value in OTHER_T_MINS]
+    variants += [Variant(backend, n, s, most, "") for backend in gpu_backends() for n, s in scenes]  # type: ignore[arg-type]
     variants += [Variant("plain", count, s, 1, "") for s in plain_sizes]
     return [*variants, Variant("reference", count, size, most, "")]
 
@@ -173,12 +176,14 @@ def reference_of(gaussians: Gaussians, size: int, *, alpha_min: float = ALPHA_MI
 
 
 def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, function: Draw = splat) -> Accuracy:
-    """The variant's errors at `size` pixels; UserError if they are above the tolerances.
+    """The variant's errors at `size` pixels; UserError if they are above the tolerances, unless it is somebody else's.
 
     Where the variant has its own cut-offs, its errors against a reference with the same ones decide, at OWN_SIZE or less.
     """
     accuracy = accuracy_of(variant, gaussians, size, truth, function)
     found = accuracy
+    if variant.backend == "gsplat":
+        return accuracy
     if not variant.has_usual_cutoffs:
         size = min(size, OWN_SIZE)
         own = reference_of(gaussians, size, **variant.cutoffs)
@@ -193,11 +198,11 @@ def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, fu
 
 
 def accuracy_of(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, function: Draw = splat) -> Accuracy:
-    leaves = Gaussians(*(t.clone().requires_grad_() for t in gaussians))
+    leaves = leaves_of(variant, gaussians)
     found = draw(variant, leaves, size, function)
-    gradients = torch.autograd.grad(found.image, leaves, truth.cotangent)
-    difference = (found.image.detach() - truth.rendering.image)[truth.clear]
-    gradient = max(float((a - b).norm() / b.norm()) for a, b in zip(gradients, truth.gradients, strict=True))
+    gradients = torch.autograd.grad(found.image, leaves, truth.cotangent.to(found.image.device))
+    difference = (found.image.detach().cpu() - truth.rendering.image)[truth.clear]
+    gradient = max(float((a.cpu() - b).norm() / b.norm()) for a, b in zip(gradients, truth.gradients, strict=True))
     return Accuracy(
         size,
         float(difference.abs().max()),
@@ -211,8 +216,8 @@ def time_in_turns(
     variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int, function: Draw = splat
 ) -> list[Timing]:
     """All variants in turns; the plain ones and the reference, seconds long, have three rounds of their own after them."""
-    fast = [v for v in variants if v.backend == "cpu"]
-    slow = [v for v in variants if v.backend != "cpu"]
+    fast = [v for v in variants if v.backend in ("cpu", *ON_GPU)]
+    slow = [v for v in variants if v not in fast]
     times: dict[tuple[Variant, str], Time] = {}
     for group, rounds in ((fast, repeats), (slow, min(repeats, 3))):
         functions = {
@@ -228,22 +233,34 @@ def passes_of(
     variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat
 ) -> dict[str, Callable[[], object]]:
     """The forward pass, and the backward pass of the drawing that the forward pass made last."""
-    leaves, cotangent = Gaussians(*(t.clone().requires_grad_() for t in gaussians)), torch.ones(size, size, 3)
+    device = device_of(variant.backend)
+    leaves, cotangent = leaves_of(variant, gaussians), torch.ones(size, size, 3, device=device)
     drawn: list[Rendering] = []
 
     def forward() -> None:
         drawn[:] = [draw(variant, leaves, size, function)]
+        settle(device)
 
     def backward() -> object:
         with limited_to(threads=variant.threads, simd=variant.simd):
-            return torch.autograd.grad(drawn.pop().image, leaves, cotangent)
+            gradients = torch.autograd.grad(drawn.pop().image, leaves, cotangent)
+            settle(device)
+            return gradients
 
     return {"forward": forward, "backward": backward}
 
 
+def leaves_of(variant: Variant, gaussians: Gaussians) -> Gaussians:
+    """Copies to differentiate in, where the variant draws."""
+    device = device_of(variant.backend)
+    return Gaussians(*(t.detach().clone().to(device).requires_grad_() for t in gaussians))
+
+
 def draw(variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat) -> Rendering:
-    camera, black = head_camera(size), torch.zeros(3)
+    camera, black = head_camera(size), torch.zeros(3, device=gaussians.means.device)
     with limited_to(threads=variant.threads, simd=variant.simd):
+        if variant.backend == "gsplat":
+            return splat_gsplat(gaussians, camera)
         if variant.backend == "plain":
             return splat_plain(gaussians, camera, black, **variant.cutoffs)
         return function(gaussians, camera, black, backend=variant.backend, **variant.cutoffs)

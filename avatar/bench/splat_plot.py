@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avatar.bench.results import new_figure
+from avatar.bench.splat_gpu import ON_GPU
 
 if TYPE_CHECKING:
     from avatar.bench.splat import Row
@@ -19,7 +20,13 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
     count, size = truth.variant.count, truth.variant.size
 
     here = [row for row in rows if (row.variant.count, row.variant.size) == (count, size)]
-    for mark, kind in (("o", "instructions, threads"), ("v", "alpha_min"), ("^", "t_min"), ("s", "plain torch")):
+    for mark, kind in (
+        ("o", "instructions, threads"),
+        ("v", "alpha_min"),
+        ("^", "t_min"),
+        ("s", "plain torch"),
+        ("*", "GPU"),
+    ):
         points = [(row, row.accuracy) for row in here if row.accuracy and kind_of(row) == kind]
         by_error.scatter(
             [a.gradient for _, a in points], [total(row) for row, _ in points], s=30, marker=mark, label=kind
@@ -53,6 +60,12 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
         counts = sorted((row.variant.count, total(row)) for row in own if row.variant.size == size)
         for axes, line in ((by_size, sizes), (by_count, counts)):
             axes.plot(*zip(*line, strict=True), marker="o", ms=4, label=f"cpu {best}, threads: {threads}")
+    for backend in sorted({row.variant.backend for row in rows if kind_of(row) == "GPU"}):
+        own = [row for row in rows if row.variant.backend == backend]
+        sizes = sorted((row.variant.size, total(row)) for row in own if row.variant.count == count)
+        counts = sorted((row.variant.count, total(row)) for row in own if row.variant.size == size)
+        for axes, line in ((by_size, sizes), (by_count, counts)):
+            axes.plot(*zip(*line, strict=True), "*-", ms=5, label=backend)
     plain = sorted((row.variant.size, total(row)) for row in rows if row.variant.backend == "plain")
     by_size.plot(*zip(*plain, strict=True), "s-", color="tab:red", ms=4, label="plain torch, threads: 1")
     for axes, x in ((by_size, size), (by_count, count)):
@@ -75,6 +88,8 @@ def kind_of(row: Row) -> str:
     variant = row.variant
     if variant.backend == "plain":
         return "plain torch"
+    if variant.backend in ON_GPU:
+        return "GPU"
     if variant.has_usual_cutoffs:
         return "instructions, threads"
     return "t_min" if "T" in variant.changed else "alpha_min"
@@ -82,8 +97,8 @@ def kind_of(row: Row) -> str:
 
 def note(row: Row) -> str:
     variant = row.variant
-    if variant.backend == "plain":
-        return "plain"
+    if variant.backend in ("plain", *ON_GPU):
+        return variant.backend
     return f"{variant.simd}, {variant.threads}" if variant.has_usual_cutoffs else variant.changed
 
 

@@ -9,6 +9,7 @@ from avatar.commands import OK
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, open_trained, source_of
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.commands.tracking import is_video, tracked_once
+from avatar.compute.choose import choose_device
 from avatar.files.video import VIDEO_SUFFIXES
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
@@ -20,6 +21,7 @@ from data_prep.open import open_subject
 
 def run_reenact(arguments: Namespace) -> int:
     trained = open_trained(arguments.run, arguments.head)
+    trained.avatar.to(choose_device(arguments.device or "auto", print))
     choices = Choices(
         arguments.transfer,
         arguments.strength,

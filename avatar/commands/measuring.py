@@ -8,6 +8,7 @@ from argparse import Namespace
 from avatar.commands import OK
 from avatar.commands.opening import open_run
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.compute.choose import choose_device
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
@@ -16,6 +17,7 @@ from avatar.evaluation.protocol import choose_protocols
 
 def run_eval(arguments: Namespace) -> int:
     run = open_run(arguments.run, arguments.head, arguments.folder)
+    run.avatar.to(choose_device(arguments.device or "auto", print))
     results = evaluate(run, arguments.protocol, write_frames=arguments.frames or arguments.verify)
     if arguments.verify:
         from avatar.evaluation.verify import verify  # imports scikit-image, which nothing else here needs

@@ -84,6 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument(
         "--minutes", type=float, metavar="M", help="with --refine: about what all of it may take, by fewer steps"
     )
+    add_device(train, "the configuration's, auto")
     train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
@@ -101,6 +102,7 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="write them, and compute PSNR and SSIM again from the files, with scikit-image",
     )
+    add_device(evaluate)
 
     refine = commands.add_parser("refine", help="improve the tracking of a run's video through its avatar")
     add_run(refine)
@@ -149,6 +151,7 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument(
         "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
     )
+    add_device(reenact)
 
     add_export(commands.add_parser("export", help="write an avatar as a file to take away"))
 
@@ -294,6 +297,14 @@ def add_folder(parser: argparse.ArgumentParser) -> None:
 def add_avatar(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="AVATAR", help="folder that avatar train wrote, or its avatar file")
     add_head(parser)
+
+
+def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
+    parser.add_argument(
+        "--device",
+        metavar="auto|cpu|cuda[:N]",
+        help=f"what computes; auto takes a GPU that passes its test (default: {default})",
+    )
 
 
 def add_head(parser: argparse.ArgumentParser) -> None:

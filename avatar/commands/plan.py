@@ -10,6 +10,7 @@ import torch
 
 from avatar.commands.opening import split_sizes
 from avatar.commands.training import new_avatar
+from avatar.compute.device import CPU
 from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.errors import UserError
@@ -103,7 +104,7 @@ def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: fl
         return asked
     subject, assets = open_subject(source, split_sizes(config), print)
     term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))
-    avatar = new_avatar(assets, subject, config, term.name)
+    avatar = new_avatar(assets, subject, config, term.name, CPU)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
     step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds

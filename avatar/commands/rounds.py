@@ -32,6 +32,8 @@ def run_train(arguments: Namespace) -> int:
     """With rounds where they are asked for, or were when the run began; else `training`."""
     run = arguments.out or training.default_run(arguments.folder)
     overrides = training.config_overrides(arguments)
+    if arguments.device is not None and (arguments.refine is not None or plan_file(run).exists()):
+        overrides.append(f"device={arguments.device}")
     if arguments.resume and plan_file(run).exists():
         training.forget_video(arguments)
         plan = Plan.load(run)

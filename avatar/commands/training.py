@@ -13,6 +13,8 @@ from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
 from avatar.commands.outputs import check_run_folder
 from avatar.commands.tracking import head_for_video, is_video, tracked_once
+from avatar.compute.choose import choose_device
+from avatar.compute.device import CPU, free_bytes
 from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
@@ -37,10 +39,10 @@ def run_train(arguments: Namespace) -> int:
     if arguments.resume:
         forget_video(arguments)
         refuse_changes(run, read_run_info(run), arguments, overrides)
-        return resume_run(run, arguments.head, arguments.folder)
+        return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
     load_config(overrides)  # a mistake in it before one in the folder
     check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
-    return train_new(tracked_source(arguments), overrides, run)
+    return train_new(tracked_source(arguments), overrides, run, arguments.device)
 
 
 def tracked_source(arguments: Namespace) -> Source:
@@ -57,25 +59,34 @@ def forget_video(arguments: Namespace) -> None:
         arguments.folder = None
 
 
+def asked_device(overrides: list[str]) -> str | None:
+    """What the command line says of `device`, the one key of a configuration that a run may change."""
+    own = [override for override in overrides if override.partition("=")[0] == "device"]
+    return load_config(own).device if own else None
+
+
 def default_run(folder: Path | None) -> Path:
     if folder is None:
         raise UserError("say which run to go on with: avatar train --resume --out RUN")
     return Path("runs") / (folder.resolve().stem if folder.is_file() else folder.resolve().name)
 
 
-def train_new(source: Source, overrides: list[str], run: Path) -> int:
+def train_new(source: Source, overrides: list[str], run: Path, device: str | None = None) -> int:
+    """`device` stands in for the configuration's."""
     config = load_config(overrides)
     with locked(run):
         refuse_trained(run)
+        chosen = choose_device(device or config.device, print)
         subject, assets = open_subject(source, split_sizes(config))
         check_divided(subject.split)
-        perceptual = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
-        avatar = new_avatar(assets, subject, config, perceptual.name)
+        size = subject.image_size(config.data.size)
+        perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
+        avatar = new_avatar(assets, subject, config, perceptual.name, chosen)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
-        return finish_training(avatar, subject, config, run, perceptual)
+        return finish_training(avatar, subject, config, run, perceptual, chosen)
 
 
-def resume_run(run: Path, head: Path | None = None, folder: Path | None = None) -> int:
+def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, device: str | None = None) -> int:
     """Go on from the newest checkpoint, with the decisions that the run began with."""
     with locked(run):
         info, checkpoint = read_run_info(run), newest_checkpoint(run)
@@ -83,33 +94,40 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None) 
         subject, assets = open_subject(source, split_sizes(info.config))
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
-        return go_on(run, info, checkpoint, subject, assets)
+        return go_on(run, info, checkpoint, subject, assets, device)
 
 
-def go_on(run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets) -> int:
+def go_on(
+    run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets, device: str | None
+) -> int:
     config = info.config
     if checkpoint.meta.get("threads") != torch.get_num_threads():
         print(
             f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
             f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
         )
-    avatar = new_avatar(assets, subject, config, info.perceptual)
-    if checkpoint.step >= config.trainer.iterations:
+    is_complete = checkpoint.step >= config.trainer.iterations
+    chosen = CPU if is_complete else choose_device(device or config.device, print)
+    avatar = new_avatar(assets, subject, config, info.perceptual, chosen)
+    if is_complete:
         leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
         return OK
+    if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
+        print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; the result is the same to rounding")
     size = subject.image_size(config.data.size)
-    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, size=size)
+    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, size=size, device=chosen)
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
-    return finish_training(avatar, subject, config, run, perceptual, checkpoint)
+    return finish_training(avatar, subject, config, run, perceptual, chosen, checkpoint)
 
 
-def new_avatar(assets: HeadAssets, subject: Subject, config: Config, perceptual: str) -> Avatar:
+def new_avatar(assets: HeadAssets, subject: Subject, config: Config, perceptual: str, device: torch.device) -> Avatar:
     """An avatar with its initial parameters. Raises UserError, before any is made, when training it needs more memory than
     there is."""
     size = subject.image_size(config.data.size)
     frames = len(subject.split.train)
-    check_memory("training", training_needs(config, assets, frames=frames, size=size, perceptual=perceptual))
+    needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual)
+    check_memory("training", needs, free_bytes(device))
     torch.manual_seed(config.trainer.seed)
     return Avatar(assets, subject.identity, config.model)
 
@@ -120,6 +138,7 @@ def finish_training(
     config: Config,
     run: Path,
     perceptual: PerceptualTerm,
+    device: torch.device,
     checkpoint: Checkpoint | None = None,
 ) -> int:
     split = subject.split
@@ -128,7 +147,7 @@ def finish_training(
         f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
     )
     begin = time.monotonic()
-    done = train(avatar, subject, config, run, perceptual, resume=checkpoint)
+    done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
     first = checkpoint.step if checkpoint else 0
     seconds = time.monotonic() - begin
     rate = f"{seconds / max(done - first, 1):.3f} s per step"
@@ -158,7 +177,7 @@ def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: li
         recorded = {**flatten(info.config.to_dict()), **info.options}
         asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
         for key in (override.partition("=")[0] for override in overrides):
-            if recorded[key] != asked[key]:
+            if key != "device" and recorded[key] != asked[key]:
                 raise UserError(
                     f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
                     "start a new run"

@@ -7,6 +7,7 @@ from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
+from avatar.data.shelf import Shelf
 from avatar.data.subject import FramePixels, Subject
 from avatar.types import Frame
 
@@ -24,7 +25,8 @@ def cache_estimate(subject: Subject, size: int | None = None, count: int | None 
 class FrameLoader:
     """Decoded frames of a subject. Keeps the most recently used ones as uint8, at most `cache_bytes` of them.
 
-    Use it as a context manager, or call `close`; the frames do not depend on the cache or on the number of workers.
+    Use it as a context manager, or call `close`; the frames do not depend on the cache or on the number of workers. With a
+    `shelf` they are on its GPU, and what it holds is decoded once.
     """
 
     def __init__(
@@ -33,6 +35,7 @@ class FrameLoader:
         size: int | None = None,
         cache_bytes: int = DEFAULT_CACHE_BYTES,
         workers: int = 2,
+        shelf: Shelf | None = None,
     ) -> None:
         if workers < 1:
             raise ValueError(f"workers must be at least 1, got {workers}")
@@ -42,6 +45,7 @@ class FrameLoader:
         self.size = size
         self.cache_bytes = cache_bytes
         self.cached_bytes = 0
+        self._shelf = shelf
         self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
         self._ahead = workers * FRAMES_AHEAD
         self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="frames")
@@ -82,19 +86,32 @@ class FrameLoader:
                     index = next(order, None)
                     if index is None:
                         break
-                    if index not in self._cache and index not in pending:
+                    if not self._holds(index) and index not in pending:
                         pending[index] = self._pool.submit(self.subject.pixels, index, self.size)
                     queue.append((index, pending.get(index)))
                 if not queue:
                     return
                 index, future = queue.popleft()
-                pixels = self._take(index, future)
+                on_shelf = self._shelf is not None and index in self._shelf
+                pixels = None if on_shelf else self._take(index, future)
                 if not any(waiting == index for waiting, _ in queue):
                     pending.pop(index, None)
-                yield self.subject.assemble(index, pixels, self.size)
+                yield self._frame(index, pixels)
         finally:
             for future in pending.values():
                 future.cancel()
+
+    def _holds(self, index: int) -> bool:
+        return index in self._cache or (self._shelf is not None and index in self._shelf)
+
+    def _frame(self, index: int, pixels: FramePixels | None) -> Frame:
+        if self._shelf is not None:
+            frame = self._shelf.frame(index, pixels, self.size)
+            if index in self._shelf and index in self._cache:  # in one place only
+                self.cached_bytes -= self._cache.pop(index).nbytes
+            return frame
+        assert pixels is not None
+        return self.subject.assemble(index, pixels, self.size)
 
     def _take(self, index: int, future: Future[FramePixels] | None) -> FramePixels:
         if index in self._cache:

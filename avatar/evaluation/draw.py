@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -11,12 +12,14 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from avatar.compute.device import brought
 from avatar.data.background import Colour
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer, drawn
+from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
 from avatar.types import Frame
 
@@ -27,21 +30,23 @@ TIMED_FRAMES, WARM_UP = 30, 3
 
 
 def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, Pair]:
-    """Render and truth of a frame for each look; looks of one background share the drawing."""
+    """Render and truth of a frame for each look, where the avatar is; looks of one background share the drawing."""
+    device = renderer.background.device
     gaussians = renderer.gaussians(frame.params)
     images: dict[Colour, Pair] = {}
     pairs = {}
     for look in looks:
         if look.background not in images:
             colour = torch.tensor(look.background)
-            images[look.background] = Pair(drawn(gaussians, frame.camera, colour).image, frame.composite(colour))
+            picture = with_room(partial(drawn, gaussians, frame.camera, brought(colour, device)))
+            images[look.background] = Pair(picture.image, brought(frame.composite(colour), device))
         pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
     return pairs
 
 
 def panel(pair: Pair, captions: tuple[str, str] = ("truth", "render")) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
     """Truth, render and error map side by side under captions."""
-    render, truth = (image / 255.0 if image.dtype == torch.uint8 else image for image in pair)
+    render, truth = (image.cpu() / 255.0 if image.dtype == torch.uint8 else image.cpu() for image in pair)
     images = (truth, render, error_map(render, truth, ERROR_SCALE))
     return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"))
 
@@ -66,7 +71,7 @@ def speed(renderer: Renderer, subject: Subject, indices: Sequence[int], size: in
     for index in [*chosen[:1] * WARM_UP, *chosen]:
         params, camera = subject.params(index), subject.camera(index, size)
         begin = time.perf_counter()
-        renderer.render(params, camera)
+        renderer.render(params, camera).alpha[0, 0].item()  # a GPU is waited for
         seconds.append(time.perf_counter() - begin)
     timed = np.array(seconds[WARM_UP:]) * 1000.0
     width, height = subject.image_size(size)

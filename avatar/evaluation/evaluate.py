@@ -72,7 +72,7 @@ def evaluate(
     chosen = [protocol for protocol in asked if protocol.name not in left_out]
     folder = run.path / "eval"
     renderer = Renderer(run.avatar, torch.tensor(chosen[0].background))
-    networks = find_networks(protocol.lpips_net for protocol in chosen)
+    networks = find_networks((protocol.lpips_net for protocol in chosen), renderer.background.device)
     lpips: dict[Net, Lpips | None] = {net: found.network for net, found in networks.items()}
     order = sorted(set().union(*indices.values()))
     known = conditions(run.avatar.head, subject, order)

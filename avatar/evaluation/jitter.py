@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from avatar.compute.device import brought
 from avatar.evaluation.measure import Pair
 from avatar.losses.metrics import weighted_mean
 
@@ -34,7 +35,8 @@ class JitterMeter:
     def add(self, time: int, pair: Pair, head_mask: UInt8[Tensor, "H W"]) -> None:
         """The next picture in the order of time; three of successive `time` give the middle one its figure."""
         error = pair.render.float() - pair.truth.float()
-        self._recent.append(_Moment(time, error if pair.render.dtype == torch.uint8 else error * 255.0, head_mask))
+        error = error if pair.render.dtype == torch.uint8 else error * 255.0
+        self._recent.append(_Moment(time, error, brought(head_mask, error.device)))
         if len(self._recent) < 3:
             return
         before, middle, after = self._recent

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import torch
+
+from avatar.compute.device import CPU
 from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import NETS, Lpips, Net
 
@@ -21,9 +24,13 @@ class ChosenLpips(NamedTuple):
         }
 
 
-def find_networks(nets: Iterable[Net]) -> dict[Net, ChosenLpips]:
-    """The network of each backbone, loaded once."""
-    return {net: find_lpips(net) for net in dict.fromkeys(nets)}
+def find_networks(nets: Iterable[Net], device: torch.device = CPU) -> dict[Net, ChosenLpips]:
+    """The network of each backbone, loaded once, on a device."""
+    found: dict[Net, ChosenLpips] = {net: find_lpips(net) for net in dict.fromkeys(nets)}
+    for chosen in found.values():
+        if chosen.network is not None:
+            chosen.network.on(device)
+    return found
 
 
 def find_lpips(net: Net) -> ChosenLpips:

@@ -48,5 +48,5 @@ def clear_pictures(folder: Path) -> None:
 
 
 def _png(image: Tensor) -> bytes:
-    pixels = (image if image.dtype == torch.uint8 else to_8_bit(image)).numpy()
+    pixels = (image if image.dtype == torch.uint8 else to_8_bit(image)).cpu().numpy()
     return cv2.imencode(".png", pixels[..., ::-1] if pixels.ndim == 3 else pixels)[1].tobytes()

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from avatar.gaussians.hyper_cpu import Touching, touching_lists
 from avatar.gaussians.uv import UVTexels
 from avatar.head.assets import HeadAssets
 
@@ -20,6 +21,7 @@ class Embedding:
         self.corners: Int[Tensor, "N 3"] = assets.faces[texels.face]
         self.barycentric: Float[Tensor, "N 3"] = texels.barycentric
         self._flat_corners = self.corners.reshape(-1)
+        self._touching: Touching | None = None
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -27,6 +29,18 @@ class Embedding:
     def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
         corners = vertices.index_select(0, self._flat_corners).reshape(-1, 3, 3)
         return (corners * self.barycentric.to(vertices.dtype)[:, :, None]).sum(dim=1)
+
+    def touching(self, num_vertices: int) -> Touching:
+        """The Gaussians that hang on each vertex; made when it is first asked for."""
+        if self._touching is None:
+            self._touching = touching_lists(self.corners, self.barycentric, num_vertices)
+        return self._touching
+
+    def move(self, device: torch.device) -> None:
+        """Bring it to where the vertices are to be. The texels stay: they are for people."""
+        if self.corners.device != device:
+            self.corners, self.barycentric = self.corners.to(device), self.barycentric.to(device)
+            self._flat_corners, self._touching = self.corners.reshape(-1), None
 
 
 def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, " N"]:

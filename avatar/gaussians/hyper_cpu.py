@@ -6,7 +6,7 @@ same for any number of threads.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -98,6 +98,22 @@ def interpolate(
     return Interpolation(cells, weights, len(grid_values))(grid_values)
 
 
+class Touching(NamedTuple):
+    """For each place the Gaussians that take part of it, place by place, in the order of the Gaussians."""
+
+    begins: Int[Tensor, " M+1"]  # of each place's list
+    gaussians: Int[Tensor, " E"]  # int32
+    weights: Float[Tensor, " E"]
+
+
+def touching_lists(cells: Int[Tensor, "N k"], weights: Float[Tensor, "N k"], num_cells: int) -> Touching:
+    """The lists of `num_cells` places, of which each Gaussian takes part of k."""
+    flat, order = cells.reshape(-1), torch.argsort(cells.reshape(-1), stable=True)
+    ends = torch.bincount(flat, minlength=num_cells).cumsum(0)
+    begins = torch.cat((cells.new_zeros(1), ends))
+    return Touching(begins, (order // cells.shape[1]).int(), weights.reshape(-1)[order])
+
+
 class Interpolation:
     """Values at `num_cells` places, four of which are mixed for each of N Gaussians.
 
@@ -118,21 +134,22 @@ class Interpolation:
             raise ValueError(f"cells must be 0 to {num_cells - 1}, got {int(cells[tuple(first)])} at {first}")
         self.num_cells = num_cells
         self.cells, self.weights = cells.contiguous(), weights.detach().contiguous()
-        by_cell = torch.argsort(cells.reshape(-1), stable=True)
-        self._corners = self.cells.int(), self.weights
-        self._touching = (
-            torch.cat((cells.new_zeros(1), torch.bincount(cells.reshape(-1), minlength=num_cells).cumsum(0))),
-            (by_cell // 4).int(),
-            self.weights.reshape(-1)[by_cell],
-        )
+        self.corners = self.cells.int(), self.weights
+        self.touching = touching_lists(self.cells, self.weights, num_cells)
 
     def __call__(self, grid_values: Float[Tensor, "G n"]) -> Float[Tensor, "N n"]:
         """The mixed values. Float32 on the CPU goes through the kernel, all else through torch's own operations."""
         check_shapes(grid_values=(grid_values, f"{self.num_cells} n"))
         if grid_values.dtype == torch.float32 and grid_values.device.type == "cpu":
-            return _Interpolate.apply(grid_values, self._corners, self._touching)  # pyright: ignore
+            return _Interpolate.apply(grid_values, self.corners, self.touching)  # pyright: ignore
         weights = self.weights.to(grid_values)
         return (grid_values[self.cells.to(grid_values.device)] * weights[..., None]).sum(dim=1)
+
+    def move(self, device: torch.device) -> None:
+        """Bring it to where the values are to be."""
+        self.cells, self.weights = self.cells.to(device), self.weights.to(device)
+        self.corners = self.corners[0].to(device), self.weights
+        self.touching = Touching(*(tensor.to(device) for tensor in self.touching))
 
 
 class _Interpolate(torch.autograd.Function):
@@ -141,7 +158,7 @@ class _Interpolate(torch.autograd.Function):
         ctx: Any,
         grid_values: Tensor,
         corners: tuple[Tensor, Tensor],
-        touching: tuple[Tensor, Tensor, Tensor],
+        touching: Touching,
     ) -> Tensor:
         ctx.shape, ctx.touching = grid_values.shape, touching
         out = torch.empty((len(corners[0]), grid_values.shape[1]), dtype=torch.float32)
@@ -153,6 +170,6 @@ class _Interpolate(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore
         grad_grid = torch.empty(ctx.shape, dtype=torch.float32)
-        touching: tuple[Tensor, Tensor, Tensor] = ctx.touching
+        touching: Touching = ctx.touching
         _core.interpolate_backward(grad.contiguous(), *touching, instruction_set(), thread_count(), grad_grid)
         return grad_grid, None, None

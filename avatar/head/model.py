@@ -7,6 +7,7 @@ eyelid blendshapes after skinning as in metrical-tracker.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +18,7 @@ from avatar.tensors import check_shapes
 from avatar.types import HeadParams
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
+FLAME_PARENTS = (-1, ROOT, NECK, NECK, NECK)
 
 
 def matrix_from_6d(rotation: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
@@ -28,6 +30,17 @@ def matrix_from_6d(rotation: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
     second = rotation[..., 3:] - (first * rotation[..., 3:]).sum(-1, keepdim=True) * first
     second = torch.nn.functional.normalize(second, dim=-1)
     return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-2)
+
+
+class PoseTensors(NamedTuple):
+    """What posing one identity takes, float32 and contiguous, for the kernels of `avatar.kernels.pose`."""
+
+    shape: Float[Tensor, " V*3"]  # without expression
+    basis: Float[Tensor, "V*3 E+36"]  # expression, then pose correctives
+    joints: Float[Tensor, "5 3"]
+    joint_directions: Float[Tensor, "15 E"]
+    weights: Float[Tensor, "V 5"]
+    eyelid_directions: Float[Tensor, "2 V 3"]
 
 
 class HeadModel:
@@ -57,6 +70,20 @@ class HeadModel:
         self._eyelid_dirs = assets.eyelid_dirs.to(dtype)
         self._parents = assets.parents
 
+    def pose_tensors(self, device: torch.device) -> PoseTensors | None:
+        """Copies for posing on a GPU; None for a head whose joints hang together in another way than FLAME's."""
+        if self._parents != FLAME_PARENTS:
+            return None
+        tensors = (
+            self._identity_shape.reshape(-1),
+            torch.cat((self._expression_dirs, self._pose_dirs), dim=1),
+            self._identity_joints,
+            self._expression_joints,
+            self._weights,
+            self._eyelid_dirs,
+        )
+        return PoseTensors(*(tensor.float().contiguous().to(device) for tensor in tensors))
+
     def neutral_vertices(self) -> Float[Tensor, "V 3"]:
         """The identity without expression, joints at rest, in metres."""
         return self._identity_shape.clone()
@@ -84,7 +111,7 @@ class HeadModel:
         shape = self._identity_shape + (self._expression_dirs[:, :E] @ expression).reshape(-1, 3)
         joints = self._identity_joints + (self._expression_joints[:, :E] @ expression).reshape(-1, 3)
 
-        identity = torch.eye(3, dtype=dtype)
+        identity = torch.eye(3, dtype=dtype, device=expression.device)
         rotations = torch.stack(
             (
                 identity,

@@ -119,8 +119,16 @@ class Lpips(nn.Module):
             total = total + (squared * head[:, None, None]).sum(dim=0).mean()
         return total
 
+    def on(self, device: torch.device) -> Lpips:
+        """Move to a device. On a GPU channels come first: with channels last its pooling adds gradients up in any order."""
+        if device.type == "cpu":
+            return self.to(device)
+        return self.to(device, memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
     def _unit_features(self, image: Tensor) -> list[Tensor]:
         x = ((image.permute(2, 0, 1) * 2.0 - 1.0 - self.shift) / self.scale).unsqueeze(0)
+        if x.is_cuda:
+            x = x.contiguous()
         units = []
         for index, layer in enumerate(self.features):
             x = layer(x)

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import on_gpu
 from avatar.losses.dssim_cpu import dssim_cpu
 from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_RADIUS, SSIM_WINDOW, bounding_box, grown_box, ssim_map
@@ -30,7 +31,7 @@ LPIPS_WEIGHT = 0.05
 DSSIM_WEIGHT = 0.05
 
 # (image [H, W, 3], target [H, W, 3], mask [H, W]) -> a dissimilarity of the two images times the mask, scalar
-Perceptual = Callable[[Tensor, Tensor, Tensor], Tensor]
+Perceptual = Callable[..., Tensor]
 
 
 class PhotometricLoss(NamedTuple):
@@ -58,8 +59,13 @@ def photometric_loss(
     check_shapes(
         image=(image, "H W 3"), target=(target, "H W 3"), mouth_mask=(mouth_mask, "H W"), head_mask=(head_mask, "H W")
     )
-    frame = F.huber_loss(image, target, delta=delta)
-    mouth = mouth_weight * masked_huber(image, target, mouth_mask, delta=delta)
+    if _by_gpu_kernels(image, target, mouth_mask):
+        from avatar.losses.gpu import huber_gpu  # imports Triton, which is not there on every machine
+
+        frame, mouth = huber_gpu(image, target, mouth_mask, delta=delta, mask_weight=mouth_weight)
+    else:
+        frame = F.huber_loss(image, target, delta=delta)
+        mouth = mouth_weight * masked_huber(image, target, mouth_mask, delta=delta)
     if perceptual is None:
         third = torch.zeros((), dtype=image.dtype, device=image.device)
     else:
@@ -88,12 +94,18 @@ def dssim(
     """Structural dissimilarity (1 - SSIM) / 2 of `image * mask` against `target * mask`; SSIM as `metrics.ssim`.
 
     Windows without a masked pixel see two black images and add nothing, so only the others are evaluated. Float32
-    tensors on the CPU, differentiated by the image alone, take the compiled kernel, which computes in double precision.
+    tensors that are differentiated by the image alone take a kernel: on the CPU the compiled one, which computes in double
+    precision, or a GPU's.
     """
     height, width = mask.shape
-    plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in (image, target, mask))
-    if plain and min(height, width) >= SSIM_WINDOW and not (target.requires_grad or mask.requires_grad):
-        return dssim_cpu(image, target, mask)
+    if min(height, width) >= SSIM_WINDOW:
+        if _by_gpu_kernels(image, target, mask):
+            from avatar.losses.gpu import dssim_gpu
+
+            return dssim_gpu(image, target, mask)
+        plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in (image, target, mask))
+        if plain and not (target.requires_grad or mask.requires_grad):
+            return dssim_cpu(image, target, mask)
     box = bounding_box(mask)
     if box is None:
         return (image * 0.0).sum()
@@ -105,17 +117,24 @@ def dssim(
     return (1.0 - similarity).sum() / (2.0 * similarity.shape[-1] * windows)
 
 
+def _by_gpu_kernels(image: Tensor, target: Tensor, mask: Tensor) -> bool:
+    """Whether the kernels of `avatar.losses.gpu` take these: float32, differentiated by the image alone."""
+    plain = all(tensor.dtype == torch.float32 and on_gpu(tensor) for tensor in (image, target, mask))
+    return plain and not (target.requires_grad or mask.requires_grad)
+
+
 def on_head(perceptual: Perceptual, margin: int = 16, least: int = MIN_SIZE) -> Perceptual:
     """`perceptual` of the mask's bounding box, grown by `margin` pixels, in place of the whole frame.
 
     The value is scaled by the box's share of the frame, so it weighs what the mean over the whole frame does: both images
     are black outside the mask. Only networks that see the frame's border where the box ends can tell. A head far away gets
-    a box of `least` pixels a side, which LPIPS needs, where the frame has them.
+    a box of `least` pixels a side, which LPIPS needs, where the frame has them. Who knows the box may name it
+    (`Frame.head_box`): to look for it is to wait for a GPU.
     """
 
-    def cropped(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-        box = bounding_box(mask)
-        if box is None:
+    def cropped(image: Tensor, target: Tensor, mask: Tensor, box: tuple[slice, slice] | None = None) -> Tensor:
+        box = bounding_box(mask) if box is None else box
+        if box is None or box[0].start == box[0].stop:
             return (image * 0.0).sum()
         crop = grown_box(box, (mask.shape[0], mask.shape[1]), margin=margin, least=least)
         inside = mask[crop]

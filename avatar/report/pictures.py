@@ -26,7 +26,7 @@ def frame_panels(run: Run) -> list[tuple[str, np.ndarray]]:
     panels = []
     with FrameLoader(run.subject, run.config.data.size, workers=run.config.data.workers) as loader:
         for frame in loader.frames(chosen):
-            render = renderer.render(frame.params, frame.camera).image.clamp(0, 1)
+            render = renderer.render(frame.params, frame.camera).image.clamp(0, 1).cpu()
             image = panel(Pair(render, frame.composite(background)))
             if image.shape[1] > MAX_PANEL_WIDTH:
                 height = round(image.shape[0] * MAX_PANEL_WIDTH / image.shape[1])
@@ -45,7 +45,7 @@ def uncertainty_map(run: Run) -> np.ndarray | None:
     if hyper is None:
         return None
     with torch.no_grad():
-        values = torch.sigmoid(UNCERTAINTY_GAIN * hyper.uncertainty()).numpy()
+        values = torch.sigmoid(UNCERTAINTY_GAIN * hyper.uncertainty()).cpu().numpy()
     size = run.config.model.uv_size
     colours = cv2.applyColorMap(np.round(values * 255).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     image = np.full((size, size, 3), 255, np.uint8)

@@ -50,7 +50,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
                 f"step {checkpoint.step}: {message}; the checkpoint was not written, the last good one stays"
             )
     meta = {"format": CHECKPOINT_FORMAT, "step": checkpoint.step, **checkpoint.meta}
-    tensors = {name: tensor.detach().contiguous() for name, tensor in checkpoint.tensors.items()}
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()}
     path = folder / f"step_{checkpoint.step:08d}.safetensors"
     write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(meta)}))
     for old in list_checkpoints(folder)[:-keep]:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import on_gpu
 from avatar.splat.counters import Counters
 from avatar.splat.cpu import CannotDraw, count_cpu, splat_cpu
 from avatar.splat.reference import splat_reference
@@ -29,7 +30,7 @@ def splat(
     camera: Camera,
     background: Float[Tensor, " 3"],
     *,
-    backend: Literal["cpu", "reference"] = "cpu",
+    backend: Literal["cpu", "gpu", "reference"] | None = None,
     sh_degree: int | None = None,
     alpha_min: float = 1 / 255,
     alpha_max: float = 0.999,
@@ -42,7 +43,9 @@ def splat(
     """Draw 3D Gaussians over a background; differentiable in all five fields of `gaussians` and in `background`.
 
     backend      "cpu": C++, float32, multithreaded (torch.get_num_threads(), or the variable AVATAR_THREADS);
-                 "reference": plain torch in float64 whatever the dtype, any device, slow, the definition of the result
+                 "gpu": Triton, float32, tensors on a GPU (or on the CPU, with TRITON_INTERPRET=1, slowly, for tests);
+                 "reference": plain torch in float64 whatever the dtype, any device, slow, the definition of the result;
+                 None: "gpu" or "cpu", by where `gaussians.means` is
     sh_degree    colour from the first (sh_degree + 1)^2 coefficients only; None: all. The others get zero gradient
     alpha_min    a splat is skipped at pixels where its alpha is below this, and everywhere if its opacity is; in [0, 1)
     alpha_max    alpha is clamped to this, with zero gradient where it is; in (0, 0.9999]
@@ -61,15 +64,18 @@ def splat(
     The Jacobian of the projection is taken at a slope clamped to 0.3 tan(fov / 2) outside the image, as in gsplat. A
     zero quaternion is the identity, with zero gradient. The sign of a scale has no effect.
 
-    The image and alpha of the "cpu" backend are the same to the last bit for any number of threads.
+    The image and alpha of the "cpu" backend are the same to the last bit for any number of threads. The camera stays on the
+    CPU for all backends.
     Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
-    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits.
+    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. The
+    "gpu" backend learns of those when nobody waits for it any more: image and alpha are then NaN wherever it draws.
     """
+    chosen = backend or _backend_for(gaussians.means)
     options = _checked_options(
         gaussians,
         camera,
         background,
-        backend=backend,
+        backend=chosen,
         sh_degree=sh_degree,
         alpha_min=alpha_min,
         alpha_max=alpha_max,
@@ -79,22 +85,36 @@ def splat(
         antialiased=antialiased,
         region=region,
     )
-    if backend == "reference":
+    if chosen == "reference":
         try:
             check_finite(**gaussians._asdict(), background=background)
         except ValueError as error:
             raise CannotDraw(str(error)) from None
         return splat_reference(gaussians, camera, background, **options)
+    if chosen == "gpu":
+        from avatar.splat.gpu import splat_gpu  # imports Triton, which takes a second and is not there on every machine
+
+        return splat_gpu(gaussians, camera, background, **options)
     return splat_cpu(gaussians, camera, background, **options)
 
 
 def counters(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Counters:
-    """What the "cpu" backend does and skips to draw `splat(gaussians, camera, background, **options)`.
+    """What the "cpu" or "gpu" backend does and skips to draw `splat(gaussians, camera, background, **options)`.
 
     The scene is drawn once more to be counted; drawing without counting costs nothing for it.
     """
-    checked = _checked_options(gaussians, camera, background, **{**(splat.__kwdefaults__ or {}), **options})
+    backend = options.get("backend") or _backend_for(gaussians.means)
+    given = {**(splat.__kwdefaults__ or {}), **options, "backend": backend}
+    checked = _checked_options(gaussians, camera, background, **given)
+    if backend == "gpu":
+        from avatar.splat.gpu_counters import count_gpu
+
+        return count_gpu(gaussians, camera, background, **checked)[1]
     return count_cpu(gaussians, camera, background, **checked)[1]
+
+
+def _backend_for(tensor: Any) -> str:
+    return "gpu" if isinstance(tensor, Tensor) and on_gpu(tensor) else "cpu"
 
 
 def _checked_options(
@@ -157,9 +177,11 @@ def _checked_options(
 
 
 def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: str) -> None:
-    if backend not in ("cpu", "reference"):
-        raise ValueError(f'backend must be "cpu" or "reference", got {backend!r}')
-    allowed = (torch.float32,) if backend == "cpu" else (torch.float32, torch.float64)
+    if backend not in ("cpu", "gpu", "reference"):
+        raise ValueError(f'backend must be "cpu", "gpu" or "reference", got {backend!r}')
+    if backend == "gpu" and not on_gpu(gaussians.means):
+        raise ValueError(f'means must be on a GPU for backend "gpu", got {gaussians.means.device}')
+    allowed = (torch.float32, torch.float64) if backend == "reference" else (torch.float32,)
     device = torch.device("cpu") if backend == "cpu" else gaussians.means.device
     for name, tensor in (*gaussians._asdict().items(), ("background", background)):
         if tensor.dtype not in allowed:
@@ -170,6 +192,9 @@ def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: s
 
 
 def _check_camera(camera: Camera) -> None:
+    for name in ("R_cam_world", "t_cam_world"):
+        if not (pose := getattr(camera, name)).is_cpu:
+            raise ValueError(f"camera.{name} must be on the cpu, whatever the backend, got {pose.device}")
     if not all(map(math.isfinite, (*camera.R_cam_world.flatten().tolist(), *camera.t_cam_world.tolist()))):
         check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)  # names and counts them
     for name in ("fx", "fy"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -37,14 +38,27 @@ class TrainingLog:
 
     def step(self, step: int, loss: PhotometricLoss, render: Tensor, truth: Tensor) -> None:
         """Record one step; `step` counts from 1. The PSNR is computed only for the steps that are logged."""
-        self._loss = smoothed(self._loss, float(loss.total.detach()), 1)
+        total, terms, quality = float(loss.total.detach()), {}, math.nan
+        if self.shows(step):
+            terms, quality = (
+                {name: float(term.detach()) for name, term in loss._asdict().items()},
+                float(psnr(render, truth)),
+            )
+        self.note(step, total, terms, quality)
+
+    def shows(self, step: int) -> bool:
+        """Whether the curves have a point at `step`."""
+        return step % self._every == 0
+
+    def note(self, step: int, total: float, terms: Mapping[str, float], quality: float) -> None:
+        """Record the numbers of a step; all but the total count at those steps only that the curves show."""
+        self._loss = smoothed(self._loss, total, 1)
         self._bar.update(1)
-        if step % self._every == 0:
-            value = float(psnr(render, truth))
-            self._psnr = smoothed(self._psnr, value, self._every)
-            for name, term in loss._asdict().items():
-                self._writer.add_scalar(f"loss/{name}", float(term.detach()), step)
-            self._writer.add_scalar("train/psnr", value, step)
+        if self.shows(step):
+            self._psnr = smoothed(self._psnr, quality, self._every)
+            for name, term in terms.items():
+                self._writer.add_scalar(f"loss/{name}", term, step)
+            self._writer.add_scalar("train/psnr", quality, step)
         shown = {"loss": f"{self._loss:.5f}"}
         if not math.isnan(self._psnr):  # none is measured before the first step that is logged
             shown["psnr"] = f"{self._psnr:.2f}"
@@ -53,7 +67,7 @@ class TrainingLog:
     def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""
         pair = torch.cat((truth, render), dim=1).detach().clamp(0, 1)
-        image = np.round(pair.numpy() * 255).astype(np.uint8)
+        image = np.round(pair.cpu().numpy() * 255).astype(np.uint8)
         self._previews.mkdir(parents=True, exist_ok=True)
         iio.imwrite(self._previews / f"step_{step:08d}.png", image)
         self._writer.add_image("preview", image, step, dataformats="HWC")

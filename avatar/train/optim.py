@@ -29,7 +29,8 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
         groups.append({"params": list(avatar.hyper.parameters()), "lr": rates.hyper})
     for group in groups:
         group["full_lr"] = group["lr"]
-    return torch.optim.Adam(groups, eps=config.adam_eps, fused=True)
+    # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.
+    return torch.optim.Adam(groups, eps=config.adam_eps, fused=True, capturable=avatar.code.is_cuda)
 
 
 def schedule(step: int, config: TrainerConfig) -> float:
@@ -62,7 +63,8 @@ def load_optimizer(optimizer: torch.optim.Adam, avatar: Avatar, tensors: Mapping
     """Put back what `optimizer_tensors` gave, to the bit."""
     for name, parameter in avatar.named_parameters():
         prefix = f"optimizer.{name}."
-        state = {key.removeprefix(prefix): value.clone() for key, value in tensors.items() if key.startswith(prefix)}
+        own = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+        state = {key: value.to(parameter.device, copy=True) for key, value in own.items()}
         if state.keys() != {"exp_avg", "exp_avg_sq", "step"}:
             raise UserError(f"the checkpoint lacks the optimizer state of {name}; training cannot go on from it")
         optimizer.state[parameter] = state

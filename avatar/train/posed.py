@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.head.model import HeadModel
+from avatar.model import Avatar
 from avatar.types import Frame
 
 LIMIT_BYTES = 2**28  # 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again
@@ -14,7 +15,7 @@ LIMIT_BYTES = 2**28  # 4,400 frames of FLAME's 5,023 vertices; what does not fit
 class PosedMeshes:
     """Vertices by frame, kept from their first use on while there is room."""
 
-    def __init__(self, head: HeadModel, limit_bytes: int = LIMIT_BYTES) -> None:
+    def __init__(self, head: HeadModel | Avatar, limit_bytes: int = LIMIT_BYTES) -> None:
         self._head = head
         self._room = limit_bytes
         self._meshes: dict[int, Tensor] = {}

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.losses.lpips import load_lpips
@@ -23,10 +25,13 @@ from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
 from avatar.types import Frame, Gaussians
 
+Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
+
 
 class Weighted(NamedTuple):
     function: Perceptual
     weight: float
+    crops: bool = False  # to the head's box, which it takes as `box` where it is known
 
 
 @dataclass(frozen=True)
@@ -70,12 +75,13 @@ class Objective:
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
         start = round(self.config.perceptual_start * self.config.iterations)
         term = self.perceptual.at(step, start)
+        function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
         return photometric_loss(
             image,
             target,
             frame.mouth_mask,
             frame.head_mask,
-            perceptual=term.function if term else None,
+            perceptual=function,
             perceptual_weight=term.weight if term else 0.0,
             mouth_weight=self.config.mouth_weight,
             delta=self.config.huber_delta,
@@ -93,11 +99,12 @@ def training_step(
     step: int,
     frame: Frame,
     vertices: Float[Tensor, "V 3"],
+    judge: Judge | None = None,
 ) -> Outcome:
     """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`.
 
     Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
-    is not finite.
+    is not finite; with a `judge` the latter is for it to see to.
     """
     target = frame.composite(objective.background)
     try:
@@ -107,7 +114,10 @@ def training_step(
     loss = objective.loss(step, frame, image, target)
     optimizer.zero_grad()
     loss.total.backward()
-    check_step(step, frame, loss, avatar)
+    if judge is None:
+        check_step(step, frame, loss, avatar)
+    else:
+        judge(loss, [parameter.grad for parameter in avatar.parameters() if parameter.grad is not None])
     set_rates(optimizer, schedule(step, objective.config))
     optimizer.step()
     return Outcome(loss, image.detach(), target)
@@ -119,6 +129,7 @@ def choose_perceptual(
     recorded: str | None = None,
     *,
     size: tuple[int, int] | None = None,
+    device: torch.device = CPU,
 ) -> PerceptualTerm:
     """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
 
@@ -136,9 +147,10 @@ def choose_perceptual(
         try:
             if size is not None and min(size) < MIN_SIZE:
                 raise UserError(too_small("LPIPS", MIN_SIZE, size))
-            lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
-            function = masked_lpips(lpips) if config.lpips_region == "frame" else on_head(masked_lpips(lpips))
-            term = Weighted(function, config.perceptual_weight)
+            lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips").on(device)
+            crops = config.lpips_region == "head"
+            function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
+            term = Weighted(function, config.perceptual_weight, crops)
             return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place)
         except UserError as error:
             if recorded is not None:

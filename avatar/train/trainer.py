@@ -7,14 +7,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from avatar.compute.device import CPU, on_gpu
 from avatar.config import Config
 from avatar.data.loader import FrameLoader
+from avatar.data.shelf import Shelf, shelf_bytes
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw, splat
+from avatar.splat.capacity import with_room
+from avatar.train.ahead import Ahead, Prompt, Spoilt
 from avatar.train.colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
@@ -32,24 +36,31 @@ def train(
     perceptual: PerceptualTerm,
     *,
     resume: Checkpoint | None = None,
+    device: torch.device = CPU,
 ) -> int:
     """Train `avatar` on the subject's training frames and write checkpoints, avatar file, curves and previews into `run`.
+
+    The avatar is moved to `device`; what `perceptual` holds has to be there already.
 
     Returns the number of steps done when it ends, which is less than `trainer.iterations` after an interruption (Ctrl-C
     or SIGTERM; the state is saved first). Raises UserError, leaving the last good checkpoint, when the avatar cannot be
     drawn any more or a loss or gradient is not finite.
     """
     trainer = config.trainer
-    optimizer = make_optimizer(avatar, trainer)
     start = 0
     if resume is not None:
         load_module(avatar, resume.tensors, run)
-        load_optimizer(optimizer, avatar, resume.tensors)
         start = resume.step
     elif trainer.initial_colours == "frames":
         colour_from_frames(avatar, subject, config.data.size)
-    meshes = PosedMeshes(avatar.head)
-    background = torch.tensor(config.data.background)
+    recording = subject.recording
+    neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
+    avatar.to(device)
+    optimizer = make_optimizer(avatar, trainer)
+    if resume is not None:
+        load_optimizer(optimizer, avatar, resume.tensors)
+    meshes = PosedMeshes(avatar)
+    background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)
     meta = {
         "head_fingerprint": avatar.head.assets.fingerprint,
@@ -57,34 +68,44 @@ def train(
         "config": config.to_dict(),
         "perceptual": perceptual.name,
         "threads": torch.get_num_threads(),
+        "device": device.type,
     }
-
-    recording = subject.recording
-    neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
 
     def save(step: int) -> None:
         tensors = {**module_tensors(avatar), **optimizer_tensors(optimizer, avatar)}
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
-    order = frame_order(subject.split.train, trainer.seed, start, trainer.iterations)
+    data, is_gpu = config.data, on_gpu(avatar.code)
+    shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
     step = saved = start
     with (
-        FrameLoader(subject, config.data.size, config.data.cache_mb << 20, config.data.workers) as loader,
+        FrameLoader(subject, data.size, data.cache_mb << 20, data.workers, shelf) as loader,
         TrainingLog(run, start, trainer.iterations, trainer.log_every) as log,
         interruption() as interrupted,
     ):
-        for frame in loader.frames(order):
-            outcome = training_step(avatar, optimizer, objective, step, frame, meshes.vertices(frame))
-            step += 1
-            log.step(step, outcome.loss, outcome.render, outcome.target)
-            if step % trainer.preview_every == 0 or step == trainer.iterations:
-                log.preview(step, *render_held_out(avatar, loader, subject, background, step))
-            if step % trainer.checkpoint_every == 0 or step == trainer.iterations:
-                save(step)
-                saved = step
-            if interrupted():
-                break
+        progress = Ahead(log, optimizer, device) if is_gpu else Prompt(log)
+        while step < trainer.iterations and not interrupted():
+            order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
+            try:
+                for frame in loader.frames(order):
+                    vertices, judge = meshes.vertices(frame), progress.judge(step)
+                    outcome = training_step(avatar, optimizer, objective, step, frame, vertices, judge)
+                    step += 1
+                    progress.note(step, outcome)
+                    shows = step % trainer.preview_every == 0 or step == trainer.iterations
+                    saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
+                    if shows or saves or interrupted():
+                        progress.settle()
+                    if shows:
+                        log.preview(step, *render_held_out(avatar, loader, subject, background, step))
+                    if saves:
+                        save(step)
+                        saved = step
+                    if interrupted():
+                        break
+            except Spoilt as spoilt:
+                step = progress.go_back(spoilt)
         if step > saved:
             save(step)
     return step
@@ -107,6 +128,7 @@ def render_held_out(
     """Truth and render of the first held-out frame after `step` steps. Raises UserError when it cannot be drawn."""
     frame = next(iter(loader.frames([subject.split.test[0]])))
     try:
-        return frame.composite(background), splat(avatar(frame.params), frame.camera, background).image
+        drawn = with_room(lambda: splat(avatar(frame.params), frame.camera, background))
     except CannotDraw as error:
         raise stopped(step, frame, str(error)) from error
+    return frame.composite(background), drawn.image

@@ -36,13 +36,14 @@ def _frame(clip: Clip, number: int) -> Frame:
     mouth = np.zeros_like(alpha) if mouth is None else mouth
     R, t = (torch.from_numpy(value).float() for value in (track.R, track.t))
     fx, fy, cx, cy = track.intrinsics.tolist()
+    planes = [torch.from_numpy(pixels).float() / 255 for pixels in (image, alpha, head, mouth)]
     return Frame(
         index=0,
         name=files.images[number].stem,
         camera=Camera(R, t, fx, fy, cx, cy, width, height),
         params=head_params(track),
-        **{
-            name: torch.from_numpy(pixels).float() / 255
-            for name, pixels in (("image", image), ("alpha", alpha), ("head_mask", head), ("mouth_mask", mouth))
-        },
+        image=planes[0],
+        alpha=planes[1],
+        head_mask=planes[2],
+        mouth_mask=planes[3],
     )

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from command_line import avatar
 
 from avatar.commands import diagnosing
@@ -107,6 +108,17 @@ def test_memory_that_runs_out_gets_a_sentence(monkeypatch: pytest.MonkeyPatch, e
     monkeypatch.setattr(diagnosing, "run_doctor", refuse)
     output = avatar("doctor", status=1)
     assert output.startswith("avatar: there is not enough memory (") and output.count("\n") == 1
+
+
+def test_a_full_gpu_gets_a_sentence_that_says_what_to_lower(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> int:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
+
+    monkeypatch.setattr(diagnosing, "run_doctor", refuse)
+    output = avatar("doctor", status=1)
+    assert (
+        output.startswith("avatar: the GPU's memory is full: lower --size or model.uv_size") and output.count("\n") == 1
+    )
 
 
 def test_a_mistake_of_the_program_keeps_its_stack_trace(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
-from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
+from avatar.runs.checkpoint import Checkpoint, list_checkpoints, newest_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info
 
 OPTIONS = ("--frame-offset", "1", *SMALL)
@@ -94,6 +94,30 @@ def test_what_a_resumed_run_cannot_change_is_refused(name: str, begun: Path, own
 def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:
     same = ("preset=fast", "model=hypergaussians", "trainer.seed=0", "--frame-offset", 1, "--max-left-out", 0.05)
     assert "at step 8 of 12" in avatar("train", own_folder, "--out", begun, "--resume", *same)
+
+
+@pytest.mark.parametrize("way", [("--device", "cpu"), ("device=cpu",)])
+def test_a_run_may_go_on_on_another_device_and_says_so(way: tuple[str, ...], begun: Path, own_folder: Path) -> None:
+    newest = newest_checkpoint(begun)
+    assert newest.meta["device"] == "cpu"
+    elsewhere = Checkpoint(newest.step, newest.tensors, {**newest.meta, "device": "cuda"})
+    save_checkpoint(begun / "checkpoints", elsewhere, keep=3)
+    output = avatar("train", own_folder, "--out", begun, "--resume", *way)
+    assert "Note: the checkpoint was made on cuda, this is cpu; the result is the same to rounding" in output
+    assert newest_checkpoint(begun).step == 12
+
+
+@pytest.mark.parametrize("way", [("--device", "cuda:99"), ("device=cuda:99",)])
+def test_a_gpu_that_is_asked_for_by_name_is_used_or_refused(
+    way: tuple[str, ...], begun: Path, own_folder: Path
+) -> None:
+    for command in (
+        ("train", own_folder, "--out", begun, "--resume"),
+        ("train", own_folder, "--out", begun.parent / "new"),
+    ):
+        output = avatar(*command, *way, status=1)
+        assert "\navatar: " in f"\n{output}" and "Resuming" not in output
+    assert newest_checkpoint(begun).step == 8 and not list((begun.parent / "new").rglob("*.safetensors"))
 
 
 def test_two_trainings_into_one_folder_are_one_too_many(own_folder: Path, tmp_path: Path) -> None:

@@ -13,10 +13,14 @@ import torch
 from torch import Tensor
 
 from avatar.bench.scenes import head_camera, head_shell
+from avatar.compute.device import interpreted
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, Rendering
 
 SIMD = ("baseline", "avx2", "avx512")
+# The gpu backend takes part where there is a GPU, and where Triton interprets its kernels: make gpu-check.
+GPU = ["gpu"] if interpreted() or torch.cuda.is_available() else []
+BACKENDS = ["cpu", "reference", *GPU]
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,10 @@ SCENES: dict[str, Scene] = {
     "32x32": Scene(random_gaussians(60, seed=8), camera(32, 32)),
     "33x65": Scene(random_gaussians(60, seed=18), camera(33, 65)),
     "opaque": Scene(random_gaussians(150, seed=9)._replace(opacities=torch.ones(150)), camera(64, 48)),
+    # Every pixel is full long before its list of splats ends.
+    "walls": Scene(
+        random_gaussians(150, seed=19, spread=0.03, size=0.3)._replace(opacities=torch.ones(150)), camera(20, 20)
+    ),
     "dense": Scene(random_gaussians(3000, seed=10, spread=0.08), camera(40, 40)),
     "thresholds": Scene(threshold_gaussians(), camera(80, 60)),
     "one": Scene(random_gaussians(1, seed=11, spread=0.01), camera(31, 29)),
@@ -129,6 +137,11 @@ SCENES: dict[str, Scene] = {
 
 
 def render(scene: Scene, backend: Any = "cpu") -> Rendering:
+    """On whatever device the scene is; drawn by a GPU, the rendering of a scene on the CPU comes back to it."""
+    if backend == "gpu" and not interpreted() and scene.background.is_cpu:
+        gaussians = Gaussians(*(tensor.cuda() for tensor in scene.gaussians))
+        moved = replace(scene, gaussians=gaussians, background=scene.background.cuda())
+        return Rendering(*(tensor.cpu() for tensor in render(moved, backend)))
     return splat(scene.gaussians, scene.camera, scene.background, backend=backend, **scene.options)
 
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat.scenes import Scene, camera, random_gaussians, render
+from splat.scenes import BACKENDS, Scene, camera, random_gaussians, render
 
 from avatar.types import Gaussians
 
 SCENE = Scene(random_gaussians(10), camera(20, 20))
-BACKENDS = ["cpu", "reference"]
 
 
 def _with_field(name: str, value: torch.Tensor) -> Scene:
@@ -76,7 +75,7 @@ def test_wrong_device() -> None:
 
 
 def test_unknown_backend() -> None:
-    with pytest.raises(ValueError, match='backend must be "cpu" or "reference", got \'metal\''):
+    with pytest.raises(ValueError, match='backend must be "cpu", "gpu" or "reference", got \'metal\''):
         render(SCENE, "metal")
 
 

@@ -17,12 +17,12 @@ from avatar.types import Gaussians, Rendering
 TILE = 32
 
 
-def _count(scene: Scene) -> Counters:
-    return counters(scene.gaussians, scene.camera, scene.background, **scene.options)
+def _count(scene: Scene, backend: str = "cpu") -> Counters:
+    return counters(scene.gaussians, scene.camera, scene.background, backend=backend, **scene.options)
 
 
 def _drawn_and_counted(scene: Scene, *, everywhere: bool) -> tuple[Rendering, Counters]:
-    options: dict[str, Any] = {**(avatar.splat.splat.__kwdefaults__ or {}), **scene.options}
+    options: dict[str, Any] = {**(avatar.splat.splat.__kwdefaults__ or {}), **scene.options, "backend": "cpu"}
     checked = avatar.splat._checked_options(scene.gaussians, scene.camera, scene.background, **options)
     return count_cpu(scene.gaussians, scene.camera, scene.background, **checked, everywhere=everywhere)
 

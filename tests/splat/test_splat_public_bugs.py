@@ -10,6 +10,8 @@ import pytest
 import torch
 from splat.loops import splat_by_loops
 from splat.scenes import (
+    BACKENDS,
+    GPU,
     Scene,
     assert_agrees,
     assert_gradients_close,
@@ -25,7 +27,7 @@ from avatar import _core
 from avatar.splat import CannotDraw
 from avatar.types import Gaussians
 
-BACKENDS = ["cpu", "reference"]
+KERNELS = ["cpu", *GPU]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -134,47 +136,53 @@ def test_a_splat_just_beyond_the_near_plane_agrees() -> None:
     assert_agrees(Scene(g._replace(means=means), camera(32, 32, yaw=0.0)))
 
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize("scale", [1e-4, 1e-6, 1e-9, 1e-12, 1e-30, 0.0])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_tiny_scales_do_not_underflow_to_nan(scale: float, antialiased: bool) -> None:
+def test_tiny_scales_do_not_underflow_to_nan(scale: float, antialiased: bool, backend: str) -> None:
     g = random_gaussians(100)._replace(scales=scale * torch.tensor([[0.7, 1.0, 2.0]]).repeat(100, 1))
     scene = Scene(g, camera(64, 64), options={"alpha_min": 0.0, "antialiased": antialiased})
-    assert_agrees(scene)
+    assert_agrees(scene, backend)
 
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (15, 16), (17, 1), (1, 50), (31, 33), (64, 7), (65, 95)])
-def test_sizes_that_are_not_a_multiple_of_the_tile(width: int, height: int) -> None:
-    assert_agrees(Scene(random_gaussians(60), camera(width, height)))
+def test_sizes_that_are_not_a_multiple_of_the_tile(width: int, height: int, backend: str) -> None:
+    assert_agrees(Scene(random_gaussians(60), camera(width, height)), backend)
 
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_the_sign_of_a_scale_has_no_effect(antialiased: bool) -> None:
+def test_the_sign_of_a_scale_has_no_effect(antialiased: bool, backend: str) -> None:
     g, sign = random_gaussians(60), torch.tensor([-1.0, 1.0, -1.0])
     scene = Scene(g, camera(40, 30), options={"antialiased": antialiased})
     flipped = replace(scene, gaussians=g._replace(scales=g.scales * sign))
-    assert torch.equal(render(flipped).image, render(scene).image)
+    assert torch.equal(render(flipped, backend).image, render(scene, backend).image)
     cotangent = torch.randn(30, 40, 3)
-    expected, found = gradients(scene, "cpu", cotangent, None), gradients(flipped, "cpu", cotangent, None)
+    expected, found = gradients(scene, backend, cotangent, None), gradients(flipped, backend, cotangent, None)
     assert torch.equal(found.pop("scales"), expected.pop("scales") * sign)
     assert all(torch.equal(found[name], expected[name]) for name in found)
 
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize(("focal", "spread"), [(1000.0, 3e-4), (100.0, 3e-3), (0.05, 0.8), (0.005, 3.0)])
-def test_fields_of_view_from_a_twentieth_of_a_degree_to_179(focal: float, spread: float) -> None:
+def test_fields_of_view_from_a_twentieth_of_a_degree_to_179(focal: float, spread: float, backend: str) -> None:
     f = 48 * focal  # `focal` is in widths of the image
     view = replace(camera(48, 40), t_cam_world=torch.tensor([0.0, 0.0, 1.2]), fx=f, fy=f)
     scene = Scene(random_gaussians(80, spread=spread, size=spread / 10), view)
     assert render(scene).alpha.max() > 0.1
-    assert_agrees(scene)
+    assert_agrees(scene, backend)
 
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize("scale", [1e2, 1e6, 1e15, 1e30])
-def test_huge_scales_do_not_overflow_the_tile_count(scale: float) -> None:
+def test_huge_scales_do_not_overflow_the_tile_count(scale: float, backend: str) -> None:
     g = random_gaussians(12)._replace(scales=scale * torch.tensor([[0.7, 1.0, 2.0]]).repeat(12, 1))
-    assert_agrees(Scene(g, camera(70, 50)))
+    assert_agrees(Scene(g, camera(70, 50)), backend)
 
 
-def test_a_long_splat_far_outside_the_image_still_crosses_it() -> None:
+@pytest.mark.parametrize("backend", KERNELS)
+def test_a_long_splat_far_outside_the_image_still_crosses_it(backend: str) -> None:
     # Its centre is 1e5 pixels away: the quadratic form of a float32 conic has no correct digit here.
     g = single_splat().gaussians._replace(
         means=torch.tensor([[800.0, 800.0, 1.0]]),
@@ -183,33 +191,36 @@ def test_a_long_splat_far_outside_the_image_still_crosses_it() -> None:
     )
     scene = replace(single_splat(), gaussians=g)
     assert render(scene).alpha.max() > 0.1
-    assert_agrees(scene, image_tolerance=1e-4)
+    assert_agrees(scene, backend, image_tolerance=1e-4)
 
 
-def test_too_many_pairs_are_refused_and_not_allocated() -> None:
+@pytest.mark.parametrize("backend", KERNELS)
+def test_too_many_pairs_are_refused_and_not_allocated(backend: str) -> None:
     g = random_gaussians(100_000, sh_degree=0)._replace(scales=torch.full((100_000, 3), 1e6))
     message = (
-        "drawing needs 1[0-9]{8} pairs of a tile of .* and a splat, the limit is 67108864; are the scales too large"
+        "drawing needs [1-9][0-9]{8} pairs of a tile of .* and a splat, the limit is 67108864; are the scales too large"
     )
     with pytest.raises(ValueError, match=message):
-        render(Scene(g, camera(1100, 1100)))
+        render(Scene(g, camera(1100, 1100)), backend)
 
 
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_non_finite_cotangent_shows_in_the_gradients_of_its_splat_alone(value: float) -> None:
+def test_a_non_finite_cotangent_shows_in_the_gradients_of_its_splat_alone(value: float, backend: str) -> None:
     one = single_splat(scale=0.01).gaussians
     places = torch.tensor([[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0]])  # pixels 6.5 and 26.5 of a row
     g = Gaussians(*(torch.cat((field, field)) for field in one))._replace(means=places)
     cotangent = torch.ones(33, 33, 3)
     cotangent[16, 7] = value
-    grads = gradients(replace(single_splat(), gaussians=g), "cpu", cotangent, None)
+    grads = gradients(replace(single_splat(), gaussians=g), backend, cotangent, None)
     for name in Gaussians._fields:
         assert not torch.isfinite(grads[name][0]).all() and torch.isfinite(grads[name][1]).all(), name
 
 
-def test_alpha_has_a_gradient() -> None:
+@pytest.mark.parametrize("backend", KERNELS)
+def test_alpha_has_a_gradient(backend: str) -> None:
     scene = Scene(random_gaussians(50), camera(30, 20))
-    grads = gradients(scene, "cpu", None, torch.ones(20, 30))
+    grads = gradients(scene, backend, None, torch.ones(20, 30))
     for name in ("means", "quats", "scales", "opacities"):
         assert grads[name].norm() > 0
     assert (grads["sh"] == 0).all() and (grads["background"] == 0).all()
@@ -246,12 +257,13 @@ def test_no_output_memory_is_left_uninitialised() -> None:
     assert (outputs["grad_means"] == 0).all(-1).any() and (outputs["grad_means"] != 0).any()
 
 
-def test_results_do_not_differ_from_run_to_run() -> None:
-    scene = Scene(random_gaussians(3000), camera(100, 100))
+@pytest.mark.parametrize("backend", KERNELS)
+def test_results_do_not_differ_from_run_to_run(backend: str) -> None:
+    scene = Scene(random_gaussians(3000 if backend == "cpu" else 300), camera(100, 100))
     cotangent = torch.randn(100, 100, 3)
-    first = gradients(scene, "cpu", cotangent, None)
-    for _ in range(5):
-        again = gradients(scene, "cpu", cotangent, None)
+    first = gradients(scene, backend, cotangent, None)
+    for _ in range(5 if backend == "cpu" else 1):
+        again = gradients(scene, backend, cotangent, None)
         assert all(torch.equal(again[name], first[name]) for name in first)
 
 
@@ -286,15 +298,17 @@ def test_zero_quaternion_is_the_identity_without_gradient(backend: str) -> None:
     assert torch.equal(gradients(scene, backend, torch.randn(30, 30, 3), None)["quats"], zero)
 
 
-def test_colours_of_1e30_are_drawn() -> None:
+@pytest.mark.parametrize("backend", KERNELS)
+def test_colours_of_1e30_are_drawn(backend: str) -> None:
     scene = single_splat(colour=1e30)
-    found, expected = render(scene), render(in_float64(scene), "reference")
+    found, expected = render(scene, backend), render(in_float64(scene), "reference")
     torch.testing.assert_close(found.image.double(), expected.image, rtol=1e-5, atol=1e-6)
 
 
-def test_a_colour_that_overflows_is_named() -> None:
+@pytest.mark.parametrize("backend", KERNELS)
+def test_a_colour_that_overflows_is_named(backend: str) -> None:
     g = random_gaussians(9)
     sh = g.sh.clone()
     sh[7] = 3e38
     with pytest.raises(CannotDraw, match="sh gives splat 7 a colour beyond the range of float32"):
-        render(Scene(g._replace(sh=sh, means=g.means * 0.1), camera(20, 20)))
+        render(Scene(g._replace(sh=sh, means=g.means * 0.1), camera(20, 20)), backend)

@@ -1,0 +1,270 @@
+"""The launches of a drawing on a GPU and of its gradients; no autograd, and nothing that waits but `needed_pairs`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avatar.kernels.bin import FIELDS, expand, gather
+from avatar.kernels.composite import composite
+from avatar.kernels.composite_backward import MOMENTS, composite_backward
+from avatar.kernels.project import POISON, project
+from avatar.kernels.project_backward import project_backward
+from avatar.kernels.start import start
+from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Kind
+from avatar.splat.cpu import CannotDraw
+from avatar.splat.region import Region
+from avatar.tensors import check_finite
+from avatar.types import Gaussians, Rendering
+
+ALIGNED = 16  # values; what Triton sees of a number that it may load as vectors by
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How the kernels cut their work. Results depend on tile and steps in their last bits only."""
+
+    tile: int = 8  # pixels, width and height; a power of two
+    step: int = 8  # splats that are composited at a time
+    backward_step: int = 4
+    warps: int = 2  # of a tile
+    backward_warps: int = 1
+    lanes: int = 128  # Gaussians or pairs of a program
+    backward_lanes: int = 32
+
+    @property
+    def chunk(self) -> int:
+        """Records of a tile begin at multiples of it."""
+        return max(self.step, self.backward_step)
+
+
+TUNING = Tuning()
+
+
+class Settings(NamedTuple):
+    """The options of `avatar.splat.splat`, checked, and what they need of the camera."""
+
+    view: Float[Tensor, " 25"]  # float64, see avatar.kernels.geometry
+    width: int
+    height: int
+    region: Region
+    sh_degree: int
+    alpha_min: float
+    alpha_max: float
+    t_min: float
+    antialiased: bool
+    everywhere: bool = False  # for tests: look for every splat at every pixel, as if nothing were known of its extent
+
+    @property
+    def is_whole(self) -> bool:
+        return self.region == (0, 0, self.width, self.height)
+
+
+class Grid(NamedTuple):
+    """The tiles that meet the region. They lie where those of the whole image do, so that a pixel gets the same bits."""
+
+    first_x: int
+    first_y: int
+    across: int
+    down: int
+
+    @property
+    def tiles(self) -> int:
+        return self.across * self.down
+
+    @property
+    def place(self) -> tuple[int, int, int]:
+        return self.first_x, self.first_y, self.across
+
+
+class Drawing(NamedTuple):
+    """What the backward pass needs of a forward pass; see the kernels for the buffers."""
+
+    tuning: Tuning
+    grid: Grid
+    capacity: int
+    order: Int[Tensor, " N"]
+    ends: Int[Tensor, " N"]
+    boxes: Int[Tensor, "4 N"]
+    begins: Int[Tensor, " tiles+1"]
+    records: Float[Tensor, "9 stride"]
+    places: Int[Tensor, " capacity"]
+    transmittances: Float[Tensor, "H W"]
+    stops: Int[Tensor, "H W"]
+    chunks: Int[Tensor, " tiles"]
+
+
+class Counted(NamedTuple):
+    """What a drawing that counts finds besides."""
+
+    visibility: Int[Tensor, " N"]
+    ellipses: Float[Tensor, "5 N"]
+    looks: Float[Tensor, "5 N"]
+    composited: Int[Tensor, " stride"]
+
+
+def draw(
+    gaussians: Gaussians, background: Float[Tensor, " 3"], settings: Settings, *, count: bool = False
+) -> tuple[Rendering, Drawing, Counted]:
+    """Draw contiguous tensors of at least one Gaussian."""
+    device, tuning, s = gaussians.means.device, TUNING, settings
+    N, stored = len(gaussians.means), gaussians.sh.shape[1]
+    grid, warps = tile_grid(s.region, tuning.tile), tuning.lanes // 32
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    depths, ellipses = empty(N, dtype=torch.float64), empty(5, N, dtype=torch.float64)
+    looks, boxes = empty(5, N), empty(4, N, dtype=torch.int32)
+    visibility = empty(N, dtype=torch.int8) if count else boxes  # not written without COUNT
+    start(
+        project,
+        programs(N, tuning.lanes),
+        *(*gaussians, s.view, s.alpha_min, s.sh_degree, N, s.width, s.height, *grid),
+        *(depths, ellipses, looks, boxes, visibility),
+        warps=warps,
+        STORED=stored,
+        ANTIALIASED=s.antialiased,
+        EVERYWHERE=s.everywhere,
+        COUNT=count,
+        TILE=tuning.tile,
+        BLOCK=tuning.lanes,
+    )
+    order = torch.sort(depths, stable=True).indices
+    ends = boxes[3].index_select(0, order).cumsum(0)
+    kind = Kind(device, N, grid.tiles)
+    capacity = CAPACITIES.known(kind)
+    if capacity is None:
+        capacity = CAPACITIES.learn(kind, needed_pairs(gaussians, background, boxes, ends))
+    if not 1 <= capacity <= MAX_PAIRS:
+        raise ValueError(f"the capacity must be 1 to {MAX_PAIRS} pairs of a tile and a splat, got {capacity}")
+
+    stride = programs(programs(capacity, tuning.chunk) * tuning.chunk + grid.tiles * tuning.chunk, ALIGNED) * ALIGNED
+    key_type = torch.int16 if grid.tiles < 2**15 - 1 else torch.int32
+    keys, splats, corners = empty(capacity, dtype=key_type), empty(capacity, dtype=torch.int32), empty(2, capacity)
+    records, places = empty(FIELDS.value, stride), empty(capacity, dtype=torch.int32)
+    start(
+        expand,
+        programs(stride, tuning.lanes),
+        *(order, ends, boxes, ellipses, looks, N, capacity, stride, N.bit_length(), *grid.place, grid.tiles),
+        *(keys, splats, corners, records),
+        warps=warps,
+        TILE=tuning.tile,
+        BLOCK=tuning.lanes,
+    )
+    sorted_keys, permutation = torch.sort(keys, stable=True)
+    begins = torch.searchsorted(sorted_keys, tile_numbers(grid.tiles, key_type, device), out_int32=True)
+    start(
+        gather,
+        programs(capacity, tuning.lanes),
+        *(sorted_keys, permutation, begins, splats, corners, ellipses, looks, N, capacity, stride, grid.tiles),
+        *(records, places),
+        warps=warps,
+        CHUNK=tuning.chunk,
+        BLOCK=tuning.lanes,
+    )
+    size = s.height, s.width
+    if s.is_whole:
+        image, alphas, transmittances = empty(*size, 3), empty(*size), empty(*size)
+    else:
+        image, alphas = background.repeat(*size, 1), torch.zeros(size, device=device)
+        transmittances = torch.ones(size, device=device)
+    stops, chunks = empty(*size, dtype=torch.int32), empty(grid.tiles, dtype=torch.int32)
+    composited = torch.zeros(stride, dtype=torch.int32, device=device) if count else stops  # not written without COUNT
+    start(
+        composite,
+        grid.tiles,
+        *(records, begins, ends, background, s.alpha_min, s.alpha_max, s.t_min, N, capacity, stride),
+        *(s.width, *grid.place, *s.region),
+        *(image, alphas, transmittances, stops, chunks, composited),
+        warps=tuning.warps,
+        COUNT=count,
+        TILE=tuning.tile,
+        CHUNK=tuning.chunk,
+        STEP=tuning.step,
+    )
+    CAPACITIES.watch(kind, ends)
+    lists = (order, ends, boxes, begins, records, places)
+    drawing = Drawing(tuning, grid, capacity, *lists, transmittances, stops, chunks)
+    return Rendering(image, alphas), drawing, Counted(visibility, ellipses, looks, composited)
+
+
+def backward(
+    gaussians: Gaussians,
+    background: Float[Tensor, " 3"],
+    settings: Settings,
+    drawing: Drawing,
+    grad_image: Float[Tensor, "H W 3"] | None,
+    grad_alpha: Float[Tensor, "H W"] | None,
+) -> Gaussians:
+    """The gradients of all fields; two launches."""
+    s, d, N, tuning = settings, drawing, len(gaussians.means), drawing.tuning
+    stride = d.records.shape[1]
+    moments = torch.empty((stride, MOMENTS.value), dtype=torch.float32, device=background.device)
+    # The moments stand for a cotangent that the kernel does not read.
+    by_image, by_alpha = (moments if g is None else g.contiguous() for g in (grad_image, grad_alpha))
+    start(
+        composite_backward,
+        d.grid.tiles,
+        *(d.records, d.begins, d.chunks, background, d.transmittances, d.stops, by_image, by_alpha),
+        *(s.alpha_min, s.alpha_max, stride, s.width, *d.grid.place, *s.region, moments),
+        warps=tuning.backward_warps,
+        HAS_IMAGE=grad_image is not None,
+        HAS_ALPHA=grad_alpha is not None,
+        TILE=tuning.tile,
+        CHUNK=tuning.chunk,
+        STEP=tuning.backward_step,
+        FORWARD_STEP=tuning.step,
+    )
+    gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
+    start(
+        project_backward,
+        programs(N, tuning.backward_lanes),
+        *(*gaussians, s.view, d.order, d.ends, d.boxes, d.places, moments, s.sh_degree, N, d.capacity, *gradients),
+        warps=max(tuning.backward_lanes // 32, 1),
+        STORED=gaussians.sh.shape[1],
+        ANTIALIASED=s.antialiased,
+        BLOCK=tuning.backward_lanes,
+    )
+    return gradients
+
+
+def programs(items: int, each: int) -> int:
+    """How many programs of `each` items it takes; also what to multiply `each` by to hold all."""
+    return -(-items // each)
+
+
+def tile_grid(region: Region, tile: int) -> Grid:
+    first_x, first_y = region.left // tile, region.top // tile
+    return Grid(first_x, first_y, (region.right - 1) // tile - first_x + 1, (region.bottom - 1) // tile - first_y + 1)
+
+
+@lru_cache(maxsize=16)
+def tile_numbers(tiles: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " tiles+1"]:
+    return torch.arange(tiles + 1, dtype=dtype, device=device)
+
+
+def needed_pairs(
+    gaussians: Gaussians, background: Float[Tensor, " 3"], boxes: Int[Tensor, "4 N"], ends: Int[Tensor, " N"]
+) -> int:
+    """The number of pairs, waited for. Raises CannotDraw, as the "cpu" backend does, where nothing can be drawn."""
+    needed = int(ends[-1])
+    try:
+        check_finite(background=background)
+        if needed >= POISON.value:
+            check_finite(**gaussians._asdict())
+    except ValueError as error:
+        raise CannotDraw(str(error)) from None
+    if needed >= POISON.value and bool((spoilt := boxes[3] == POISON.value).any()):
+        raise CannotDraw(f"sh gives splat {int(spoilt.nonzero()[0])} a colour beyond the range of float32")
+    if needed > MAX_PAIRS:
+        raise CannotDraw(
+            f"drawing needs {needed} pairs of a tile of {TUNING.tile}x{TUNING.tile} pixels and a splat, the limit is "
+            f"{MAX_PAIRS}; are the scales too large for this camera?"
+        )
+    return needed

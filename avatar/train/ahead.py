@@ -1,0 +1,143 @@
+"""Training on a GPU, which is told of many steps before anything is known about the first.
+
+To ask after each step whether it was finite would make the GPU wait for the question. So it answers itself: a step whose
+loss or gradient is not finite moves nothing, and neither does any after it, until somebody has read of it and goes back.
+The parameters are then still those before that step.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.losses.metrics import psnr
+from avatar.losses.photometric import PhotometricLoss
+from avatar.splat.capacity import CAPACITIES
+from avatar.train.log import TrainingLog
+from avatar.train.step import Judge, Outcome
+
+MOST_AHEAD = 64  # steps
+
+
+class Spoilt(Exception):
+    """Step `step` (from 0) was not finite; nothing has moved since."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(f"step {step}")
+        self.step = step
+
+
+class Guard:
+    """Tells the optimizer, on its own device, to leave everything as it is from the first step on that is not finite."""
+
+    def __init__(self, optimizer: torch.optim.Adam, device: torch.device) -> None:
+        self._sum = torch.zeros((), device=device)  # of 0 for each step, NaN from the first that is not finite on
+        self.is_spoilt: Float[Tensor, ""] = torch.zeros((), device=device)
+        optimizer.found_inf = self.is_spoilt  # type: ignore[attr-defined]  # of Adam's fused kernel: 1 is to do nothing
+
+    def judge(self, loss: PhotometricLoss, gradients: list[Tensor]) -> None:
+        """Before the optimizer's step."""
+        norms = torch.stack(torch._foreach_norm(gradients))  # pyright: ignore
+        self._sum.add_((norms.sum() + loss.total.detach()) * 0.0)
+        torch.ne(self._sum, self._sum, out=self.is_spoilt)
+
+    def forgive(self) -> None:
+        self._sum.zero_()
+        self.is_spoilt.zero_()
+
+
+class Numbers(NamedTuple):
+    """What is told of a step; float32."""
+
+    is_spoilt: float
+    total: float
+    frame: float
+    mouth: float
+    perceptual: float
+    psnr: float  # counts at the steps only that the curves show
+
+
+@dataclass
+class _Note:
+    """The numbers of step `step` (from 1) on their way to the host."""
+
+    step: int
+    numbers: Float[Tensor, " 6"]
+    arrived: torch.cuda.Event | None  # None: they are there
+
+    def has_arrived(self, wait: bool) -> bool:
+        if self.arrived is not None and wait:
+            self.arrived.synchronize()
+        return self.arrived is None or self.arrived.query()
+
+
+class Prompt:
+    """Steps on a CPU: each is checked before it moves anything, and logged when it is made."""
+
+    def __init__(self, log: TrainingLog) -> None:
+        self._log = log
+
+    def judge(self, step: int) -> None:
+        """`training_step` is to check step `step` itself."""
+
+    def note(self, step: int, outcome: Outcome) -> None:
+        self._log.step(step, outcome.loss, outcome.render, outcome.target)
+
+    def settle(self) -> None:
+        """Everything is known."""
+
+    def go_back(self, spoilt: Spoilt) -> int:
+        raise spoilt
+
+
+class Ahead:
+    """Steps on a GPU, which run ahead of what the log shows of them."""
+
+    def __init__(self, log: TrainingLog, optimizer: torch.optim.Adam, device: torch.device) -> None:
+        self._log, self._guard = log, Guard(optimizer, device)
+        self._notes: deque[_Note] = deque()
+        self._suspect = -1
+
+    def judge(self, step: int) -> Judge | None:
+        """Who looks at step `step` (from 0) before it moves anything; None: `training_step`, which waits and says why."""
+        return None if step == self._suspect else self._guard.judge
+
+    @torch.no_grad()
+    def note(self, step: int, outcome: Outcome) -> None:
+        """Send the numbers of a step (from 1) on their way, and log those that have arrived. Raises Spoilt."""
+        total = outcome.loss.total.detach()
+        quality = psnr(outcome.render, outcome.target).float() if self._log.shows(step) else total
+        terms = [term.detach() for term in outcome.loss]
+        numbers = torch.stack((self._guard.is_spoilt, *terms, quality))
+        copy, arrived = numbers.to("cpu", non_blocking=True), None
+        if numbers.is_cuda:
+            arrived = torch.cuda.Event()
+            arrived.record()
+        self._notes.append(_Note(step, copy, arrived))
+        self._read(most_left=MOST_AHEAD)
+
+    def settle(self) -> None:
+        """Wait for all that is known of the steps so far. Raises Spoilt."""
+        self._read(most_left=0)
+
+    def go_back(self, spoilt: Spoilt) -> int:
+        """Give the step to repeat, with care: the GPU's buffers were too small for it, or it has an error to show."""
+        self._notes.clear()
+        self._guard.forgive()
+        self._suspect = spoilt.step
+        CAPACITIES.forget()
+        return spoilt.step
+
+    def _read(self, most_left: int) -> None:
+        while self._notes and self._notes[0].has_arrived(wait=len(self._notes) > most_left):
+            note = self._notes.popleft()
+            numbers = Numbers(*note.numbers.tolist())
+            if numbers.is_spoilt:
+                raise Spoilt(note.step - 1)
+            terms = {name: getattr(numbers, name) for name in PhotometricLoss._fields}
+            self._log.note(note.step, numbers.total, terms, numbers.psnr)

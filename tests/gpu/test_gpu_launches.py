@@ -1,0 +1,76 @@
+"""What a step and a frame launch; and that they read nothing back, which cannot be done on the meta device."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import Counter
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from heads import grid_head
+
+from avatar.losses.photometric import dssim
+from avatar.train.step import PerceptualTerm, Weighted
+
+pytest.importorskip("triton", reason="Triton is not installed")
+pytestmark = pytest.mark.without_kernels  # the meta device has none
+
+MOST_IN_A_STEP, MOST_IN_A_FRAME = 150, 60
+STAND_IN = PerceptualTerm("dssim", Weighted(dssim, 0.05))
+
+
+@pytest.fixture(scope="module")
+def counting() -> ModuleType:
+    path = Path(__file__).resolve().parents[2] / "scripts" / "count_launches.py"
+    spec = importlib.util.spec_from_file_location("count_launches", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def counts(counting: ModuleType) -> dict[str, Counter[str]]:
+    return counting.count_all(grid_head(), 32, 64)
+
+
+def test_a_fast_step_and_a_frame_launch_little(counts: dict[str, Counter[str]]) -> None:
+    for name in ("step, first half", "step with D-SSIM"):
+        assert 50 < counts[name].total() <= MOST_IN_A_STEP, name
+    assert 20 < counts["rendered frame"].total() <= MOST_IN_A_FRAME
+
+
+def test_so_does_a_step_on_average_with_lpips_in_every_tenth(counts: dict[str, Counter[str]]) -> None:
+    first, second, tenth = (counts[name].total() for name in list(counts)[:3])
+    assert (first + 0.9 * second + 0.1 * tenth) / 2 <= MOST_IN_A_STEP
+
+
+def test_every_kernel_of_a_step_is_ours_once_or_twice(counts: dict[str, Counter[str]]) -> None:
+    own = {name: count for name, count in counts["step with D-SSIM"].items() if name.startswith("our ")}
+    assert own.keys() >= {"our project", "our composite", "our composite_backward", "our project_backward", "our place"}
+    assert max(own.values()) <= 2
+
+
+@pytest.mark.parametrize("preset", ["preset=paper", "model=flashavatar", "preset=balanced"])
+def test_other_recipes_read_nothing_back_either(counting: ModuleType, preset: str) -> None:
+    rehearsal = counting.Rehearsal(grid_head(), 32, 64, (preset,))
+    assert rehearsal.step(STAND_IN, late=True).total() > 50
+    assert rehearsal.rendered().total() > 20
+
+
+def test_the_rehearsal_would_notice_a_number_that_is_read_back(counting: ModuleType) -> None:
+    def reading(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        return dssim(image, target, mask) if mask.any().item() else image.sum()
+
+    rehearsal = counting.Rehearsal(grid_head(), 32, 64)
+    with pytest.raises(RuntimeError, match="meta"):
+        rehearsal.step(PerceptualTerm("reading", Weighted(reading, 0.05)), late=True)
+
+
+def test_the_rehearsal_would_notice_a_tensor_on_another_device(counting: ModuleType) -> None:
+    rehearsal = counting.Rehearsal(grid_head(), 32, 64)
+    rehearsal.background = torch.ones(3)
+    with pytest.raises((RuntimeError, ValueError), match=r"meta|cpu"):
+        rehearsal.step(STAND_IN, late=True)

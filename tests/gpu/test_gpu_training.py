@@ -1,0 +1,145 @@
+"""A whole training on the GPU's path against one on the CPU's, and what happens when a step fails in the middle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from interpreter import DEVICE, the_cpus_way
+from small_runs import new_avatar, open_small, small_config
+from torch import Tensor
+
+from avatar.errors import UserError
+from avatar.model import Avatar
+from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
+from avatar.splat import capacity as capacity_module
+from avatar.splat import gpu_draw
+from avatar.train import trainer as trainer_module
+from avatar.train.step import choose_perceptual
+from avatar.train.trainer import train
+
+TINY = (
+    "model.uv_size=10",
+    "data.size=24",
+    "trainer.perceptual=dssim",
+    "trainer.checkpoint_every=100",
+    "model.latent_grid=4",
+)
+
+
+def trained(
+    folder: Path, run: Path, *overrides: str, on_cpu: bool = False, change: Callable[[Avatar], object] = id
+) -> tuple[Avatar, list[float]]:
+    """An avatar, and the loss of each step as the log was told."""
+    config = small_config(*TINY, *overrides)
+    _, subject, assets = open_small(folder, config)
+    avatar = new_avatar(assets, subject, config)
+    change(avatar)
+    losses: list[float] = []
+    with pytest.MonkeyPatch.context() as patch:
+        note = trainer_module.TrainingLog.note
+
+        def listening(self: object, step: int, total: float, terms: dict[str, float], quality: float) -> None:
+            assert step == len(losses) + 1
+            losses.append(total)
+            note(self, step, total, terms, quality)  # type: ignore[arg-type]
+
+        patch.setattr(trainer_module.TrainingLog, "note", listening)
+        device = torch.device("cpu") if on_cpu else DEVICE
+        term = choose_perceptual(config.trainer, lambda _: None, device=device)
+        if on_cpu:
+            with the_cpus_way():
+                train(avatar, subject, config, run, term, device=device)
+        else:
+            train(avatar, subject, config, run, term, device=device)
+    return avatar, losses
+
+
+def test_thirty_steps_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path: Path) -> None:
+    """Across the steps where a spherical-harmonics degree, the perceptual term and a checkpoint come in."""
+    steps = ("trainer.iterations=30", "trainer.preview_every=30")
+    _, expected = trained(tracked_folder, tmp_path / "cpu", *steps, on_cpu=True)
+    avatar, found = trained(tracked_folder, tmp_path / "gpu", *steps)
+    assert len(found) == len(expected) == 30
+    assert found == pytest.approx(expected, rel=1e-4)
+    assert avatar.code.device.type == DEVICE.type
+    saved = newest_checkpoint(tmp_path / "gpu")
+    assert saved.step == 30 and saved.meta["device"] == DEVICE.type
+    assert all(tensor.is_cpu for tensor in saved.tensors.values())
+
+
+def poison_gradient_at(step: int) -> Callable[[Avatar], object]:
+    """The gradient of the colours is NaN at its `step`-th use (from 0), and at each that repeats it."""
+    seen = {"step": 0}
+
+    def poison(gradient: Tensor) -> Tensor:
+        seen["step"] += 1
+        return gradient if seen["step"] <= step else gradient * torch.nan
+
+    return lambda avatar: avatar.sh_dc.register_hook(poison)
+
+
+def test_a_gradient_that_is_not_finite_is_named_and_has_moved_nothing(tracked_folder: Path, tmp_path: Path) -> None:
+    steps = ("trainer.iterations=9", "trainer.checkpoint_every=3", "trainer.preview_every=9")
+    with pytest.raises(UserError) as caught:
+        trained(tracked_folder, tmp_path / "run", *steps, change=poison_gradient_at(4))
+    message = str(caught.value)
+    assert "training stopped at step 5, frame " in message and "the gradient of sh_dc has" in message
+    assert [load_checkpoint(path).step for path in list_checkpoints(tmp_path / "run" / "checkpoints")] == [3]
+
+
+def test_a_drawing_without_room_is_repeated_and_leaves_no_trace(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps 3 and 4 find buffers that are too small, as if the splats had grown; the run is the same to the bit."""
+    steps = ("trainer.iterations=5", "trainer.preview_every=5")
+    expected_avatar, expected = trained(tracked_folder, tmp_path / "whole", *steps)
+    drawn = {"count": 0, "without room": 0}
+    draw, forget = gpu_draw.draw, capacity_module.Capacities.forget
+
+    def sometimes_without_room(*arguments: object, **named: object) -> object:
+        drawn["count"] += 1
+        if drawn["count"] in (3, 4) and not drawn.get("forgotten"):
+            drawn["without room"] += 1
+            with capacity_module.fixed_capacity(2):
+                return draw(*arguments, **named)  # type: ignore[arg-type]
+        return draw(*arguments, **named)  # type: ignore[arg-type]
+
+    def forgotten(self: capacity_module.Capacities) -> None:
+        drawn["forgotten"] = 1
+        forget(self)
+
+    from avatar.splat import gpu
+
+    monkeypatch.setattr(gpu, "draw", sometimes_without_room)
+    monkeypatch.setattr(capacity_module.Capacities, "forget", forgotten)
+    avatar, found = trained(tracked_folder, tmp_path / "broken", *steps)
+    assert drawn["without room"] >= 1 and drawn["count"] > 5
+    assert found == expected
+    for (name, own), wanted in zip(avatar.state_dict().items(), expected_avatar.state_dict().values(), strict=True):
+        assert torch.equal(own, wanted), name
+
+
+def test_a_checkpoint_of_the_gpus_path_goes_on_there_to_the_same_bits_and_on_the_cpu_to_rounding(
+    tracked_folder: Path, tmp_path: Path
+) -> None:
+    steps = ("trainer.iterations=6", "trainer.checkpoint_every=3", "trainer.preview_every=6")
+    whole, _ = trained(tracked_folder, tmp_path / "run", *steps)
+    halfway = load_checkpoint(list_checkpoints(tmp_path / "run" / "checkpoints")[0])
+    assert halfway.step == 3
+    config = small_config(*TINY, *steps)
+    _, subject, assets = open_small(tracked_folder, config)
+    term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
+
+    again = new_avatar(assets, subject, config)
+    train(again, subject, config, tmp_path / "again", term, resume=halfway, device=DEVICE)
+    assert all(torch.equal(a, b) for a, b in zip(again.parameters(), whole.parameters(), strict=True))
+
+    elsewhere = new_avatar(assets, subject, config)
+    with the_cpus_way():
+        term = choose_perceptual(config.trainer, lambda _: None)
+        train(elsewhere, subject, config, tmp_path / "cpu", term, resume=halfway)
+    for own, wanted in zip(elsewhere.parameters(), whole.parameters(), strict=True):
+        torch.testing.assert_close(own, wanted.cpu(), rtol=1e-2, atol=1e-3)
