@@ -13,6 +13,7 @@ import torch
 import avatar
 from avatar.config import config_dir
 from avatar.errors import UserError
+from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import load_head_assets
 from avatar.losses.lpips import load_lpips
 from avatar.runs.trained import HEAD_VARIABLE
@@ -30,6 +31,9 @@ def diagnose(say: Callable[[str], None] = print) -> int:
     ]
     try_finding("video encoder", find_encoder, say)
     try_finding("head model", find_default_head, say)
+    for file in TRACKING_FILES:
+        try_finding(Path(file.name).stem[:16], lambda file=file: f"found ({require(file)})", say)
+    try_finding("MediaPipe", find_mediapipe, say)
     for net in ("vgg", "alex", "squeeze"):
         try_finding(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
     return 0 if all(works) else 1
@@ -66,6 +70,15 @@ def find_encoder() -> str:
     import imageio_ffmpeg
 
     return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+
+
+def find_mediapipe() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("mediapipe")
+    except PackageNotFoundError:
+        return "not installed, so videos cannot be tracked: pip install 'hyperavatar[track]'"
 
 
 def find_default_head() -> str:

@@ -27,6 +27,8 @@ COMMANDS = (
     "demo-data",
     "demo",
     "bench",
+    "track",
+    "models",
 )
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])

@@ -14,6 +14,7 @@ MODULES = {
     "refine": "refining",
     "report": "measuring",
     "compare": "measuring",
+    "track": "tracking",
     "reenact": "driving",
     "drive-file": "driving",
     "export": "exporting",
@@ -26,6 +27,7 @@ MODULES = {
     "bench": "benchmarking",
     "sweep": "sweeping",
     "doctor": "diagnosing",
+    "models": "third_party",
 }
 
 

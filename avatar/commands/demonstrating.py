@@ -10,7 +10,7 @@ from avatar.commands.opening import open_driver, open_run, open_trained
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.training import resume_run, train_new
 from avatar.data.source import Source
-from avatar.demo import make_subject
+from avatar.demo import make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
@@ -23,6 +23,11 @@ RECIPE = ["experiment=demo"]
 
 def run_demo_data(arguments: Namespace) -> int:
     check_outputs([arguments.out], [])
+    if arguments.video:
+        make_video(arguments.out, arguments.frames, arguments.size or 512, arguments.seed, arguments.motion)
+        print(f"Next   avatar track {arguments.out} --out SUBJECT --head head_model/ of what avatar demo-data makes")
+        return OK
+    arguments.size = arguments.size or 256
     make_subject(arguments.out, arguments.frames, arguments.size, arguments.seed, arguments.motion)
     print(f"Next   avatar train {arguments.out}")
     return OK

@@ -8,11 +8,13 @@ from pathlib import Path
 from avatar.commands import OK
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, open_trained, source_of
 from avatar.commands.outputs import check_file, check_outputs
+from avatar.commands.tracking import is_video, tracked_once
 from avatar.files.video import VIDEO_SUFFIXES
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
 from avatar.motion.reenact import Choices, reenact, sidecars
-from avatar.runs.run import RUN_FILE
+from avatar.runs.run import RUN_FILE, read_run_info
+from avatar.runs.trained import TrainedAvatar
 from data_prep.open import open_subject
 
 
@@ -35,8 +37,18 @@ def run_reenact(arguments: Namespace) -> int:
     if driver.suffix.lower() in DRIVE_SUFFIXES:
         reenact(trained, open_drive_file(driver, trained), out, choices)
     else:
+        if is_video(driver):
+            driver = tracked_once(driver, head_of(arguments, trained), trained.assets)
         reenact(trained, open_driver(driver, trained, arguments), out, choices)
     return OK
+
+
+def head_of(arguments: Namespace, trained: TrainedAvatar) -> Path:
+    """Where the avatar's head model lies, with the files beside it that tracking uses: names, landmarks."""
+    if arguments.head is not None:
+        return arguments.head
+    recorded = read_run_info(arguments.run).source.head if (arguments.run / RUN_FILE).is_file() else None
+    return recorded if recorded is not None and recorded.exists() else trained.source
 
 
 def default_video(avatar: Path, driver: Path, choices: Choices) -> Path:

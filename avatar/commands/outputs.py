@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.lock import LOCK_FILE
 from avatar.runs.avatar_file import AVATAR_FILE
-from avatar.runs.lock import LOCK_FILE
 from avatar.runs.run import RUN_FILE
 
 RUN_FILES = (RUN_FILE, AVATAR_FILE, LOCK_FILE)

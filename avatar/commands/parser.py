@@ -52,8 +52,23 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"avatar {avatar.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
-    train = commands.add_parser("train", help="train an avatar on a tracked video folder")
-    train.add_argument("words", nargs="*", metavar="FOLDER", help="tracked video folder; --resume knows it")
+    track = commands.add_parser("track", help="track a face through a video, and write a folder to train on")
+    track.add_argument(
+        "video", type=Path, metavar="VIDEO", help="a video, or a folder of numbered PNG or JPEG pictures"
+    )
+    add_head(track)
+    track.add_argument("--out", type=Path, required=True, metavar="SUBJECT", help="the tracked folder to write")
+    lens = track.add_mutually_exclusive_group()
+    lens.add_argument("--focal", type=float, metavar="PX", help="focal length in pixels of the video, if known")
+    lens.add_argument("--fov", type=float, metavar="DEG", help="field of view across the video's width, if known")
+    track.add_argument("--crop", default="auto", metavar="auto|none|X,Y,W,H", help="what is kept (default: the head)")
+    track.add_argument("--size", type=int, metavar="S", help="longer side of the frames in pixels (default: 512)")
+    track.add_argument("--start", type=float, metavar="S", help="seconds, of the part of the video that is used")
+    track.add_argument("--end", type=float, metavar="S", help="seconds")
+    track.add_argument("--matte", type=Path, metavar="DIR", help="your own mattes: a folder or a video of all pictures")
+
+    train = commands.add_parser("train", help="train an avatar on a tracked video folder, or on a video")
+    train.add_argument("words", nargs="*", metavar="FOLDER | VIDEO", help="what avatar track wrote; --resume knows it")
     add_head(train)
     add_reading(train)
     add_tracking(train)
@@ -107,7 +122,11 @@ def build_parser() -> argparse.ArgumentParser:
     reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
     add_avatar(reenact)
     reenact.add_argument(
-        "--driver", type=Path, required=True, metavar="DRIVER", help="tracked folder, or a drive file (.npz, .csv)"
+        "--driver",
+        type=Path,
+        required=True,
+        metavar="DRIVER",
+        help="tracked folder, video, or a drive file (.npz, .csv)",
     )
     add_reading(reenact)
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
@@ -159,7 +178,8 @@ def build_parser() -> argparse.ArgumentParser:
     demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
     demo_data.add_argument("out", type=Path, metavar="OUT")
     demo_data.add_argument("--frames", type=int, default=600)
-    demo_data.add_argument("--size", type=int, default=256, help="width and height in pixels")
+    demo_data.add_argument("--video", action="store_true", help="OUT is a plain .mp4 of the person, to be tracked")
+    demo_data.add_argument("--size", type=int, help="width and height in pixels (default: 256, of a video 512)")
     demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
     demo_data.add_argument("--motion", choices=("speech", "turn"), default="speech")
 
@@ -176,6 +196,9 @@ def build_parser() -> argparse.ArgumentParser:
     extent = bench.add_mutually_exclusive_group()
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
     extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")
+
+    models = commands.add_parser("models", help="list the files of others that the program can use, and where they are")
+    models.add_argument("--download", action="store_true", help="get what is missing from its publishers")
 
     sweep = commands.add_parser("sweep", help="train and measure many subjects, configurations and seeds")
     sweep.add_argument(

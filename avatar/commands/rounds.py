@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from avatar.commands import OK, training
-from avatar.commands.opening import open_run, source_of
+from avatar.commands.opening import open_run
 from avatar.commands.outputs import check_run_folder
 from avatar.commands.plan import ROUNDS_FOLDER, Plan, plan_file, steps_in_time
 from avatar.commands.refining import refine_run
@@ -21,8 +21,8 @@ from avatar.commands.training import resume_run, train_new
 from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.errors import UserError
+from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.lock import locked
 from avatar.runs.run import RUN_FILE, refuse_trained
 
 MAX_ROUNDS = 10
@@ -33,6 +33,7 @@ def run_train(arguments: Namespace) -> int:
     run = arguments.out or training.default_run(arguments.folder)
     overrides = training.config_overrides(arguments)
     if arguments.resume and plan_file(run).exists():
+        training.forget_video(arguments)
         plan = Plan.load(run)
         refuse_changes(run, plan, arguments, overrides)
         source = moved_source(run, plan.source, arguments)
@@ -44,9 +45,8 @@ def run_train(arguments: Namespace) -> int:
         return training.run_train(arguments)
     if arguments.resume:
         raise UserError(f"{run} began without --refine: leave it out to resume, or start a new run")
-    source = source_of(arguments)
-    check_run_folder(run, [source.folder, source.head, source.tracking])
-    return begin_rounds(run, arguments.refine, arguments.minutes, source, overrides)
+    check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
+    return begin_rounds(run, arguments.refine, arguments.minutes, training.tracked_source(arguments), overrides)
 
 
 def begin_rounds(run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str]) -> int:

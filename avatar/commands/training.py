@@ -12,18 +12,19 @@ import torch
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
 from avatar.commands.outputs import check_run_folder
+from avatar.commands.tracking import head_for_video, is_video, tracked_once
 from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.lock import locked
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.footprint import training_needs
-from avatar.runs.lock import locked
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
@@ -34,18 +35,32 @@ def run_train(arguments: Namespace) -> int:
     run = arguments.out or default_run(arguments.folder)
     overrides = config_overrides(arguments)
     if arguments.resume:
+        forget_video(arguments)
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder)
     load_config(overrides)  # a mistake in it before one in the folder
-    source = source_of(arguments)
-    check_run_folder(run, [source.folder, source.head, source.tracking])
-    return train_new(source, overrides, run)
+    check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
+    return train_new(tracked_source(arguments), overrides, run)
+
+
+def tracked_source(arguments: Namespace) -> Source:
+    """What to train on; a video is tracked first."""
+    if is_video(arguments.folder):
+        head = head_for_video(arguments.folder, arguments.head)
+        arguments.head, arguments.folder = head, tracked_once(arguments.folder, head)
+    return source_of(arguments)
+
+
+def forget_video(arguments: Namespace) -> None:
+    """A run that is resumed knows where the tracking of its video is."""
+    if arguments.folder is not None and is_video(arguments.folder):
+        arguments.folder = None
 
 
 def default_run(folder: Path | None) -> Path:
     if folder is None:
         raise UserError("say which run to go on with: avatar train --resume --out RUN")
-    return Path("runs") / folder.resolve().name
+    return Path("runs") / (folder.resolve().stem if folder.is_file() else folder.resolve().name)
 
 
 def train_new(source: Source, overrides: list[str], run: Path) -> int:

@@ -258,6 +258,12 @@ def _background(wall_colour: tuple[float, float, float], height: int, width: int
     return lighting.tone_map(wall.reshape(-1, 3)).reshape(height, width, 3)
 
 
+def background_of(identity: Identity, height: int, width: int) -> np.ndarray:
+    """What lies behind the person, float32 [H, W, 3], levels of 255."""
+    large = _background(tuple(identity.background.tolist()), SUPERSAMPLE * height, SUPERSAMPLE * width)
+    return cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
 @lru_cache(maxsize=2)
 def _renderer(seed: int) -> Renderer:
     return Renderer(sample_identity(seed))

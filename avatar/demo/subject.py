@@ -8,6 +8,7 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -47,7 +48,8 @@ def make_subject(
     empty.
     """
     out = Path(out)
-    _check_arguments(out, frames, size, seed, motion, threads)
+    check_arguments(frames, size, seed, motion, threads)
+    _check_place(out)
     if not 0.0 <= neutral_bias <= 1.0:
         raise UserError(f"neutral_bias must be from 0 to 1, not {neutral_bias}")
     try:
@@ -91,7 +93,8 @@ def tracking_bias(seed: int, strength: float) -> TrackingBias:
     return TrackingBias(torch.from_numpy(expression), shape)
 
 
-def _check_arguments(out: Path, frames: int, size: int, seed: int, motion: str, threads: int | None) -> None:
+def check_arguments(frames: int, size: int, seed: int, motion: str, threads: int | None) -> None:
+    """Raises UserError for values out of range."""
     for name, value, low, high in (
         ("frames", frames, 1, MAX_FRAMES),
         ("size", size, MIN_SIZE, MAX_SIZE),
@@ -104,6 +107,9 @@ def _check_arguments(out: Path, frames: int, size: int, seed: int, motion: str, 
             raise UserError(f"{name} must be from {low} to {high}, not {value}")
     if motion not in MOTIONS:
         raise UserError(f"motion must be one of {', '.join(MOTIONS)}, not {motion!r}")
+
+
+def _check_place(out: Path) -> None:
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         raise UserError(f"{out} exists and is not a folder; choose another output folder")
     if out.is_dir() and any(out.iterdir()):
@@ -120,26 +126,33 @@ def _write_subject(
     write_head_model(folder / "head_model", renderer.performer.head)
     performance = perform(seed, frames, motion)
     bias = tracking_bias(seed, neutral_bias)
-    threads_before = torch.get_num_threads(), cv2.getNumThreads()
-    # One thread a frame is the better use of the cores than many in one frame's short operations.
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    try:
-        done = _rendered(renderer, performance, size, threads)
+    with single_threads():
+        done = rendered(renderer, performance, size, threads)
         for index, (params, camera, picture) in enumerate(
             tqdm(done, total=frames, desc="rendering", unit="frame", disable=not progress)
         ):
             tracked = replace(params, expression=params.expression + bias.expression)
             _write_frame(folder, index, tracked, camera, picture, identity.shape + bias.shape)
+
+
+@contextmanager
+def single_threads() -> Iterator[None]:
+    """One thread a frame is the better use of the cores than many in one frame's short operations."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield
     finally:
-        torch.set_num_threads(threads_before[0])
-        cv2.setNumThreads(threads_before[1])
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
-def _rendered(
-    renderer: Renderer, performance: Performance, size: int, threads: int
+def rendered(
+    renderer: Renderer, performance: Performance, size: int, threads: int | None = None
 ) -> Iterator[tuple[HeadParams, Camera, RenderedFrame]]:
     """Frames in order, rendered a few ahead by the threads."""
+    threads = threads or os.cpu_count() or 1
 
     def one(frame: int) -> tuple[HeadParams, Camera, RenderedFrame]:
         params, camera = frame_params(performance, frame), frame_camera(performance, frame, size)

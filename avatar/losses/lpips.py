@@ -2,59 +2,23 @@
 
 Weights are looked for in a file or folder that the caller names, else in the folder AVATAR_LPIPS, else in the folder
 `lpips` of the cache (AVATAR_CACHE, else ~/.cache/avatar). A folder holds either `lpips_NET.safetensors` (made by
-`download_lpips` or scripts/lpips_from_onnx.py) or the two published files of `PUBLISHED[NET]`.
+`download_lpips` or scripts/lpips_from_onnx.py) or the two published files of `LPIPS_FILES[NET]`.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import tempfile
-import urllib.error
-import urllib.request
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from tqdm import tqdm
 
 from avatar.errors import UserError
+from avatar.files.third_party import LPIPS_FILES, ThirdPartyFile, check_sha256, fetch, search_folders, sha256_of
 from avatar.losses.lpips_network import NETS, Lpips, Net
-
-
-class PublishedFile(NamedTuple):
-    name: str  # in our folders
-    url: str
-    sha256: str  # all 64 hex digits, or as many first ones as the publisher gives (torchvision: 8, in the file name)
-
-
-_TORCHVISION = "https://download.pytorch.org/models/"
-_HEADS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/"
-PUBLISHED: dict[Net, tuple[PublishedFile, PublishedFile]] = {  # backbone, linear heads
-    "vgg": (
-        PublishedFile("vgg16-397923af.pth", _TORCHVISION + "vgg16-397923af.pth", "397923af"),
-        PublishedFile(
-            "lin_v0.1_vgg.pth", _HEADS + "vgg.pth", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"
-        ),
-    ),
-    "alex": (
-        PublishedFile("alexnet-owt-7be5be79.pth", _TORCHVISION + "alexnet-owt-7be5be79.pth", "7be5be79"),
-        PublishedFile(
-            "lin_v0.1_alex.pth", _HEADS + "alex.pth", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"
-        ),
-    ),
-    "squeeze": (
-        PublishedFile("squeezenet1_1-b8a52dc0.pth", _TORCHVISION + "squeezenet1_1-b8a52dc0.pth", "b8a52dc0"),
-        PublishedFile(
-            "lin_v0.1_squeeze.pth",
-            _HEADS + "squeeze.pth",
-            "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76",
-        ),
-    ),
-}
 
 
 class MissingWeights(UserError):
@@ -70,6 +34,16 @@ def lpips_folder() -> Path:
     return (Path(cache) if cache else Path.home() / ".cache" / "avatar") / "lpips"
 
 
+def _folder_with(net: Net) -> Path:
+    """The first folder that holds weights of this network: $AVATAR_LPIPS or the cache's, then those of $AVATAR_MODELS."""
+    own = lpips_folder()
+    names = {f"lpips_{net}.safetensors"}, {file.name for file in LPIPS_FILES[net]}
+    for folder in (own, *search_folders()):
+        if any(all((folder / name).is_file() for name in wanted) for wanted in names):
+            return folder
+    return own
+
+
 def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False) -> Lpips:
     """LPIPS with the weights of `weights` (a .safetensors file or a folder), else of the folders named above.
 
@@ -78,30 +52,30 @@ def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False)
     """
     if net not in NETS:
         raise UserError(f"LPIPS network must be one of {', '.join(NETS)}, not {net!r}")
-    place = lpips_folder() if weights is None else Path(weights)
+    place = _folder_with(net) if weights is None else Path(weights)
     if place.is_file():
         return from_state(net, _read_safetensors(place), place)
     converted = place / f"lpips_{net}.safetensors"
     if converted.is_file():
         return from_state(net, _read_safetensors(converted), converted)
-    backbone, heads = PUBLISHED[net]
+    backbone, heads = LPIPS_FILES[net]
     if all((place / file.name).is_file() for file in (backbone, heads)):
         return from_published(net, place)
     if download and weights is None:
-        return download_lpips(net, place)
+        return download_lpips(net, lpips_folder())
     raise MissingWeights(
         f"no LPIPS weights for {net!r} in {place}: put {backbone.name} ({backbone.url}) and {heads.name} ({heads.url}) "
         f"there, or name their folder with AVATAR_LPIPS"
     )
 
 
-def from_published(net: Net, folder: Path, files: tuple[PublishedFile, PublishedFile] | None = None) -> Lpips:
+def from_published(net: Net, folder: Path, files: tuple[ThirdPartyFile, ThirdPartyFile] | None = None) -> Lpips:
     """LPIPS from torchvision's file and the linear heads' file in `folder`, both checked by SHA-256."""
-    backbone, heads = files or PUBLISHED[net]
+    backbone, heads = files or LPIPS_FILES[net]
     state: dict[str, Tensor] = {}
     for file in (backbone, heads):
         path = folder / file.name
-        _check_sha256(file, _sha256(path), str(path))
+        check_sha256(file, sha256_of(path), str(path))
         state |= _renamed(_read_torch(path))
     return from_state(net, state, folder / backbone.name)
 
@@ -125,18 +99,18 @@ def from_state(net: Net, state: dict[str, Tensor], source: Path) -> Lpips:
     return lpips
 
 
-def download_lpips(net: Net, folder: Path, files: tuple[PublishedFile, PublishedFile] | None = None) -> Lpips:
+def download_lpips(net: Net, folder: Path, files: tuple[ThirdPartyFile, ThirdPartyFile] | None = None) -> Lpips:
     """Fetch, check and convert the published weights to `folder`/lpips_NET.safetensors; of VGG16's 528 MB 59 remain.
 
     Nothing is left in `folder` when a transfer or a check fails. Raises UserError.
     """
-    files = files or PUBLISHED[net]
+    files = files or LPIPS_FILES[net]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix="download-") as name:
             temporary = Path(name)
             for file in files:
-                _fetch(file, temporary / file.name, folder / file.name)
+                fetch(file, temporary / file.name, folder / file.name)
             lpips = from_published(net, temporary, files)
             converted = temporary / f"lpips_{net}.safetensors"
             save_lpips(lpips, converted)
@@ -149,38 +123,6 @@ def download_lpips(net: Net, folder: Path, files: tuple[PublishedFile, Published
 def save_lpips(lpips: Lpips, path: Path) -> None:
     """Write all weights as one safetensors file that `load_lpips` reads."""
     save_file({name: tensor.contiguous() for name, tensor in lpips.state_dict().items()}, path)
-
-
-def _fetch(file: PublishedFile, path: Path, target: Path) -> None:
-    digest = hashlib.sha256()
-    try:
-        with urllib.request.urlopen(file.url, timeout=30) as response, path.open("wb") as out:
-            size = int(response.headers.get("Content-Length") or 0) or None
-            with tqdm(total=size, unit="B", unit_scale=True, desc=file.name, leave=False) as bar:
-                while chunk := response.read(1 << 20):
-                    digest.update(chunk)
-                    out.write(chunk)
-                    bar.update(len(chunk))
-    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
-        reason = getattr(error, "reason", error)
-        raise UserError(f"cannot download {file.url} ({reason}); fetch it by other means to {target}") from error
-    _check_sha256(file, digest.hexdigest(), file.url)
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as opened:
-        while chunk := opened.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()
-
-
-def _check_sha256(file: PublishedFile, digest: str, source: str) -> None:
-    if not digest.startswith(file.sha256):
-        raise UserError(
-            f"{source} is not the published file or is damaged: its SHA-256 is {digest[: len(file.sha256)]}, not "
-            f"{file.sha256}; fetch {file.url} again"
-        )
 
 
 def _renamed(state: dict[str, Tensor]) -> dict[str, Tensor]:

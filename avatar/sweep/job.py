@@ -18,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.lock import locked
 from avatar.sweep.spec import Job
 from avatar.sweep.state import HEARTBEAT_SECONDS, State, beat, read_job, read_state, worker_name, write_state
 

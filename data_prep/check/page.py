@@ -15,6 +15,7 @@ from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding
 from data_prep.check.folder import Check, facts
 from data_prep.check.overlay import draw_overlays
+from data_prep.check.own_tracking import tracking_sections
 from data_prep.check.plots import course_plots, coverage_plots
 
 PAGE, TABLE = "index.html", "frames.csv"
@@ -45,7 +46,7 @@ def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
     )
     parts: list[Markup] = [header, section("Findings", *_findings(check))]
     if check.clip is not None:
-        parts += _pictures(check.clip)
+        parts += [*tracking_sections(check.clip.files.folder), *_pictures(check.clip)]
         if check.coverage is not None:
             plots = [*coverage_plots(check.coverage), *course_plots(check.clip)]
             parts.append(section("Coverage and course", element("div", *plots, class_="plots")))

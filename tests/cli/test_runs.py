@@ -16,10 +16,10 @@ from small_runs import SMALL, train_small
 from tracked_folder import write_tracked_folder
 
 from avatar.errors import UserError
+from avatar.files.lock import locked
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
-from avatar.runs.lock import locked
 from avatar.runs.run import read_run_info
 
 OPTIONS = ("--frame-offset", "1", *SMALL)

@@ -15,10 +15,9 @@ import pytest
 import torch
 
 from avatar.errors import UserError
+from avatar.files.third_party import LPIPS_FILES, ThirdPartyFile
 from avatar.losses.lpips import (
-    PUBLISHED,
     MissingWeights,
-    PublishedFile,
     download_lpips,
     from_published,
     load_lpips,
@@ -34,7 +33,7 @@ def no_own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AVATAR_LPIPS", raising=False)
 
 
-def publish(folder: Path, lpips: Lpips) -> tuple[PublishedFile, PublishedFile]:
+def publish(folder: Path, lpips: Lpips) -> tuple[ThirdPartyFile, ThirdPartyFile]:
     """Write `lpips` the way its publishers do: torchvision's file with a classifier too, and the linear heads."""
     folder.mkdir(exist_ok=True)
     state = lpips.state_dict()
@@ -46,8 +45,8 @@ def publish(folder: Path, lpips: Lpips) -> tuple[PublishedFile, PublishedFile]:
     )
     sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in ("backbone.pth", "heads.pth")}
     return (
-        PublishedFile("backbone.pth", (folder / "backbone.pth").as_uri(), sums["backbone.pth"][:8]),
-        PublishedFile("heads.pth", (folder / "heads.pth").as_uri(), sums["heads.pth"]),
+        ThirdPartyFile("backbone.pth", (folder / "backbone.pth").as_uri(), sums["backbone.pth"][:8]),
+        ThirdPartyFile("heads.pth", (folder / "heads.pth").as_uri(), sums["heads.pth"]),
     )
 
 
@@ -108,7 +107,7 @@ def test_file_folder_and_cache(tmp_path: Path) -> None:
 def test_published_files_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lpips = Lpips("squeeze")
     files = publish(tmp_path / "by_hand", lpips)
-    monkeypatch.setitem(PUBLISHED, "squeeze", files)
+    monkeypatch.setitem(LPIPS_FILES, "squeeze", files)
     assert same(load_lpips("squeeze", tmp_path / "by_hand"), lpips)
 
 
@@ -117,7 +116,7 @@ def test_download_by_http_checks_and_converts(tmp_path: Path, monkeypatch: pytes
     files = publish(tmp_path / "site", lpips)
     with served(tmp_path / "site") as url:
         remote = tuple(file._replace(url=url + file.name) for file in files)
-        monkeypatch.setitem(PUBLISHED, "squeeze", remote)
+        monkeypatch.setitem(LPIPS_FILES, "squeeze", remote)
         with pytest.raises(MissingWeights):
             load_lpips("squeeze")
         assert not lpips_folder().exists()

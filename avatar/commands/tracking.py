@@ -1,0 +1,75 @@
+"""avatar track: a video in, a tracked folder out; and videos where other commands take tracked folders."""
+
+from __future__ import annotations
+
+import os
+from argparse import Namespace
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from avatar.commands import OK
+from avatar.commands.outputs import check_outputs
+from avatar.errors import UserError
+from avatar.head.assets import HeadAssets, load_head_assets
+from data_prep.avatar_track import read_info, recognise
+from data_prep.cache import cache_folder
+from data_prep.open import HEAD_VARIABLE
+from data_prep.track.crop import parse_crop
+from data_prep.track.footage import Span
+from data_prep.track.pictures import is_footage, open_footage
+from data_prep.track.stages import hash_of
+from data_prep.track.track import STAGES_VERSION, Choices, track
+
+
+def run_track(arguments: Namespace) -> int:
+    check_outputs([arguments.out], [arguments.video, arguments.matte, arguments.head])
+    head = head_for_video(arguments.video, arguments.head)
+    choices = Choices(
+        crop=parse_crop(arguments.crop),
+        size=arguments.size,
+        span=Span(arguments.start or 0.0, arguments.end),
+        focal=arguments.focal,
+        field_of_view=arguments.fov,
+        matte=arguments.matte,
+    )
+    track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=bar)
+    print(f"Look at  {arguments.out / 'overlay'}")
+    print(f"Next     avatar train {arguments.out}")
+    return OK
+
+
+def head_for_video(video: Path, given: Path | None) -> Path:
+    """The head model to track a video with: the one given, else $AVATAR_HEAD. Raises UserError without one."""
+    if given is not None:
+        return given
+    if named := os.environ.get(HEAD_VARIABLE):
+        return Path(named)
+    raise UserError(
+        f"no head model to track {video} with: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can "
+        "be had from https://flame.is.tue.mpg.de; docs/data.md says which files belong into its folder"
+    )
+
+
+def is_video(path: Path) -> bool:
+    """Whether a command's FOLDER is a video, or a folder of pictures, that has to be tracked first."""
+    return not recognise(path) and is_footage(path)
+
+
+def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> Path:
+    """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing."""
+    assets = assets or load_head_assets(head)
+    key = hash_of([STAGES_VERSION, open_footage(video).content_hash(), assets.fingerprint])[:12]
+    folder = cache_folder() / "tracked" / f"{video.resolve().stem}-{key}"
+    if recognise(folder) and read_info(folder).head_fingerprint == assets.fingerprint:
+        print(f"using the tracking {folder}")
+        return folder
+    track(video, folder, head, assets, progress=bar)
+    return folder
+
+
+def bar(items: Iterable[Any], total: int | None, title: str) -> Iterable[Any]:
+    """A progress bar with a rate, which leaves its line."""
+    return tqdm(items, total=total, desc=title, unit=" frames")

@@ -1,0 +1,172 @@
+"""Files of others that the program can use and does not contain: what they are for, where they are looked for and had.
+
+Each is looked for in the folder $AVATAR_MODELS, in the folders directly inside that, and in the cache (`models` in
+$AVATAR_CACHE, else in ~/.cache/avatar). A file counts only with the published SHA-256.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import NamedTuple
+
+from tqdm import tqdm
+
+from avatar.errors import UserError
+
+FOLDER_VARIABLE = "AVATAR_MODELS"
+
+
+class ThirdPartyFile(NamedTuple):
+    name: str  # in our folders
+    url: str  # of the publisher
+    sha256: str  # all 64 hex digits, or as many first ones as the publisher gives (torchvision: 8, in the file name)
+    megabytes: float = 0.0
+    licence: str = ""
+    purpose: str = ""
+    is_optional: bool = False
+
+
+_MEDIAPIPE = "https://storage.googleapis.com/mediapipe-models/"
+FACE_LANDMARKER = ThirdPartyFile(
+    "face_landmarker.task",
+    _MEDIAPIPE + "face_landmarker/face_landmarker/float16/1/face_landmarker.task",
+    "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff",
+    3.8,
+    "Apache-2.0, Google",
+    "face landmarks (track)",
+)
+SELFIE_SEGMENTATION = ThirdPartyFile(
+    "selfie_segmentation.tflite",
+    "https://cdn.jsdelivr.net/npm/@mediapipe/selfie_segmentation@0.1.1675465747/selfie_segmentation.tflite",
+    "9ee168ec7c8f2a16c56fe8e1cfbc514974cbbb7e434051b455635f1bd1462f5c",
+    0.2,
+    "Apache-2.0, Google",
+    "mattes (track)",
+)
+SELFIE_MULTICLASS = ThirdPartyFile(
+    "selfie_multiclass_256x256.tflite",
+    _MEDIAPIPE + "image_segmenter/selfie_multiclass_256x256/float32/1/selfie_multiclass_256x256.tflite",
+    "c6748b1253a99067ef71f7e26ca71096cd449baefa8f101900ea23016507e0e0",
+    16.4,
+    "Apache-2.0, Google",
+    "better mattes (track)",
+    is_optional=True,
+)
+TRACKING_FILES = (FACE_LANDMARKER, SELFIE_SEGMENTATION, SELFIE_MULTICLASS)
+
+_TORCHVISION = "https://download.pytorch.org/models/"
+_HEADS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/"
+
+
+def _lpips(net: str, backbone: str, megabytes: float, heads_sha256: str) -> tuple[ThirdPartyFile, ThirdPartyFile]:
+    """Backbone and linear heads. torchvision publishes the first eight digits of the hash, in the file's name."""
+    digits = backbone.rpartition("-")[2].removesuffix(".pth")
+    return (
+        ThirdPartyFile(
+            backbone, _TORCHVISION + backbone, digits, megabytes, "BSD-3-Clause, torchvision", f"LPIPS {net}"
+        ),
+        ThirdPartyFile(
+            f"lin_v0.1_{net}.pth", f"{_HEADS}{net}.pth", heads_sha256, 0.01, "BSD-2-Clause, R. Zhang", f"LPIPS {net}"
+        ),
+    )
+
+
+LPIPS_FILES = {
+    "vgg": _lpips("vgg", "vgg16-397923af.pth", 528, "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
+    "alex": _lpips(
+        "alex", "alexnet-owt-7be5be79.pth", 233, "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"
+    ),
+    "squeeze": _lpips(
+        "squeeze", "squeezenet1_1-b8a52dc0.pth", 4.7, "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"
+    ),
+}
+"""Weights of the networks of LPIPS."""
+
+
+def models_folder() -> Path:
+    """Where downloads go: `models` in the cache."""
+    cache = os.environ.get("AVATAR_CACHE")
+    return (Path(cache).expanduser() if cache else Path.home() / ".cache" / "avatar") / "models"
+
+
+def search_folders() -> list[Path]:
+    """The folders that files are looked for in, in this order."""
+    named = os.environ.get(FOLDER_VARIABLE)
+    folders = [models_folder()]
+    if named:
+        place = Path(named).expanduser()
+        inside = sorted(path for path in place.iterdir() if path.is_dir()) if place.is_dir() else []
+        folders = [place, *inside, *folders]
+    return folders
+
+
+def find(file: ThirdPartyFile) -> Path | None:
+    """The first place where a file of that name lies, whatever is in it."""
+    return next((path for folder in search_folders() if (path := folder / file.name).is_file()), None)
+
+
+def require(file: ThirdPartyFile) -> Path:
+    """Where the published file lies. Raises UserError, with what to do, where it is missing or another file."""
+    path = find(file)
+    if path is None:
+        raise UserError(
+            f"{file.name} ({file.purpose}; {file.licence}) is missing: run avatar models --download, or fetch "
+            f"{file.url} and put it into {models_folder()} or the folder that ${FOLDER_VARIABLE} names"
+        )
+    check_sha256(file, sha256_of(path), str(path))
+    return path
+
+
+def download(file: ThirdPartyFile) -> Path:
+    """Fetch a file from its publisher into `models_folder`, whole and checked or not at all. Raises UserError."""
+    target = models_folder() / file.name
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix="download-") as name:
+            fetch(file, Path(name) / file.name, target)
+            (Path(name) / file.name).replace(target)
+    except OSError as error:
+        raise UserError(f"{target} cannot be written ({error.strerror or error})") from None
+    return target
+
+
+def fetch(file: ThirdPartyFile, path: Path, target: Path) -> None:
+    """Download to `path` and check it; `target` is where a person should put it who gets it by other means."""
+    digest = hashlib.sha256()
+    try:
+        with urllib.request.urlopen(file.url, timeout=30) as response, path.open("wb") as out:
+            size = int(response.headers.get("Content-Length") or 0) or None
+            with tqdm(total=size, unit="B", unit_scale=True, desc=file.name, leave=False) as bar:
+                while chunk := response.read(1 << 20):
+                    digest.update(chunk)
+                    out.write(chunk)
+                    bar.update(len(chunk))
+    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
+        reason = getattr(error, "reason", error)
+        raise UserError(f"cannot download {file.url} ({reason}); fetch it by other means to {target}") from error
+    check_sha256(file, digest.hexdigest(), file.url)
+
+
+def sha256_of(path: Path) -> str:
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as opened:
+            while chunk := opened.read(1 << 20):
+                digest.update(chunk)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from None
+    return digest.hexdigest()
+
+
+def check_sha256(file: ThirdPartyFile, digest: str, source: str) -> None:
+    """Raises UserError where the SHA-256 is another than the published one; `source` is for the message."""
+    if not digest.startswith(file.sha256):
+        raise UserError(
+            f"{source} is not the published file or is damaged: its SHA-256 is {digest[: len(file.sha256)]}, not "
+            f"{file.sha256}; fetch {file.url} again"
+        )

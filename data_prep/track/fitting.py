@@ -1,0 +1,74 @@
+"""The fit's place in the pipeline: from a clip's landmarks and pictures to one `FrameTrack` a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.errors import UserError
+from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
+from avatar.head.expression_names import load_expression_names
+from data_prep.track.camera import Pinhole
+from data_prep.track.detect import FaceDetector
+from data_prep.track.embedding import LandmarkEmbedding, iris_embedding, official_embedding
+from data_prep.track.fit_result import Clip, Fit
+from data_prep.track.landmark_fit import fit_landmarks
+from data_prep.track.motion import gaze_rotations, rotations
+from data_prep.track.quality import landmark_figures
+from data_prep.track.rendered_embedding import rendered_embedding
+from data_prep.tracking import FrameTrack
+
+
+def fit_tracks(
+    clip: Clip,
+    head: HeadAssets,
+    head_path: Path,
+    progress: Callable[[Iterable[Any], int | None, str], Iterable[Any]],
+) -> Fit:
+    embedding = official_embedding(head_path, head) or _rendered(head)
+    names = load_expression_names(head_path, head.num_expressions)
+    found = fit_landmarks(head, names, embedding, clip.landmarks, Pinhole(*clip.intrinsics))
+    motion = found.motion
+    T = len(motion)
+    expression = np.zeros((T, head.num_expressions))
+    expression[:, found.expressions.numpy()] = motion.expression.numpy()
+    shape = np.zeros(IDENTITY_COEFFICIENTS)
+    shape[: len(found.identity)] = found.identity.numpy()
+    columns = {
+        "R": motion.R.numpy(),
+        "t": motion.t.numpy(),
+        "jaw": rotations(motion.jaw)[:, :2].reshape(T, 6).numpy(),
+        "eyes": gaze_rotations(motion.gaze.reshape(T, 2, 2))[:, :, :2].reshape(T, 12).numpy(),
+        "eyelids": motion.eyelids.numpy(),
+        "neck": rotations(motion.neck)[:, :2].reshape(T, 6).numpy(),
+        "expression": expression,
+    }
+    if not all(np.isfinite(values).all() for values in columns.values()):
+        raise UserError("the fit did not come to finite values; try another part of the video with --start and --end")
+    tracks = {
+        int(number): FrameTrack(
+            **{name: values[row] for name, values in columns.items()},
+            shape=shape,
+            intrinsics=np.array(clip.intrinsics),
+            size=clip.landmarks.size,
+        )
+        for row, number in enumerate(found.frames.tolist())
+    }
+    fit = Fit(tracks, {})
+    return replace(
+        fit, figures=landmark_figures(head, fit, clip.landmarks, embedding.with_others(iris_embedding(head)))
+    )
+
+
+def _rendered(head: HeadAssets) -> LandmarkEmbedding:
+    with FaceDetector() as detector:
+
+        def landmarker(image: np.ndarray) -> np.ndarray | None:
+            face = detector.largest(image)
+            return None if face is None else face.points
+
+        return rendered_embedding(head, landmarker)

@@ -1,0 +1,159 @@
+"""The pictures and masks of a tracked folder: written once, read one at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar, overload
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from avatar.data.images import read_image, read_mask
+from avatar.errors import UserError
+from data_prep.track.footage import Footage, Span, TimedPicture, View
+from data_prep.track.landmarks import Landmarks
+from data_prep.track.look import Look
+
+# JPEG without subsampled colours: see docs/data.md for its size and error beside PNG's.
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+WORKERS = 2
+_AHEAD = 4  # frames that wait for a worker
+Made = TypeVar("Made")
+Progress = Callable[[Iterable[int], int, str], Iterable[int]]
+
+
+class FrameImages(Sequence[UInt8[np.ndarray, "H W 3"]]):
+    """The pictures of some frames, read from their files when they are asked for."""
+
+    def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
+        self._paths = [frame_file(folder, number) for number in numbers]
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[np.ndarray]: ...
+    def __getitem__(self, index: int | slice) -> np.ndarray | list[np.ndarray]:
+        if isinstance(index, slice):
+            return [read_image(path) for path in self._paths[index]]
+        return read_image(self._paths[index])
+
+
+class FrameMattes(FrameImages):
+    """The same for mattes, uint8 [H, W]."""
+
+    def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
+        self._paths = [mask_file(folder, number) for number in numbers]
+
+    def __getitem__(self, index: int | slice) -> np.ndarray | list[np.ndarray]:  # type: ignore[override]
+        if isinstance(index, slice):
+            return [read_mask(path) for path in self._paths[index]]
+        return read_mask(self._paths[index])
+
+
+def frame_file(folder: Path, number: int) -> Path:
+    return folder / f"{number:05d}.jpg"
+
+
+def mask_file(folder: Path, number: int) -> Path:
+    return folder / f"{number:05d}.png"
+
+
+def in_view(landmarks: Landmarks, view: View) -> Landmarks:
+    """Landmarks of the upright source pictures in the pixels of a view."""
+    box = view.box
+    scale = np.array([view.width / box.width, view.height / box.height, view.width / box.width])
+    points = (landmarks.points - np.array([box.x, box.y, 0.0])) * scale
+    points[~landmarks.detected] = 0.0
+    return Landmarks(
+        points.astype(np.float32), landmarks.scores, landmarks.detected, (view.width, view.height), landmarks.fps
+    )
+
+
+def write_frames(folder: Path, footage: Footage, view: View, span: Span, look: Look, progress: Progress) -> None:
+    """The view of every picture with the face, by frame number, as JPEG."""
+    for number, picture in _chosen(footage, view, span, look, progress, "writing frames"):
+        write_image(frame_file(folder, number), cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR), JPEG)
+
+
+def write_given_mattes(
+    folder: Path, mattes: Footage, view: View, span: Span, look: Look, size: tuple[int, int], progress: Progress
+) -> None:
+    """The user's own mattes, a video or pictures like the footage's. Raises UserError where they do not belong to it."""
+    if (mattes.width, mattes.height) != size:
+        raise UserError(
+            f"the mattes in {mattes.path} are {mattes.width}x{mattes.height} pixels, the video {size[0]}x{size[1]}; make "
+            "them of the video's own pictures"
+        )
+    for number, picture in _chosen(mattes, view, span, look, progress, "writing mattes"):
+        write_image(mask_file(folder, number), cv2.cvtColor(picture.image, cv2.COLOR_RGB2GRAY), [])
+
+
+def _chosen(
+    footage: Footage, view: View, span: Span, look: Look, progress: Progress, title: str
+) -> Iterator[tuple[int, TimedPicture]]:
+    """The pictures that belong to the frames with a face, with the frames' numbers."""
+    wanted = {int(look.pictures[number]): int(number) for number in np.flatnonzero(look.landmarks.detected)}
+    steps = iter(progress(range(len(wanted)), len(wanted), title))
+    count, last = 0, max(wanted)
+    for n, picture in enumerate(footage.read(view, span, lambda _: None)):
+        count = n + 1
+        if n in wanted:
+            next(steps, None)
+            yield wanted[n], picture
+        if n >= last and not look.is_whole:
+            break
+    next(steps, None)
+    if count <= last or (look.is_whole and count != look.read):
+        raise UserError(
+            f"{footage.path} gives {count} pictures where {look.read} were expected: mattes must be of every picture of "
+            "the video, and the video must not change meanwhile"
+        )
+
+
+def write_masks(
+    folder: Path,
+    numbers: Sequence[int],
+    make: Callable[[int], UInt8[np.ndarray, "H W"]],
+    progress: Progress,
+    title: str,
+    workers: int = WORKERS,
+) -> None:
+    """What `make` gives for each frame number, as PNG; made by some threads, in any order."""
+
+    def one(number: int) -> None:
+        write_image(mask_file(folder, number), make(number), [])
+
+    for _ in ahead(numbers, one, progress, title, workers):
+        pass
+
+
+def ahead(
+    numbers: Sequence[int], make: Callable[[int], Made], progress: Progress, title: str, workers: int = WORKERS
+) -> Iterator[tuple[int, Made]]:
+    """Each frame number with what `make` gives for it, in order; made by some threads, a few frames ahead."""
+    with ThreadPoolExecutor(workers) as pool:
+        pending: deque[tuple[int, Future[Made]]] = deque()
+        try:
+            for number in progress(numbers, len(numbers), title):
+                pending.append((number, pool.submit(make, number)))
+                if len(pending) > _AHEAD:
+                    first, future = pending.popleft()
+                    yield first, future.result()
+            while pending:
+                first, future = pending.popleft()
+                yield first, future.result()
+        finally:
+            for _, future in pending:
+                future.cancel()
+
+
+def write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
+    data = cv2.imencode(path.suffix, image, options)[1]
+    path.write_bytes(data.tobytes())  # cv2.imwrite does not notice a full disk

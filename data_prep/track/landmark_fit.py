@@ -1,0 +1,171 @@
+"""The fit of a head model to a clip's landmarks: one identity, and the motion of every frame.
+
+First the identity, from frames spread over the clip and all that moves in them; then the motion of all frames with that
+identity, smooth over time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avatar.head.assets import HeadAssets
+from avatar.head.expression_names import ExpressionNames
+from avatar.head.model import JAW, LEFT_EYE, RIGHT_EYE
+from data_prep.track import landmark_groups as groups
+from data_prep.track.camera import Pinhole
+from data_prep.track.columns import free_columns
+from data_prep.track.embedding import LandmarkEmbedding, as_points, iris_embedding
+from data_prep.track.expression_kind import is_statistical, used_expressions
+from data_prep.track.landmark_term import LandmarkTerm
+from data_prep.track.landmarks import Landmarks
+from data_prep.track.levenberg import IdentityPrior, minimise
+from data_prep.track.motion import Columns, Motion, at_rest
+from data_prep.track.priors import Priors, make_priors
+from data_prep.track.smoothness import Smoothness, make_smoothness
+from data_prep.track.start import start_poses
+from data_prep.track.surface import SurfacePoints
+
+POINT_SHARE = 0.02  # of the distance between the eyes: the landmarks' standard deviation
+ROBUST, ROBUST_PAIRS = 4.0, 3.0  # scale of the loss, in those deviations
+FEATURE_WEIGHTS = {groups.LIPS: 1.3, groups.LIDS: 1.3, groups.BROWS: 0.6, groups.NOSE: 1.0}
+OTHER_WEIGHT = 0.12  # of landmarks between the features
+OTHER_DISTANCE = 0.16  # in distances between the eyes: nearer than that to lips, lids or brows they are biased
+IRIS_WEIGHT = 4.0
+PAIR_WEIGHT = 2.0
+IDENTITIES = 100  # coefficients that are fitted; the others add less than landmarks can tell
+CLIP_WORTH = 1.0  # the clip tells as much about the identity as this many independent frames
+KEY_FRAMES = 120
+IDENTITY_ITERATIONS, MOTION_ITERATIONS = 15, 12
+
+
+@dataclass(frozen=True)
+class LandmarkFit:
+    identity: Float[Tensor, " I"]
+    motion: Motion  # of the frames in `frames`
+    frames: Int[Tensor, " T"]  # numbers of the frames with a face
+    expressions: Int[Tensor, " E"]  # the head model's coefficients that `motion` holds
+    columns: Int[Tensor, " D"]  # of a step, that are free
+    term: LandmarkTerm
+    priors: Priors
+    smoothness: Smoothness
+    costs: tuple[tuple[float, ...], ...]
+
+
+def fit_landmarks(
+    assets: HeadAssets, names: ExpressionNames, embedding: LandmarkEmbedding, landmarks: Landmarks, camera: Pinhole
+) -> LandmarkFit:
+    frames = np.flatnonzero(landmarks.detected)
+    seen = Landmarks(
+        landmarks.points[frames], landmarks.scores[frames], landmarks.detected[frames], landmarks.size, landmarks.fps
+    )
+    expressions, statistical = used_expressions(assets), is_statistical(assets)
+    identities = min(IDENTITIES, _last_used(assets.shape_dirs) + 1)
+    term = make_landmark_term(assets, embedding, seen, camera, identities, expressions)
+    R, t = _start(assets, embedding, seen, camera)
+    term = _with_unit(term, assets, camera, t)
+    priors = make_priors(seen, names, expressions, statistical)
+    smoothness = make_smoothness(assets, torch.from_numpy(frames), landmarks.fps, len(expressions), statistical)
+    fixed = [Columns.NECK]
+    if not (assets.weights[:, JAW] > 0).any():
+        fixed.append(Columns.JAW)
+    columns = free_columns(len(expressions), *fixed)
+    motion = at_rest(R, t, len(expressions)).moved(
+        torch.cat((torch.zeros(len(R), 6, dtype=torch.float64), _plausible(priors)), dim=1)
+    )
+    identity = torch.zeros(identities, dtype=torch.float64)
+    key = torch.from_numpy(np.unique(np.linspace(0, len(frames) - 1, min(KEY_FRAMES, len(frames))).round().astype(int)))
+    first = minimise(
+        (term.take(key), priors.take(key), IdentityPrior(len(key) / CLIP_WORTH)),
+        identity, motion[key], columns, IDENTITY_ITERATIONS, with_identity=True, coupled=False,
+    )  # fmt: skip
+    identity = first.identity
+    second = minimise(
+        (term, priors, smoothness), identity, motion, columns, MOTION_ITERATIONS, with_identity=False, coupled=True
+    )
+    return LandmarkFit(
+        identity, second.motion, torch.from_numpy(frames), expressions, columns, term, priors, smoothness,
+        (first.costs, second.costs),
+    )  # fmt: skip
+
+
+def make_landmark_term(
+    assets: HeadAssets,
+    embedding: LandmarkEmbedding,
+    seen: Landmarks,
+    camera: Pinhole,
+    identities: int,
+    expressions: Int[Tensor, " E"],
+) -> LandmarkTerm:
+    """The term of the frames of `seen`; its unit is one pixel as yet."""
+    embedding = embedding.with_others(iris_embedding(assets))
+    weight = _landmark_weights(assets, embedding)
+    kept = weight > 0
+    embedding = LandmarkEmbedding(embedding.landmarks[kept], embedding.corners[kept], embedding.barycentric[kept])
+    weights = torch.from_numpy(weight[kept]).expand(len(seen), -1).clone()
+    for iris, blink in ((groups.LEFT_IRIS, "eyeBlinkLeft"), (groups.RIGHT_IRIS, "eyeBlinkRight")):
+        open_share = (1.0 - seen.score(blink).astype(np.float64)).clip(0, 1)
+        weights[:, embedding.landmarks == iris] *= torch.from_numpy(open_share[:, None] ** 2)
+    row = {int(landmark): k for k, landmark in enumerate(embedding.landmarks)}
+    pairs = [
+        (row[a], row[b])
+        for a, b in (*groups.LEFT_LID_PAIRS, *groups.RIGHT_LID_PAIRS, *groups.LIP_PAIRS, groups.MOUTH_WIDTH)
+        if a in row and b in row
+    ]
+    T = len(seen)
+    return LandmarkTerm(
+        landmarks=embedding.landmarks,
+        points=SurfacePoints(assets, *as_points(embedding), identities, expressions),
+        camera=camera,
+        observed=torch.from_numpy(seen.points[:, embedding.landmarks, :2].astype(np.float64)),
+        weights=weights,
+        unit=torch.ones(T, dtype=torch.float64),
+        pairs=torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2),
+        pair_weights=torch.full((T, len(pairs)), PAIR_WEIGHT, dtype=torch.float64),
+        scale=ROBUST,
+        pair_scale=ROBUST_PAIRS,
+    )
+
+
+def _landmark_weights(assets: HeadAssets, embedding: LandmarkEmbedding) -> np.ndarray:
+    at = (assets.template.numpy()[embedding.corners] * embedding.barycentric[..., None]).sum(1)
+    weights = np.full(len(embedding), OTHER_WEIGHT)
+    biased = at[np.isin(embedding.landmarks, groups.LIPS + groups.LIDS + groups.BROWS)]
+    if len(biased):
+        distance = np.linalg.norm(at[:, None] - biased, axis=-1).min(1)
+        weights[distance < OTHER_DISTANCE * eye_distance(assets)] = 0.0
+    for group, weight in FEATURE_WEIGHTS.items():
+        weights[np.isin(embedding.landmarks, group)] = weight
+    weights[np.isin(embedding.landmarks, (groups.LEFT_IRIS, groups.RIGHT_IRIS))] = IRIS_WEIGHT
+    return weights
+
+
+def eye_distance(assets: HeadAssets) -> float:
+    """Between the eyes' joints of the template, metres."""
+    eyes = (assets.joint_regressor @ assets.template)[[LEFT_EYE, RIGHT_EYE]]
+    return float((eyes[0] - eyes[1]).norm())
+
+
+def _start(assets: HeadAssets, embedding: LandmarkEmbedding, seen: Landmarks, camera: Pinhole) -> tuple[Tensor, Tensor]:
+    """Poses by the landmarks of the generic head that the mouth does not move."""
+    rigid = np.isin(embedding.landmarks, groups.FEATURES) & ~np.isin(embedding.landmarks, groups.LIPS)
+    at = (assets.template.double().numpy()[embedding.corners[rigid]] * embedding.barycentric[rigid, :, None]).sum(1)
+    return start_poses(at, seen.points[:, embedding.landmarks[rigid], :2], camera)
+
+
+def _with_unit(term: LandmarkTerm, assets: HeadAssets, camera: Pinhole, t: Tensor) -> LandmarkTerm:
+    unit = POINT_SHARE * eye_distance(assets) * camera.fx / t[:, 2]
+    return replace(term, unit=unit)
+
+
+def _plausible(priors: Priors) -> Float[Tensor, "T C"]:
+    return priors.mean.clamp(priors.low, priors.high)
+
+
+def _last_used(directions: Tensor) -> int:
+    used = torch.nonzero((directions != 0).any(0).any(0))
+    return int(used[-1]) if len(used) else -1

@@ -1,0 +1,126 @@
+"""Head and mouth masks from the matte and the posed mesh.
+
+The matte has clothes on it; where the neck ends is found by GrabCut inside the matte (Rother, Kolmogorov, Blake 2004), with
+the mesh to say what is surely head and what is surely not. Everything is measured in heights above the mesh's neck ring.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from avatar.errors import UserError
+from data_prep.projection import silhouette
+from data_prep.track.landmark_groups import OUTER_LIPS
+
+SIDE = 256  # pixels of the picture that is divided; the division is enlarged
+# Heights above the neck ring; 1 is the middle of the head.
+_SURELY_CLOTHES = -0.15  # below
+_CLOTHES_BESIDE = 0.10  # below and outside the mesh
+_MAYBE_BESIDE = 0.50  # below and outside: shoulders, or hair that falls on them
+_SURELY_HEAD = 0.30  # above and well inside the mesh
+_ALL_HEAD = 0.75  # above, inside the matte
+_DIVIDED = 1.0  # below: the rest needs no division
+_MARGIN_IN, _MARGIN_OUT = 7, 5  # pixels of SIDE by which the mesh may be wrong
+_ITERATIONS = 3
+_NOWHERE = (255, 0, 255)  # a colour that no person has, in the place of the background
+
+
+class HeadMask(NamedTuple):
+    mask: UInt8[np.ndarray, "H W"]  # 0 or 255
+    overlap: float  # share of the mesh (above the ring) that lies on the matte
+
+
+def neck_ring(template: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " R"]:
+    """Vertices of the mesh's lowest open edge. Raises UserError for a mesh that is open nowhere."""
+    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    follows = dict(edges[count[inverse.ravel()] == 1].tolist())
+    loops = []
+    while follows:
+        start, at = follows.popitem()
+        loop = [start]
+        while at in follows:
+            loop.append(at)
+            at = follows.pop(at)
+        loops.append(loop)
+    if not loops:
+        raise UserError("the head model is closed everywhere: it has no neck ring to end the head mask at")
+    return np.array(min(loops, key=lambda loop: template[loop, 1].mean()), np.int64)
+
+
+def head_mask(
+    image: UInt8[np.ndarray, "H W 3"],
+    matte: UInt8[np.ndarray, "H W"],
+    screen: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    ring: Int[np.ndarray, " R"],
+) -> HeadMask:
+    """Head and neck of the person in `matte`; `screen` are the posed vertices in pixels of the image (centres at +0.5)."""
+    height, width = matte.shape
+    small_screen = screen * np.array([SIDE / width, SIDE / height, 1.0])
+    points, body = small_screen[:, :2], silhouette(small_screen, faces, SIDE, SIDE)
+    inside = cv2.erode(body, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_MARGIN_IN, _MARGIN_IN))) > 0
+    outside = cv2.dilate(body, np.ones((_MARGIN_OUT, _MARGIN_OUT), np.uint8)) == 0
+    level = _level(points, ring)
+    person = cv2.resize(matte, (SIDE, SIDE), interpolation=cv2.INTER_AREA) > 127
+    labels = np.full((SIDE, SIDE), cv2.GC_PR_FGD, np.uint8)
+    labels[outside & (level < _MAYBE_BESIDE)] = cv2.GC_PR_BGD
+    labels[(level < _SURELY_CLOTHES) | (outside & (level < _CLOTHES_BESIDE))] = cv2.GC_BGD
+    labels[(inside & (level > _SURELY_HEAD)) | (level > _ALL_HEAD)] = cv2.GC_FGD
+    labels[~person] = cv2.GC_BGD
+    small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    small[~person] = _NOWHERE
+    _divide(small, labels, level)
+    head = _with_face((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), inside & (level > _ALL_HEAD))
+    above = (body > 0) & (level > _SURELY_HEAD)
+    overlap = float(person[above].mean()) if above.any() else 0.0
+    large = cv2.resize(head.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    return HeadMask((large & (matte > 127)).astype(np.uint8) * 255, overlap)
+
+
+def mouth_mask(points: Float32[np.ndarray, "478 3"], width: int, height: int) -> UInt8[np.ndarray, "H W"]:
+    """255 inside the outer outline of the lips; `points` are the landmarks in pixels."""
+    mask = np.zeros((height, width), np.uint8)
+    outline = np.clip(points[list(OUTER_LIPS), :2], -(2**13), 2**13)
+    corners = np.rint((outline - 0.5) * 16).astype(np.int32)
+    return cv2.fillPoly(mask, [corners], 255, shift=4)
+
+
+def _level(points: np.ndarray, ring: np.ndarray) -> Float[np.ndarray, "S S"]:
+    """Height of every pixel's centre above the ring along the head's axis; 1 is the middle of the head."""
+    base = points[ring].mean(0)
+    axis = points.mean(0) - base
+    axis = axis / max(float(axis @ axis), 1e-9)
+    rows, columns = np.mgrid[0:SIDE, 0:SIDE] + 0.5
+    return (columns - base[0]) * axis[0] + (rows - base[1]) * axis[1]
+
+
+def _divide(image: np.ndarray, labels: np.ndarray, level: np.ndarray) -> None:
+    """GrabCut in place, on the rows that have something to divide."""
+    rows = np.flatnonzero((level < _DIVIDED).any(axis=1))
+    if not len(rows):
+        return
+    part = np.ascontiguousarray(labels[rows[0] : rows[-1] + 1])
+    known_head, known_other = (part == cv2.GC_FGD).any(), (part == cv2.GC_BGD).any()
+    if not (known_head and known_other and ((part == cv2.GC_PR_FGD) | (part == cv2.GC_PR_BGD)).any()):
+        return
+    cv2.setRNGSeed(0)  # its colour models start from random means
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cut = np.ascontiguousarray(image[rows[0] : rows[-1] + 1])
+    cv2.grabCut(cut, part, (0, 0, 0, 0), *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    labels[rows[0] : rows[-1] + 1] = part
+
+
+def _with_face(head: Bool[np.ndarray, "S S"], face: Bool[np.ndarray, "S S"]) -> Bool[np.ndarray, "S S"]:
+    """The connected part that holds the face, with its holes filled."""
+    _, parts = cv2.connectedComponents(head.astype(np.uint8))
+    of_face = parts[face & head]
+    if not len(of_face):
+        return head
+    kept = parts == np.bincount(of_face).argmax()
+    outlines, _ = cv2.findContours(kept.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(kept.astype(np.uint8), outlines, -1, 1, cv2.FILLED) > 0

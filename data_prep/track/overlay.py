@@ -1,0 +1,69 @@
+"""The tracked mesh over the frames, as a video and as a sheet of some of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from avatar.files.video import video_writer
+from avatar.head.model import HeadModel
+from data_prep.check.overlay import MASK, MOUTH, draw_mesh, outline
+from data_prep.fit import MeshProjector
+from data_prep.track.frames import JPEG, Progress, ahead, write_image
+from data_prep.tracking import FrameTrack
+
+OVERLAY_VIDEO, OVERLAY_SHEET = "overlay.mp4", "overlay.jpg"
+_WIDEST = 512  # pixels of a picture
+_SHOWN, _COLUMNS = 12, 4  # pictures in the sheet
+
+
+class FrameParts(NamedTuple):
+    image: np.ndarray  # uint8 [H, W, 3]
+    head: np.ndarray  # uint8 [H, W]
+    mouth: np.ndarray
+
+
+def write_overlay(
+    folder: Path,
+    head: HeadModel,
+    tracks: dict[int, FrameTrack],
+    read: Callable[[int], FrameParts],
+    fps: float,
+    progress: Progress,
+) -> None:
+    """FOLDER/overlay.mp4 of all frames, and FOLDER/overlay.jpg of some that are spread over the clip."""
+    first = next(iter(tracks.values()))
+    project = MeshProjector(head, first.intrinsics)
+    scale = min(1.0, _WIDEST / max(first.size))
+    width, height = round(first.size[0] * scale), round(first.size[1] * scale)
+    numbers = list(tracks)
+    shown = {numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, min(_SHOWN, len(numbers)))}
+    pictures: list[np.ndarray] = []
+
+    def draw(number: int) -> np.ndarray:
+        parts = read(number)
+        canvas = cv2.resize(parts.image, (width, height), interpolation=cv2.INTER_AREA)
+        canvas = draw_mesh(canvas, project(tracks[number], width, height))
+        for colour, mask in ((MASK, parts.head), (MOUTH, parts.mouth)):
+            outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
+        return canvas
+
+    with video_writer(folder / OVERLAY_VIDEO, fps) as add:
+        for number, canvas in ahead(numbers, draw, progress, "drawing the overlay"):
+            add(canvas)
+            if number in shown:
+                pictures.append(canvas)
+    write_image(folder / OVERLAY_SHEET, cv2.cvtColor(_sheet(pictures), cv2.COLOR_RGB2BGR), JPEG)
+
+
+def _sheet(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    blank = np.full_like(pictures[0], 255)
+    rows = []
+    for start in range(0, len(pictures), _COLUMNS):
+        row = list(pictures[start : start + _COLUMNS])
+        rows.append(np.concatenate(row + [blank] * (min(_COLUMNS, len(pictures)) - len(row)), axis=1))
+    return np.concatenate(rows)

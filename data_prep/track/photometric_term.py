@@ -1,0 +1,93 @@
+"""How far the colours of skin points are from their mean over the clip, and the derivatives through the image.
+
+A point n of the head has one grey value T_n in all frames, times a gain per frame. Where the head is a little off, its
+points land on their neighbours' values; the image's gradient says in which direction to go.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from data_prep.track.camera import Pinhole, by_pose, to_camera
+from data_prep.track.columns import frame_columns
+from data_prep.track.crops import BlurredCrops
+from data_prep.track.motion import Motion
+from data_prep.track.normal_equations import NormalEquations
+from data_prep.track.surface import SurfacePoints
+
+DEVIATION = 0.03  # of grey values from 0 to 1
+ROBUST = 3.0  # scale of Cauchy's loss, in deviations
+_FRAMES_AT_ONCE = 8
+
+
+@dataclass(frozen=True)
+class PhotometricTerm:
+    """Of N points in T frames. The wanted values and the weights stay as they are while the motion is improved."""
+
+    points: SurfacePoints
+    camera: Pinhole
+    images: BlurredCrops
+    first: int  # number of the first frame in `images`
+    wanted: Float[Tensor, "T N"]
+    weights: Float[Tensor, "T N"]  # 0 where a point is not seen
+
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
+        total = 0.0
+        for chunk in _chunks(len(motion)):
+            at = to_camera(motion[chunk], self.points.positions(identity, motion[chunk]))
+            residuals = self._residuals(self.camera.project(at), chunk)[0]
+            robust = ROBUST**2 * torch.log1p((residuals / ROBUST) ** 2)
+            total += float(0.5 * (self.weights[chunk] * robust).sum())
+        return total
+
+    def add_to(
+        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
+    ) -> None:
+        with_identity = len(equations.shared) > 0
+        for chunk in _chunks(len(motion)):
+            moving = motion[chunk]
+            at = to_camera(moving, self.points.positions(identity, moving))
+            residuals, gradient = self._residuals(self.camera.project(at), chunk)
+            slopes = gradient[:, :, None] @ self.camera.slopes(at)  # [T, N, 1, 3]
+            robust = (self.weights[chunk] / (1 + (residuals / ROBUST) ** 2)).sqrt()
+            slopes = slopes * robust[..., None, None]
+            in_head = (slopes.flatten(1, 2) @ moving.R)[:, :, None]
+            _, derivatives = self.points.positions_and_derivatives(identity, moving, in_head, with_identity)
+            pose = by_pose(moving, at, slopes)[:, :, 0].transpose(0, 1)  # [N, T, 6]
+            J = frame_columns(pose, derivatives, columns)
+            r = (residuals * robust).T
+            equations.add_rows(chunk, J, r, derivatives.identity if with_identity else None)
+
+    def _residuals(self, pixels: Float[Tensor, "T N 2"], chunk: slice) -> tuple[Tensor, Tensor]:
+        """In deviations [T, N], and their derivatives by the pixels [T, N, 2]."""
+        frames = slice(self.first + chunk.start, self.first + chunk.stop)
+        values, gradient = self.images.sample(pixels, frames)
+        return (values - self.wanted[chunk]) / DEVIATION, gradient / DEVIATION
+
+
+def _chunks(frames: int):
+    for start in range(0, frames, _FRAMES_AT_ONCE):
+        yield slice(start, min(start + _FRAMES_AT_ONCE, frames))
+
+
+def mean_texture(
+    values: Float[Tensor, "T N"], weights: Float[Tensor, "T N"], rounds: int = 6
+) -> tuple[Float[Tensor, " N"], Float[Tensor, " T"]]:
+    """The grey value of every point and the gain of every frame whose products are nearest to `values`.
+
+    Alternating weighted least squares, reweighted for Cauchy's loss; the gains have mean 1. Unseen points are 0.
+    """
+    gain = values.new_ones(len(values))
+    robust = weights
+    texture = values.new_zeros(values.shape[1])
+    for _ in range(rounds):
+        texture = (robust * gain[:, None] * values).sum(0) / (robust * gain[:, None] ** 2).sum(0).clamp(min=1e-9)
+        gain = (robust * values * texture).sum(1) / (robust * texture**2).sum(1).clamp(min=1e-9)
+        gain = gain / gain.mean()
+        residuals = (values - gain[:, None] * texture) / DEVIATION
+        robust = weights / (1 + (residuals / ROBUST) ** 2)
+    return texture, gain

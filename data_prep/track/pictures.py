@@ -1,0 +1,143 @@
+"""A folder of numbered PNG or JPEG pictures as footage."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from avatar.data.images import IMAGE_SUFFIXES, has_transparency, read_bytes, read_image
+from avatar.errors import UserError
+from data_prep.track.footage import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque
+from data_prep.track.timing import DEFAULT_FPS
+from data_prep.track.video import open_video
+
+_MAX_PICTURES = 100_000
+_TRACKED = {"imgs", "images", "image", "frames", "checkpoint", "flame_param"}  # what tracked folders hold
+_EXIF, _FOCAL_IN_35MM_FILM = 0x8769, 0xA405  # EXIF 2.3, tags of the sub-directory and of the value
+
+
+@dataclass(frozen=True)
+class PictureFolder:
+    """Implements `Footage`; the pictures are taken in the order of their numbers, 25 a second."""
+
+    path: Path
+    files: tuple[Path, ...]
+    width: int
+    height: int
+    rate: float | None
+    duration: float | None
+    equivalent_focal: float | None
+    notes: tuple[str, ...]
+    _hash: list[str] = field(default_factory=list, compare=False)
+
+    def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
+        """Raises UserError for pictures of another size and for files that cannot be decoded."""
+        was_transparent = False
+        for n, file in enumerate(self.files):
+            time = n / DEFAULT_FPS
+            if time < span.start - 1e-6 or (span.end is not None and time >= span.end):
+                continue
+            image, is_transparent = _read(file)
+            was_transparent |= is_transparent
+            if image.shape[:2] != (self.height, self.width):
+                raise UserError(
+                    f"{file} is {image.shape[1]}x{image.shape[0]} pixels but {self.files[0].name} is "
+                    f"{self.width}x{self.height}; give pictures of one size"
+                )
+            yield TimedPicture(time, resampled(image, view))
+        if was_transparent:
+            complain(LAID_OVER_GREY)
+
+    def content_hash(self) -> str:
+        if not self._hash:
+            digest = hashlib.sha256()
+            for file in self.files:
+                try:
+                    digest.update(file.name.encode(errors="surrogateescape") + b"\0" + file.read_bytes())
+                except OSError as error:
+                    raise UserError(f"{file} cannot be read ({error.strerror})") from None
+            self._hash.append(digest.hexdigest())
+        return self._hash[0]
+
+
+def _read(file: Path) -> tuple[np.ndarray, bool]:
+    """A picture, and whether it has transparent parts, which are laid over grey."""
+    image = read_image(file)
+    data = read_bytes(file)
+    if not has_transparency(data):
+        return image, False
+    four = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if four is None or four.ndim != 3 or four.shape[2] != 4 or four.dtype != np.uint8 or four[..., 3].min() == 255:
+        return image, False
+    return opaque(np.dstack((image, four[..., 3]))), True
+
+
+def resampled(image: np.ndarray, view: View) -> np.ndarray:
+    """The view of a whole picture; made smaller by the mean over areas."""
+    box = view.box
+    part = image[box.y : box.y + box.height, box.x : box.x + box.width]
+    if part.shape[:2] == (view.height, view.width):
+        return np.ascontiguousarray(part)
+    smaller = view.width < box.width
+    return cv2.resize(part, (view.width, view.height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+
+
+def open_footage(path: Path) -> Footage:
+    """A video file or a folder of pictures. Raises UserError for what is neither."""
+    return open_pictures(path) if path.is_dir() else open_video(path)
+
+
+def is_footage(path: Path) -> bool:
+    """Whether the path is something to be tracked: a file, or a folder of pictures that is nobody's tracked folder."""
+    if not path.is_dir():
+        return path.is_file()
+    names = [entry.name.lower() for entry in path.iterdir()]
+    is_tracked = any(name in _TRACKED or name.endswith(".json") for name in names)
+    return not is_tracked and any(Path(name).suffix in IMAGE_SUFFIXES for name in names)
+
+
+def open_pictures(folder: Path) -> PictureFolder:
+    try:
+        found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    except OSError as error:
+        raise UserError(f"{folder} cannot be read ({error.strerror})") from None
+    files = tuple(sorted((p for p in found if p.is_file()), key=_natural))
+    if not files:
+        inside = next((name for name in ("imgs", "frames", "images") if (folder / name).is_dir()), None)
+        hint = f"; it looks like a tracked folder: give {folder / inside} to track its pictures again" if inside else ""
+        raise UserError(f"{folder} holds no PNG or JPEG pictures{hint or ' and is not a video'}")
+    if len(files) > _MAX_PICTURES:
+        raise UserError(f"{folder} holds {len(files)} pictures; more than {_MAX_PICTURES} are not read")
+    first = read_image(files[0])
+    height, width = first.shape[:2]
+    check_size(files[0], width, height)
+    note = f"a folder of pictures has no frame rate: {DEFAULT_FPS:g} a second are assumed"
+    duration = len(files) / DEFAULT_FPS
+    return PictureFolder(folder, files, width, height, DEFAULT_FPS, duration, _focal_of(files[0]), (note,))
+
+
+def _natural(path: Path) -> tuple[Any, ...]:
+    """Sorts picture 10 after picture 9, padded or not."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return tuple((int(part[:300]), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts if part)
+
+
+def _focal_of(file: Path) -> float | None:
+    from PIL import Image  # comes with imageio; only the header is read
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(file) as image:
+                value = float(image.getexif().get_ifd(_EXIF).get(_FOCAL_IN_35MM_FILM, 0))
+    except Exception:  # a header may be damaged in many ways, and nothing depends on it
+        return None
+    return value if 5 <= value <= 1200 else None

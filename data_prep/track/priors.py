@@ -1,0 +1,129 @@
+"""What is known of a face before its landmarks are seen: how far coefficients go, and what the blendshape scores say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avatar.head.expression_names import ExpressionNames, plain
+from data_prep.track.landmarks import BLENDSHAPES, Landmarks
+from data_prep.track.motion import Columns, Motion
+from data_prep.track.normal_equations import NormalEquations
+
+SCORE_SHARE = 0.7  # of a blendshape's score is expected in its coefficient
+EXPRESSION_DEVIATION = 0.25  # of coefficients that go from 0 to 1
+STATISTICAL_DEVIATION = 1.0  # of principal components, whose unit is their standard deviation
+EYELID_DEVIATION = 0.25
+JAW_PER_SCORE = 0.3  # radians that jawOpen = 1 stands for
+JAW_DEVIATION = (0.15, 0.05, 0.03)  # radians: opening, to the sides, tilted
+GAZE_DEVIATION = 0.35  # radians
+EYES_TIED = (0.05, 0.03)  # radians between the eyes: yaw (they converge), pitch
+NECK_DEVIATION = 0.10  # radians
+BOX = (-0.15, 1.25)  # of coefficients that go from 0 to 1, and of eyelids
+BOX_DEVIATION = 0.05  # how far outside
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Independent normal distributions of the coefficients of T frames (all columns but the pose), the box, the tie.
+
+    Costs are half squares of deviations.
+    """
+
+    mean: Float[Tensor, "T C"]
+    precision: Float[Tensor, " C"]  # 1 / variance
+    low: Float[Tensor, " C"]
+    high: Float[Tensor, " C"]
+
+    def take(self, frames: slice | Tensor) -> Priors:
+        return Priors(self.mean[frames], self.precision, self.low, self.high)
+
+    def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
+        values = motion.coefficients()
+        outside = values - values.clamp(self.low, self.high)
+        tie = _between_eyes(motion) / torch.tensor(EYES_TIED, dtype=values.dtype)
+        squares = ((values - self.mean) ** 2 * self.precision).sum() + (outside / BOX_DEVIATION).pow(2).sum()
+        return float(0.5 * (squares + tie.pow(2).sum()))
+
+    def add_to(
+        self,
+        equations: NormalEquations,
+        identity: Float[Tensor, " I"],
+        motion: Motion,
+        columns: Int[Tensor, " D"],
+    ) -> None:
+        values = motion.coefficients()
+        T, C = values.shape
+        outside = values - values.clamp(self.low, self.high)
+        gradient = (values - self.mean) * self.precision + outside / BOX_DEVIATION**2
+        curvature = self.precision + (outside != 0) / BOX_DEVIATION**2
+        hessian = torch.diag_embed(curvature)
+        between = _between_eyes(motion)
+        start = Columns.GAZE.start - Columns.HEAD.start
+        for axis, deviation in enumerate(EYES_TIED):
+            left, right = start + axis, start + 2 + axis
+            gradient[:, left] += between[:, axis] / deviation**2
+            gradient[:, right] -= between[:, axis] / deviation**2
+            for a, b, sign in ((left, left, 1), (right, right, 1), (left, right, -1), (right, left, -1)):
+                hessian[:, a, b] += sign / deviation**2
+        pose = Columns.HEAD.start
+        moved = columns[columns >= pose]
+        at = len(columns) - len(moved)
+        equations.gradient[:, at:] += gradient[:, moved - pose]
+        equations.diagonal[:, at:, at:] += hessian[:, moved - pose][:, :, moved - pose]
+        assert len(equations.gradient) == T and len(self.precision) == C
+
+
+def _between_eyes(motion: Motion) -> Float[Tensor, "T 2"]:
+    return motion.gaze[:, :2] - motion.gaze[:, 2:]
+
+
+def make_priors(
+    landmarks: Landmarks, names: ExpressionNames, expressions: Int[Tensor, " E"], statistical: bool
+) -> Priors:
+    """Priors of the frames of `landmarks` for the coefficients that the fit uses, numbered as in the head model."""
+    T, E = len(landmarks), len(expressions)
+    C = Columns.EXPRESSION.start - Columns.HEAD.start + E
+    mean = torch.zeros(T, C, dtype=torch.float64)
+    deviation = torch.empty(C, dtype=torch.float64)
+    low, high = torch.full((C,), -torch.inf, dtype=torch.float64), torch.full((C,), torch.inf, dtype=torch.float64)
+
+    def part(columns: slice) -> slice:
+        first = Columns.HEAD.start
+        return slice(columns.start - first, None if columns.stop is None else columns.stop - first)
+
+    def score(name: str) -> Tensor:
+        return torch.from_numpy(landmarks.score(name)).double()
+
+    jaw, lids, expression = part(Columns.JAW), part(Columns.EYELIDS), part(Columns.EXPRESSION)
+    deviation[jaw] = torch.tensor(JAW_DEVIATION, dtype=torch.float64)
+    deviation[part(Columns.GAZE)] = GAZE_DEVIATION
+    deviation[lids] = EYELID_DEVIATION
+    deviation[part(Columns.NECK)] = NECK_DEVIATION
+    deviation[expression] = STATISTICAL_DEVIATION if statistical else EXPRESSION_DEVIATION
+    mean[:, lids] = torch.stack((score("eyeBlinkLeft"), score("eyeBlinkRight")), dim=1)
+    low[lids], high[lids] = BOX
+    if not statistical:
+        low[expression], high[expression] = BOX
+    column_of = {int(coefficient): expression.start + k for k, coefficient in enumerate(expressions)}
+    jaw_is_named = False
+    for blendshape in BLENDSHAPES:
+        for target, weight in names.targets(blendshape).items():
+            if isinstance(target, str):  # an axis of the jaw
+                jaw_is_named = True
+                mean[:, jaw.start + "xyz".index(target[-1])] += weight * score(blendshape)
+            elif target in column_of:
+                mean[:, column_of[target]] += SCORE_SHARE * weight * score(blendshape)
+    if not jaw_is_named:
+        mean[:, jaw.start] = JAW_PER_SCORE * score("jawOpen")
+    named_negative = (mean[:, expression] < 0).any(0)  # mapped to with a negative weight: goes both ways
+    low[expression] = torch.where(named_negative, -BOX[1], low[expression])
+    return Priors(mean, deviation.pow(-2), low, high)
+
+
+def names_anything(names: ExpressionNames) -> bool:
+    """Whether a head model's coefficients are known by name, so that scores speak about them."""
+    return any(names.targets(blendshape) for blendshape in BLENDSHAPES) or any(map(plain, filter(None, names.names)))

@@ -1,0 +1,155 @@
+"""What a tracking is worth, in figures with thresholds, and what to do about each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from avatar.head.assets import HeadAssets
+from data_prep.track.embedding import LandmarkEmbedding
+from data_prep.track.fit_result import Fit
+from data_prep.track.focal import Focal
+from data_prep.track.landmark_groups import BROWS, LEFT_IRIS, LIDS, LIPS, NOSE, RIGHT_IRIS
+from data_prep.track.landmarks import Landmarks
+
+GRADES = ("good", "fair", "poor")
+GROUPS = {"lips": LIPS, "lids": LIDS, "brows": BROWS, "nose": NOSE, "irises": (LEFT_IRIS, RIGHT_IRIS)}
+_WORST = 5  # frames that are named
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measure. `good` and `fair` bound the grades; without them the figure is told and not judged."""
+
+    name: str
+    value: float
+    unit: str
+    good: float | None = None
+    fair: float | None = None
+    advice: str = ""  # where it is not good
+    more_is_better: bool = False
+
+    @property
+    def grade(self) -> str | None:
+        if self.good is None or self.fair is None:
+            return None
+        sign = -1.0 if self.more_is_better else 1.0
+        steps = (sign * self.value > sign * self.good, sign * self.value > sign * self.fair)
+        return GRADES[sum(steps)] if np.isfinite(self.value) else "poor"
+
+    def line(self) -> str:
+        grade = self.grade
+        judged = "" if grade is None else f"  {grade}"
+        told = f"  -> {self.advice}" if grade in GRADES[1:] and self.advice else ""
+        return f"  {self.name:34} {self.value:9.3f} {self.unit:5}{judged}{told}"
+
+    def to_json(self) -> dict[str, Any]:
+        told = {"name": self.name, "value": self.value, "unit": self.unit}
+        return told if self.grade is None else told | {"grade": self.grade, "advice": self.advice}
+
+
+@dataclass(frozen=True)
+class Quality:
+    figures: tuple[Figure, ...]
+    worst_frames: tuple[int, ...]
+    focal: str
+
+    def lines(self) -> list[str]:
+        """For the terminal."""
+        worst = ", ".join(f"{number:05d}" for number in self.worst_frames)
+        return ["quality of the tracking", *(f.line() for f in self.figures), f"  frames that fit worst: {worst}"]
+
+    def to_json(self) -> dict[str, Any]:
+        figures = [figure.to_json() for figure in self.figures]
+        return {"figures": figures, "worst_frames": list(self.worst_frames), "focal": self.focal}
+
+
+def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Focal) -> Quality:
+    """The figures of a finished tracking. `fit.figures` holds what `landmark_figures` made of it."""
+    own = fit.figures
+    shots = {name: float(value) for name, value in own["errors"].items()}
+    seen = float(landmarks.detected.mean())
+    figures = [
+        Figure("frames with a face", 100 * seen, "%", 99, 90, "light the face, and keep it in the picture", True),
+        Figure("landmark error", shots.pop("all"), "% eyes", 1.0, 2.0, "is the head model's landmark embedding right?"),
+        *(Figure(f"  of the {name}", value, "% eyes", 1.0, 2.0) for name, value in shots.items()),
+        Figure("  the same in all frames, besides", own["constant"], "% eyes"),
+        Figure("jitter, against the landmarks' own", own["jitter"], "x", 1.0, 1.2, "a steadier camera and more light"),
+        Figure(
+            "mesh above the neck on the matte", 100 * float(np.mean(overlaps)), "%", 98, 95,
+            "look at overlay/: is the matte whole, and the head in its place?", True,
+        ),
+        Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
+    ]  # fmt: skip
+    figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
+    figures += coverage(fit, landmarks)
+    return Quality(tuple(figures), tuple(own["worst_frames"]), focal.source)
+
+
+def coverage(fit: Fit, landmarks: Landmarks) -> list[Figure]:
+    """What the clip shows of the face: what it does not show, an avatar cannot learn."""
+    rotations = np.stack([track.R for track in fit.tracks.values()])
+    forward = rotations[:, :, 2]  # the face looks along its own z
+    yaw = np.degrees(np.arctan2(forward[:, 0], -forward[:, 2]))
+    rows = list(fit.tracks)
+    closed = np.minimum(landmarks.score("eyeBlinkLeft")[rows], landmarks.score("eyeBlinkRight")[rows]) > 0.5
+    blinks = int(closed[0]) + int((closed[1:] & ~closed[:-1]).sum())
+    mouth = landmarks.score("jawOpen")[rows]
+    advice = "turn the head to both sides in the video"
+    return [
+        Figure(
+            "turns of the head, 5 to 95 %", float(np.subtract(*np.percentile(yaw, [95, 5]))), "deg", 20, 8, advice, True
+        ),
+        Figure("blinks", blinks, "", 3, 1, "let the video show closed eyes", True),
+        Figure("widest opening of the mouth", float(mouth.max()), "", 0.3, 0.1, "speak in the video", True),
+    ]
+
+
+def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding: LandmarkEmbedding) -> dict[str, Any]:
+    """Errors of the landmarks of every group, jitter and the worst frames, as JSON.
+
+    Errors are mean distances between the embedded and the detected landmarks, in per cent of the distance between the
+    irises in the picture (its 90th percentile over the clip, since turned heads show it shorter). What is the same in all
+    frames is told apart: it is where the embedding lies on this face, and not an error of the tracking.
+    """
+    rows = list(fit.tracks)
+    placed = _placed(head, fit, embedding)
+    observed = landmarks.points[rows][:, embedding.landmarks, :2]
+    eyes = np.linalg.norm(landmarks.points[rows][:, LEFT_IRIS, :2] - landmarks.points[rows][:, RIGHT_IRIS, :2], axis=1)
+    unit = float(np.percentile(eyes, 90)) / 100.0
+    residual = (placed - observed) / unit
+    constant = residual.mean(0)
+    error = np.linalg.norm(residual - constant, axis=2)  # [T, L]
+    groups = {name: np.isin(embedding.landmarks, members) for name, members in GROUPS.items()}
+    features = np.any(list(groups.values()), axis=0)
+    per_frame = error[:, features].mean(1)
+    errors = {"all": float(per_frame.mean())}
+    errors |= {name: float(error[:, members].mean()) for name, members in groups.items() if members.any()}
+    worst = [rows[i] for i in np.argsort(-per_frame)[:_WORST]]
+    return {
+        "errors": errors,
+        "constant": float(np.linalg.norm(constant[features], axis=1).mean()),
+        "jitter": _jitter(placed[:, features]) / max(_jitter(observed[:, features]), 1e-9),
+        "worst_frames": sorted(worst),
+        "identity": float(np.abs(next(iter(fit.tracks.values())).shape).max()),
+    }
+
+
+def _placed(head: HeadAssets, fit: Fit, embedding: LandmarkEmbedding) -> Float[np.ndarray, "T L 2"]:
+    project = fit.projector(head)
+    screens = []
+    for number in fit.tracks:
+        screen = project(number)[:, :2]
+        screens.append((screen[embedding.corners] * embedding.barycentric[..., None]).sum(1))
+    return np.stack(screens)
+
+
+def _jitter(points: Float[np.ndarray, "T L 2"]) -> float:
+    """Mean length of second differences over time, pixels."""
+    if len(points) < 3:
+        return 0.0
+    return float(np.linalg.norm(np.diff(points, n=2, axis=0), axis=-1).mean())

@@ -1,0 +1,98 @@
+"""A folder that is made in stages, each of them whole or not at all, so that an interrupted run goes on where it was.
+
+While it grows the folder is called `.NAME.partial` and lies beside its place. A stage writes into a folder of its own that
+gets its name when it is complete, together with a hash of everything that it was made from; a stage with the same hash is
+not made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from avatar.errors import UserError
+from avatar.files.lock import LOCK_FILE, locked
+
+RECORD = ".stage.json"
+_MAX_RECORD = 2**24
+
+Made = tuple[dict[str, Any], str]  # what a stage found out, and the hash of what it was made from
+
+
+class Stages:
+    """The stages of one folder. `run` them in order, then `finish`."""
+
+    def __init__(self, growing: Path) -> None:
+        self.folder = growing
+
+    def run(self, name: str, inputs: Mapping[str, Any], make: Callable[[Path], dict[str, Any]]) -> Made:
+        """What `make` returned when it wrote the stage's files into the folder that it is given; now, or earlier.
+
+        `inputs` and the result must be JSON. Raises UserError when the disk refuses.
+        """
+        key = hash_of([name, dict(inputs)])
+        place = self.folder / name
+        known = _read_record(place / RECORD)
+        if known is not None and known.get("key") == key:
+            return known["result"], key
+        partial = self.folder / f"{name}.partial"
+        try:
+            for stale in (place, partial):
+                shutil.rmtree(stale, ignore_errors=True)
+            partial.mkdir(parents=True)
+            result = json.loads(json.dumps(make(partial)))
+            (partial / RECORD).write_text(json.dumps({"key": key, "result": result}), encoding="utf-8")
+            partial.rename(place)
+        except OSError as error:
+            raise UserError(
+                f"{place} cannot be written ({error.strerror or error}); free some space, or choose another --out"
+            ) from None
+        return result, key
+
+    def finish(self, target: Path, temporary: tuple[str, ...]) -> None:
+        """Remove what only the making needed, and give the folder its name."""
+        try:
+            for name in temporary:
+                shutil.rmtree(self.folder / name, ignore_errors=True)
+            for record in self.folder.glob(f"*/{RECORD}"):
+                record.unlink()
+            (self.folder / LOCK_FILE).unlink(missing_ok=True)
+            self.folder.rename(target)
+        except OSError as error:
+            raise UserError(
+                f"{target} cannot be written ({error.strerror or error}); the same command tries again"
+            ) from None
+
+
+@contextlib.contextmanager
+def growing(target: Path) -> Iterator[Stages]:
+    """The stages of `target`, for one process at a time. Raises UserError where nothing can be written."""
+    folder = target.with_name(f".{target.name}.partial")
+    with locked(folder):
+        try:
+            yield Stages(folder)
+        except BaseException:
+            for unfinished in folder.glob("*.partial"):
+                shutil.rmtree(unfinished, ignore_errors=True)
+            if next(folder.glob(f"*/{RECORD}"), None) is None:  # there is nothing to go on from
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def hash_of(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _read_record(path: Path) -> dict[str, Any] | None:
+    try:
+        if path.stat().st_size > _MAX_RECORD:
+            return None
+        record = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("result"), dict) else None

@@ -1,0 +1,157 @@
+"""`avatar track`: from a video to a tracked folder, in stages that an interruption does not undo.
+
+look     every picture's faces; one person, one shot, a regular grid of times
+frames   the crop of every picture with the face
+matte    the person against the background
+fit      identity, and pose and expression of every frame
+head     head and neck without clothes
+mouth    the lips and what is between them
+overlay  the tracked mesh over the frames, for the eye
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from avatar.errors import UserError
+from avatar.files.third_party import FACE_LANDMARKER, SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find
+from avatar.head.assets import HeadAssets
+from data_prep.avatar_track import (
+    LANDMARKS_FILE,
+    TrackingInfo,
+    read_info,
+    recognise,
+    write_tracking,
+)
+from data_prep.track.focal import Focal
+from data_prep.track.footage import Footage, View
+from data_prep.track.frames import (
+    in_view,
+)
+from data_prep.track.landmarks import save_landmarks
+from data_prep.track.look import Look
+from data_prep.track.pictures import open_footage
+from data_prep.track.quality import judge
+from data_prep.track.stages import growing, hash_of
+from data_prep.track.work import Choices, Progress, Work
+
+STAGES_VERSION = 1  # raised when what a stage makes changes
+Item = TypeVar("Item")
+
+
+def silent(items: Iterable[Item], total: int | None, title: str) -> Iterable[Item]:
+    return items
+
+
+def track(
+    video: Path,
+    out: Path,
+    head_path: Path,
+    head: HeadAssets,
+    choices: Choices | None = None,
+    say: Callable[[str], object] = print,
+    progress: Progress = silent,
+) -> TrackingInfo:
+    """Track one person's face through `video` (a file or a folder of pictures) and write the tracked folder `out`.
+
+    The folder appears under its name when it is complete; until then its stages lie beside it, and the same call goes on
+    from them. Nothing is done where `out` holds just this already. Raises UserError, with what to do, where the video or
+    the choices are of no use, and where `out` is something else.
+    """
+    choices = choices or Choices()
+    footage = open_footage(video)
+    say(f"{video}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
+    for note in footage.notes:
+        say(f"note: {note}")
+    mattes = None if choices.matte is None else open_footage(choices.matte)
+    network = _matte_network()
+    options = choices.to_json()
+    seen = {"video": footage.content_hash(), "version": STAGES_VERSION, "landmarks": FACE_LANDMARKER.sha256}
+    key = hash_of([seen, options, head.fingerprint, network])
+    if out.exists() and not _is_empty(out):
+        if recognise(out) and (known := read_info(out)).source.get("key") == key:
+            say(f"{out} holds this tracking already")
+            return known
+        raise UserError(f"{out} exists and is not this tracking: choose another --out, or remove it first")
+    with growing(out) as stages, _interruptible(out, say):
+        work = Work(stages, footage, choices, head, progress)
+        look = work.look(seen)
+        for note in look.notes:
+            say(f"note: {note}")
+        view, focal = work.view_and_focal(look)
+        say(f"focal length {focal.pixels:.0f} pixels of the video, {focal.source}" + _crop_words(view, footage))
+        landmarks = in_view(look.landmarks, view)
+        frames_key = work.frames(look, view, [seen, options])
+        matte_key = work.mattes(look, view, mattes, network, frames_key, options)
+        fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
+        overlaps = work.masks(landmarks, fit)
+        work.overlay(fit, look)
+        quality = judge(landmarks, fit, overlaps, focal)
+        for line in quality.lines():
+            say(line)
+        save_landmarks(stages.folder / LANDMARKS_FILE, landmarks)
+        info = TrackingInfo(
+            fps=look.landmarks.fps,
+            width=view.width,
+            height=view.height,
+            intrinsics=_camera(focal, view, footage),
+            focal=focal.source,
+            focal_is_assumed=focal.is_assumed,
+            head_path=str(head_path.resolve()),
+            head_fingerprint=head.fingerprint,
+            source={"video": video.name, "sha256": footage.content_hash(), "key": key, "crop": list(view.box)}
+            | options,
+            left_out=_left_out(look),
+            notes=(*footage.notes, *look.notes),
+            quality=quality.to_json(),
+        )
+        write_tracking(stages.folder, info, fit.tracks)
+        stages.finish(out, ("look", "fit"))
+    say(f"tracked {len(fit.tracks)} frames in {out}")
+    return info
+
+
+def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of the view; the principal point is the middle of the source picture."""
+    centre = view.to_view(footage.width / 2, footage.height / 2)
+    return focal.pixels * view.width / view.box.width, focal.pixels * view.height / view.box.height, *centre
+
+
+def _matte_network() -> str:
+    """The hash of the network that mattes are made with."""
+    return (SELFIE_MULTICLASS if find(SELFIE_MULTICLASS) is not None else SELFIE_SEGMENTATION).sha256
+
+
+def _left_out(look: Look) -> dict[int, str]:
+    lost = np.flatnonzero(~look.landmarks.detected).tolist()
+    return {n: "no face was found" if look.pictures[n] >= 0 else "the video has no picture at this time" for n in lost}
+
+
+@contextmanager
+def _interruptible(out: Path, say: Callable[[str], object]) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"interrupted: the same command goes on after the last stage that was complete (beside {out})")
+        raise
+
+
+def _rate_and_length(footage: Footage) -> str:
+    rate = "" if footage.rate is None else f", {footage.rate:g} a second"
+    return rate + ("" if footage.duration is None else f", {footage.duration:.1f} s")
+
+
+def _crop_words(view: View, footage: Footage) -> str:
+    box = view.box
+    if (box.width, box.height) == (footage.width, footage.height):
+        return f"; frames of {view.width}x{view.height} pixels show the whole picture"
+    return f"; frames of {view.width}x{view.height} pixels show {box.width}x{box.height} from {box.x},{box.y} on"
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and next(folder.iterdir(), None) is None

@@ -1,0 +1,174 @@
+"""The stages of one video's tracking, each with what it is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from avatar.head.assets import HeadAssets
+from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.track.crop import choose_view
+from data_prep.track.fit_result import Clip, Fit
+from data_prep.track.fitting import fit_tracks
+from data_prep.track.focal import Focal, choose_focal
+from data_prep.track.footage import Box, Footage, Span, View
+from data_prep.track.frames import FrameImages, FrameMattes, write_frames, write_given_mattes, write_masks
+from data_prep.track.landmarks import Landmarks, load_landmarks, save_landmarks
+from data_prep.track.look import Look, from_json, look_at, to_json
+from data_prep.track.masks import head_mask, mouth_mask, neck_ring
+from data_prep.track.matte import open_matter
+from data_prep.track.overlay import FrameParts, write_overlay
+from data_prep.track.pictures import open_footage
+from data_prep.track.stages import Stages
+
+Progress = Callable[[Iterable[Any], int | None, str], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a person may say about a video."""
+
+    crop: Literal["auto", "none"] | Box = "auto"
+    size: int | None = None  # pixels of the longer side; None for 512 with crop="auto", else the video's
+    span: Span = field(default_factory=Span)
+    focal: float | None = None  # pixels of the video
+    field_of_view: float | None = None  # degrees across the video's width
+    matte: Path | None = None  # the user's own: a folder or a video of all pictures
+
+    def to_json(self) -> dict[str, Any]:
+        crop = self.crop if isinstance(self.crop, str) else list(self.crop)
+        matte = None if self.matte is None else open_footage(self.matte).content_hash()
+        return {"crop": crop, "size": self.size, "span": list(self.span), "focal": self.focal,
+                "field_of_view": self.field_of_view, "matte": matte}  # fmt: skip
+
+
+class Work:
+    """The stages of one video, each with what it was made from."""
+
+    def __init__(
+        self, stages: Stages, footage: Footage, choices: Choices, head: HeadAssets, progress: Progress
+    ) -> None:
+        self._stages, self._footage, self._choices, self._head = stages, footage, choices, head
+        self._progress = progress
+        self._folder = stages.folder
+        self._faces = head.faces.numpy()
+
+    def look(self, seen: dict[str, Any]) -> Look:
+        span = self._choices.span
+
+        def make(folder: Path) -> dict[str, Any]:
+            look = look_at(self._footage, span, self._progress)
+            save_landmarks(folder / LANDMARKS_FILE, look.landmarks)
+            return to_json(look)
+
+        raw, _ = self._stages.run("look", seen | {"span": list(span)}, make)
+        return from_json(raw, load_landmarks(self._folder / "look" / LANDMARKS_FILE))
+
+    def view_and_focal(self, look: Look) -> tuple[View, Focal]:
+        points = look.landmarks.points[look.landmarks.detected]
+        size = self._footage.width, self._footage.height
+        view = choose_view(self._choices.crop, self._choices.size, *size, points)
+        given = self._choices.focal, self._choices.field_of_view, self._footage.equivalent_focal
+        return view, choose_focal(*size, points, *given)
+
+    def frames(self, look: Look, view: View, inputs: list[Any]) -> str:
+        def make(folder: Path) -> dict[str, Any]:
+            write_frames(folder, self._footage, view, self._choices.span, look, self._progress)
+            return {}
+
+        return self._stages.run(FRAMES, {"of": inputs, "view": [*view.box, view.width, view.height]}, make)[1]
+
+    def mattes(
+        self, look: Look, view: View, given: Footage | None, network: str, frames_key: str, options: dict[str, Any]
+    ) -> str:
+        numbers = _numbers(look.landmarks)
+
+        def make(folder: Path) -> dict[str, Any]:
+            if given is not None:
+                size = self._footage.width, self._footage.height
+                write_given_mattes(folder, given, view, self._choices.span, look, size, self._progress)
+                return {}
+            matter, _ = open_matter()
+            images = FrameImages(self._folder / FRAMES, numbers)
+            rows = {number: row for row, number in enumerate(numbers)}
+            write_masks(folder, numbers, lambda n: matter(images[rows[n]]), self._progress, "making mattes", workers=1)
+            return {}
+
+        return self._stages.run(MATTE, {"frames": frames_key, "network": network, "given": options["matte"]}, make)[1]
+
+    def fit(
+        self, landmarks: Landmarks, intrinsics: tuple[float, float, float, float], head_path: Path, inputs: list[Any]
+    ) -> Fit:
+        numbers = _numbers(landmarks)
+
+        def make(folder: Path) -> dict[str, Any]:
+            clip = Clip(
+                landmarks,
+                intrinsics,
+                FrameImages(self._folder / FRAMES, numbers),
+                FrameMattes(self._folder / MATTE, numbers),
+            )
+            fit = fit_tracks(clip, self._head, head_path, self._progress)
+            fit.save(folder / TRACKS_FILE)
+            return fit.figures
+
+        figures, key = self._stages.run(
+            "fit", {"of": inputs, "head": self._head.fingerprint, "camera": list(intrinsics)}, make
+        )
+        return Fit.load(self._folder / "fit" / TRACKS_FILE, intrinsics, landmarks.size, figures, key)
+
+    def masks(self, landmarks: Landmarks, fit: Fit) -> list[float]:
+        """Writes head and mouth masks; returns how much of the mesh lies on the matte, by frame."""
+        numbers = list(fit.tracks)
+        rows = {number: row for row, number in enumerate(numbers)}
+        images = FrameImages(self._folder / FRAMES, numbers)
+        mattes = FrameMattes(self._folder / MATTE, numbers)
+
+        def make_heads(folder: Path) -> dict[str, Any]:
+            ring = neck_ring(self._head.template.numpy(), self._faces)
+            project = fit.projector(self._head)
+            overlaps: dict[int, float] = {}
+
+            def one(number: int) -> np.ndarray:
+                row = rows[number]
+                made = head_mask(images[row], mattes[row], project(number), self._faces, ring)  # type: ignore[arg-type]
+                overlaps[number] = made.overlap
+                return made.mask
+
+            write_masks(folder, numbers, one, self._progress, "masking the head")
+            return {"overlaps": [overlaps[number] for number in numbers]}
+
+        def make_mouths(folder: Path) -> dict[str, Any]:
+            def one(number: int) -> np.ndarray:
+                return mouth_mask(landmarks.points[number], *landmarks.size)
+
+            write_masks(folder, numbers, one, self._progress, "masking the mouth")
+            return {}
+
+        result, _ = self._stages.run(HEAD, {"fit": fit.key}, make_heads)
+        self._stages.run(MOUTH, {"fit": fit.key}, make_mouths)
+        return result["overlaps"]
+
+    def overlay(self, fit: Fit, look: Look) -> None:
+        numbers = list(fit.tracks)
+        rows = {number: row for row, number in enumerate(numbers)}
+        images = FrameImages(self._folder / FRAMES, numbers)
+        heads, mouths = (FrameMattes(self._folder / kind, numbers) for kind in (HEAD, MOUTH))
+
+        def read(number: int) -> FrameParts:
+            row = rows[number]
+            return FrameParts(images[row], heads[row], mouths[row])  # type: ignore[arg-type]
+
+        def make(folder: Path) -> dict[str, Any]:
+            write_overlay(folder, fit.model(self._head), fit.tracks, read, look.landmarks.fps, self._progress)
+            return {}
+
+        self._stages.run("overlay", {"fit": fit.key}, make)
+
+
+def _numbers(landmarks: Landmarks) -> list[int]:
+    return np.flatnonzero(landmarks.detected).tolist()

@@ -1,0 +1,55 @@
+"""The check page of a folder that avatar track wrote."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from data_prep.avatar_track import TrackingInfo, write_tracking
+from data_prep.check import own_tracking
+from data_prep.check.own_tracking import tracking_sections
+from data_prep.metrical_tracker import read_tracking
+
+
+@pytest.fixture
+def folder(tracked_folder: Path, tmp_path: Path) -> Path:
+    tracks = read_tracking({0: tracked_folder / "checkpoint" / "00000.frame"}).frames
+    figures = [
+        {"name": "landmark error", "value": 1.23456, "unit": "% eyes", "grade": "fair", "advice": "look <again>"},
+        {"name": "blinks", "value": 4, "unit": "", "grade": "good", "advice": "blink"},
+    ]
+    info = TrackingInfo(
+        25.0, 48, 48, (100.0, 100.0, 24.0, 24.0), "assumed: a lens", True, "head", "0" * 64, {},
+        notes=("the video is HDR",), quality={"figures": figures},
+    )  # fmt: skip
+    write_tracking(tmp_path, dataclasses.replace(info), tracks)
+    return tmp_path
+
+
+def test_figures_lens_and_notes_are_shown(folder: Path) -> None:
+    page = "".join(tracking_sections(folder))
+    for part in (
+        "landmark error",
+        "1.235",
+        "fair",
+        "look &lt;again&gt;",
+        "Focal length: assumed: a lens.",
+        "The video is HDR.",
+    ):
+        assert part in page
+    assert ">blink<" not in page and "<video" not in page  # advice only where it is needed
+
+
+def test_the_video_is_inside_the_page_unless_it_is_large(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "overlay").mkdir()
+    (folder / "overlay" / "overlay.mp4").write_bytes(b"film")
+    assert 'src="data:video/mp4;base64,ZmlsbQ=="' in "".join(tracking_sections(folder))
+    monkeypatch.setattr(own_tracking, "MAX_EMBEDDED", 3)
+    page = "".join(tracking_sections(folder))
+    assert "<video" not in page and "overlay.mp4" in page
+
+
+def test_folders_of_others_have_none_of_it(tracked_folder: Path) -> None:
+    assert tracking_sections(tracked_folder) == []

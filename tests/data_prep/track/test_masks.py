@@ -1,0 +1,94 @@
+"""Head and mouth masks, against the demo person's own."""
+
+from __future__ import annotations
+
+import functools
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from avatar.demo.identity import sample_identity
+from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.render import Renderer
+from avatar.errors import UserError
+from data_prep.track.landmark_groups import OUTER_LIPS
+from data_prep.track.masks import head_mask, mouth_mask, neck_ring
+
+SIZE = 256
+
+
+@functools.cache
+def renderer_of(seed: int) -> Renderer:
+    return Renderer(sample_identity(seed))
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("shift", [0, 6])
+def test_the_head_without_its_clothes(seed: int, shift: int) -> None:
+    """Also where the mesh lies 6 of 256 pixels aside, as fits do."""
+    renderer = renderer_of(seed)
+    performance = perform(seed, 40, "turn")
+    model = renderer.performer.model
+    faces, template = model.faces.numpy(), model.assets.template.numpy()
+    ring = neck_ring(template, faces)
+    for frame in (0, 20):
+        params, camera = frame_params(performance, frame), frame_camera(performance, frame, SIZE)
+        picture = renderer.render(params, camera)
+        with torch.no_grad():
+            screen = camera.project(model.vertices(params)).numpy()
+        made = head_mask(picture.image, picture.alpha, screen + np.array([shift, 0, 0]), faces, ring)
+        assert iou(made.mask > 0, picture.head > 127) > 0.97
+        assert set(np.unique(made.mask)) <= {0, 255} and made.overlap > (0.99 if shift == 0 else 0.9)
+        # A matte that is empty, and a mesh that is elsewhere, make no mask and no noise.
+        assert not head_mask(picture.image, 0 * picture.alpha, screen, faces, ring).mask.any()
+        assert head_mask(picture.image, picture.alpha, screen + np.array([2000.0, 0, 0]), faces, ring).overlap == 0.0
+
+
+def test_masks_repeat() -> None:
+    renderer = renderer_of(1)
+    performance = perform(1, 2, "speech")
+    params, camera = frame_params(performance, 1), frame_camera(performance, 1, SIZE)
+    picture = renderer.render(params, camera)
+    model = renderer.performer.model
+    with torch.no_grad():
+        screen = camera.project(model.vertices(params)).numpy()
+    ring = neck_ring(model.assets.template.numpy(), model.faces.numpy())
+    first = head_mask(picture.image, picture.alpha, screen, model.faces.numpy(), ring).mask
+    cv2.randu(np.zeros((9, 9), np.uint8), 0, 255)  # others use OpenCV's random numbers
+    np.testing.assert_array_equal(
+        first, head_mask(picture.image, picture.alpha, screen, model.faces.numpy(), ring).mask
+    )
+
+
+def test_the_ring_is_the_lowest_open_edge() -> None:
+    # Two open tubes of triangles, one above the other.
+    def tube(y: float, first: int) -> tuple[np.ndarray, np.ndarray]:
+        turn = np.arange(6) * np.pi / 3
+        rows = [np.stack((np.cos(turn), np.full(6, h), np.sin(turn)), 1) for h in (y, y + 1)]
+        a = first + np.arange(6)
+        b = first + (np.arange(6) + 1) % 6
+        return np.concatenate(rows), np.concatenate((np.stack((a, b, b + 6), 1), np.stack((a, b + 6, a + 6), 1)))
+
+    (high, high_faces), (low, low_faces) = tube(5, 0), tube(0, 12)
+    points, faces = np.concatenate((high, low)), np.concatenate((high_faces, low_faces))
+    assert sorted(neck_ring(points, faces).tolist()) == list(range(12, 18))
+    tetrahedron = np.array([(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)])
+    with pytest.raises(UserError, match="closed everywhere"):
+        neck_ring(np.zeros((4, 3)), tetrahedron)
+
+
+def test_the_mouth_is_inside_the_lips_outline() -> None:
+    points = np.zeros((478, 3), np.float32)
+    turn = np.linspace(0, 2 * np.pi, len(OUTER_LIPS), endpoint=False)
+    points[list(OUTER_LIPS), 0], points[list(OUTER_LIPS), 1] = 60 + 30 * np.cos(turn), 40 + 12 * np.sin(turn)
+    mask = mouth_mask(points, 128, 96)
+    rows, columns = np.nonzero(mask)
+    assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx((60, 40), abs=0.3)
+    assert (mask > 0).sum() == pytest.approx(np.pi * 30 * 12, rel=0.06) and mask.dtype == np.uint8
+    assert not mouth_mask(points + np.float32(1e9), 128, 96).any()

@@ -1,0 +1,82 @@
+"""Stages are made once, whole or not at all, and the folder appears when it is complete."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from avatar.errors import UserError
+from data_prep.track.stages import growing
+
+
+def test_a_stage_is_made_once_for_its_inputs(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def make(value: int):
+        def write(folder: Path) -> dict[str, int]:
+            made.append(value)
+            (folder / "file").write_text(str(value))
+            return {"value": value}
+
+        return write
+
+    with growing(tmp_path / "out") as stages:
+        first = stages.run("one", {"in": 1}, make(1))
+        assert first[0] == {"value": 1} and stages.run("one", {"in": 1}, make(2)) == first
+    with growing(tmp_path / "out") as stages:  # another process
+        assert stages.run("one", {"in": 1}, make(3)) == first
+        other = stages.run("one", {"in": 2}, make(4))
+        assert other[0] == {"value": 4} and other[1] != first[1]
+        assert (stages.folder / "one" / "file").read_text() == "4"
+        stages.run("helper", {}, make(5))
+        stages.finish(tmp_path / "out", ("helper",))
+    assert made == [1, 4, 5]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["out", "out/one", "out/one/file"]
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt, UserError("no")])
+def test_an_interruption_keeps_whole_stages_only(tmp_path: Path, interruption: BaseException) -> None:
+    def interrupted(folder: Path) -> dict[str, int]:
+        (folder / "half").write_text("half")
+        raise interruption
+
+    kind = UserError if isinstance(interruption, UserError) else KeyboardInterrupt
+    with pytest.raises(kind), growing(tmp_path / "out") as stages:
+        stages.run("one", {}, lambda folder: {})
+        stages.run("two", {}, interrupted)
+    assert [p.name for p in tmp_path.iterdir()] == [".out.partial"]
+    assert [p.name for p in (tmp_path / ".out.partial").iterdir()] == ["one"]
+    with growing(tmp_path / "out") as stages:
+        assert stages.run("one", {}, interrupted)[0] == {}  # it is not made again
+
+
+def test_nothing_is_left_where_nothing_was_done(tmp_path: Path) -> None:
+    def fails(folder: Path) -> dict[str, int]:
+        (folder / "half").write_text("half")
+        raise UserError("no face")
+
+    with pytest.raises(UserError, match="no face"), growing(tmp_path / "out") as stages:
+        stages.run("one", {}, fails)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_record_is_made_again(tmp_path: Path) -> None:
+    with growing(tmp_path / "out") as stages:
+        stages.run("one", {}, lambda folder: {"n": 1})
+        for content in (b"", b"[1]", b'{"key": 1}', b"\xff"):
+            (stages.folder / "one" / ".stage.json").write_bytes(content)
+            assert stages.run("one", {}, lambda folder: {"n": 2})[0] == {"n": 2}
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    refused = pytest.raises(UserError, match="is being written by process")
+    with growing(tmp_path / "out"), refused, growing(tmp_path / "out"):
+        pass
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written"), growing(tmp_path / "file" / "out"):
+        pass

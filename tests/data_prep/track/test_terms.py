@@ -1,0 +1,151 @@
+"""Gradients of every term of the fit against differences of its cost, column by column, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from heads import EXPRESSIONS, grid_head
+
+from avatar.head.expression_names import ExpressionNames
+from data_prep.track.camera import Pinhole, to_camera
+from data_prep.track.columns import free_columns, spread
+from data_prep.track.crops import BlurredCrops, cut_out
+from data_prep.track.landmark_term import LandmarkTerm
+from data_prep.track.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.levenberg import Term
+from data_prep.track.motion import Motion, rotations
+from data_prep.track.normal_equations import NormalEquations
+from data_prep.track.photometric_term import PhotometricTerm, mean_texture
+from data_prep.track.priors import make_priors
+from data_prep.track.smoothness import make_smoothness
+from data_prep.track.surface import SurfacePoints
+
+T, N, IDENTITIES = 5, 9, 3
+CAMERA = Pinhole(300.0, 310.0, 64.0, 60.0)
+IDENTITY = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+COLUMNS = free_columns(EXPRESSIONS)
+
+
+def noise(*shape: int, seed: int = 0, scale: float = 1.0) -> torch.Tensor:
+    return scale * torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def some_motion() -> Motion:
+    """In front of the camera, whose z points away from it."""
+    t = torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64) + noise(T, 3, seed=1, scale=0.01)
+    parts = [noise(T, columns, seed=2 + columns, scale=0.2) for columns in (3, 4, 2, 3, EXPRESSIONS)]
+    return Motion(rotations(noise(T, 3, seed=2, scale=0.2)), t, *parts)
+
+
+def some_points() -> SurfacePoints:
+    assets = grid_head()
+    corners = assets.faces[torch.randperm(len(assets.faces), generator=torch.Generator().manual_seed(4))[:N]]
+    weights = noise(N, 3, seed=5).abs()
+    every = torch.arange(EXPRESSIONS)
+    return SurfacePoints(assets, corners, weights / weights.sum(1, keepdim=True), IDENTITIES, every)
+
+
+def landmark_term() -> LandmarkTerm:
+    points, motion = some_points(), some_motion()
+    seen = CAMERA.project(to_camera(motion, points.positions(IDENTITY, motion)))
+    return LandmarkTerm(
+        landmarks=np.arange(N), points=points, camera=CAMERA, observed=seen + noise(T, N, 2, seed=6, scale=3.0),
+        weights=noise(T, N, seed=7).abs(), unit=noise(T, seed=8).abs() + 0.5, pairs=torch.tensor([[0, 1], [4, 2]]),
+        pair_weights=noise(T, 2, seed=9).abs(), scale=4.0, pair_scale=3.0,
+    )  # fmt: skip
+
+
+def smoothness() -> Term:
+    frames = torch.tensor([0, 1, 2, 4, 5])  # one is missing
+    return make_smoothness(grid_head(), frames, 30.0, EXPRESSIONS, statistical=False)
+
+
+def priors() -> Term:
+    generator = np.random.default_rng(0)
+    scores = generator.random((T, len(BLENDSHAPES))).astype(np.float32)
+    points = np.zeros((T, NUM_POINTS, 3), np.float32)
+    landmarks = Landmarks(points, scores, np.ones(T, bool), (128, 120), 25.0)
+    names = ExpressionNames(tuple(f"e{i}" for i in range(EXPRESSIONS)))
+    return make_priors(landmarks, names, torch.arange(EXPRESSIONS), statistical=False)
+
+
+def photometric_term() -> PhotometricTerm:
+    """Waves of some pixels' length, smooth enough for the differences by which the images' slopes are taken."""
+    points, motion = some_points(), some_motion()
+    y, x = np.mgrid[0:120, 0:128]
+    wave = 127 + 60 * np.sin(x / 9.0) + 60 * np.cos(y / 8.0)
+    images = [np.repeat(np.rint(wave + 2 * k).astype(np.uint8)[..., None], 3, axis=2) for k in range(T)]
+    mattes = np.full((T, 120, 128), 255, np.uint8)
+    box = np.tile([8.0, 8.0, 120.0, 112.0], (T, 1))
+    crops = cut_out(lambda k: images[k], lambda k: mattes[k], range(T), box, 1.0)
+    blurred = BlurredCrops(crops, 2.0)
+    values, _ = blurred.sample(CAMERA.project(to_camera(motion, points.positions(IDENTITY, motion))), slice(0, T))
+    wanted = values + noise(T, N, seed=11, scale=0.05)
+    return PhotometricTerm(points, CAMERA, blurred, 0, wanted, noise(T, N, seed=12).abs())
+
+
+def gradients(term: Term, step: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """The term's own [T, D], and central differences of its cost."""
+    motion = some_motion()
+    own = NormalEquations.zeros(T, len(COLUMNS), 0, coupled=True)
+    term.add_to(own, IDENTITY, motion, COLUMNS)
+    differences = torch.zeros(T, len(COLUMNS), dtype=torch.float64)
+    for t in range(T):
+        for column in range(len(COLUMNS)):
+            moved = torch.zeros(T, len(COLUMNS), dtype=torch.float64)
+            moved[t, column] = step
+            there, back = (
+                term.cost(IDENTITY, motion.moved(spread(sign * moved, COLUMNS, EXPRESSIONS))) for sign in (1, -1)
+            )
+            differences[t, column] = (there - back) / (2 * step)
+    return own.gradient, differences
+
+
+@pytest.mark.parametrize("make", [landmark_term, smoothness, priors])
+def test_gradients(make) -> None:
+    own, differences = gradients(make(), 1e-6)
+    assert float(differences.abs().max()) > 0
+    torch.testing.assert_close(own, differences, rtol=2e-5, atol=2e-5 * float(differences.abs().max()))
+
+
+def test_photometric_gradient() -> None:
+    """The images' slopes are differences over a pixel, so the agreement is not to the last digit."""
+    own, differences = gradients(photometric_term(), 1e-4)
+    assert float((own * differences).sum() / (own.norm() * differences.norm())) > 0.999
+    assert float(own.norm() / differences.norm()) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize(("make", "step", "share"), [(landmark_term, 1e-5, 1e-5), (photometric_term, 0.1, 0.03)])
+def test_gradient_by_the_identity(make, step: float, share: float) -> None:
+    """Steps in pictures are some tenths of a pixel: between pixels they are interpolated, and bend at every one."""
+    term, motion = make(), some_motion()
+    own = NormalEquations.zeros(T, len(COLUMNS), IDENTITIES, coupled=True)
+    term.add_to(own, IDENTITY, motion, COLUMNS)
+    moved = step * torch.eye(IDENTITIES, dtype=torch.float64)
+    differences = torch.tensor(
+        [(term.cost(IDENTITY + d, motion) - term.cost(IDENTITY - d, motion)) / (2 * step) for d in moved],
+        dtype=torch.float64,
+    )
+    torch.testing.assert_close(own.shared_gradient, differences, rtol=0, atol=share * float(differences.abs().max()))
+
+
+def test_frames_that_do_not_follow_each_other_are_not_compared() -> None:
+    term, motion = smoothness(), some_motion()
+    jumped = replace(motion, jaw=motion.jaw + torch.tensor([0, 0, 0, 1.0, 1.0], dtype=torch.float64)[:, None])
+    assert term.cost(IDENTITY, jumped) == pytest.approx(term.cost(IDENTITY, motion), rel=1e-9)
+
+
+def test_texture_and_gains_explain_what_they_made() -> None:
+    texture, gain = noise(40, seed=1).abs() + 0.2, torch.tensor([0.8, 1.0, 1.2], dtype=torch.float64)
+    values = gain[:, None] * texture
+    weights = torch.ones(3, 40, dtype=torch.float64)
+    weights[0, 5], values[0, 5] = 0.0, 9.0  # not seen
+    weights[:, 7] = 0.0
+    found, gains = mean_texture(values, weights)
+    torch.testing.assert_close(gains, gain)
+    seen = torch.arange(40) != 7
+    torch.testing.assert_close(found[seen], texture[seen])
+    assert found[7] == 0.0

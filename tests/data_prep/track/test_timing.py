@@ -1,0 +1,53 @@
+"""The regular grid that pictures are put on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_prep.track.timing import regular_timing
+
+
+@pytest.mark.parametrize("fps", [24000 / 1001, 25.0, 30000 / 1001, 30.0, 12.5])
+@pytest.mark.parametrize("digits", [6, 3])
+def test_regular_times(fps: float, digits: int) -> None:
+    timing = regular_timing(np.round(3.7 + np.arange(200) / fps, digits))
+    assert timing.fps == pytest.approx(fps, rel=1e-9) and not timing.notes
+    assert timing.numbers.tolist() == list(range(200))
+
+
+def test_an_unusual_rate_stays() -> None:
+    timing = regular_timing(np.arange(200) / 27.3)
+    assert timing.fps == pytest.approx(27.3) and not timing.notes
+
+
+def test_jitter_of_a_telephone_drops_nothing() -> None:
+    rng = np.random.default_rng(0)
+    timing = regular_timing(np.arange(300) / 30 + rng.uniform(-0.008, 0.008, 300))
+    assert timing.numbers.tolist() == list(range(300)) and timing.fps == 30.0
+
+
+def test_a_variable_rate_leaves_gaps_and_drops_between() -> None:
+    times = np.array([0, 1, 2, 3, 7, 8, 8.3, 8.9, 10, 11, 12, 13]) / 25
+    timing = regular_timing(times)
+    assert timing.fps == 25.0
+    assert timing.numbers.tolist() == [0, 1, 2, 3, 7, 8, -1, 9, 10, 11, 12, 13]
+    assert timing.notes == (
+        "the frame rate varies (12 to 160 ms from picture to picture): the clip is taken at 25 a second, 1 pictures "
+        "between are left out and 3 times have none",
+    )
+
+
+def test_times_that_run_backwards() -> None:
+    times = np.arange(40) / 25
+    times[20] = times[3]
+    timing = regular_timing(times)
+    kept = timing.numbers[timing.numbers >= 0]
+    assert (np.diff(kept) > 0).all() and len(kept) == 39 and timing.fps == 25.0
+
+
+def test_clips_without_times() -> None:
+    assert regular_timing(np.zeros(2), 30.0).fps == 30.0
+    timing = regular_timing(np.zeros(50), 24.0)
+    assert timing.fps == 24.0 and timing.notes == ("the pictures carry no usable times: 24 a second are assumed",)
+    assert timing.numbers.tolist() == list(range(50))

@@ -1,0 +1,71 @@
+"""The demo person as a plain video: the same person and motion as the subject, in a room, with a sensor's noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar.cli import main
+from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.raw_video import expose, filmed, make_room, make_video
+from avatar.demo.render import render_frame
+from avatar.errors import UserError
+from data_prep.track.footage import Span, whole
+from data_prep.track.video import open_video
+
+SEED, SIZE, FRAMES = 1, 96, 3
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[np.ndarray]:
+    return list(filmed(FRAMES, SIZE, SEED))
+
+
+def test_the_person_is_the_subjects_and_the_room_is_not(pictures: list[np.ndarray]) -> None:
+    performance = perform(SEED, FRAMES, "speech")
+    for n in (0, FRAMES - 1):
+        truth = render_frame(SEED, frame_params(performance, n), frame_camera(performance, n, SIZE))
+        inside, outside = truth.alpha == 255, truth.alpha == 0
+        error = pictures[n].astype(float) - truth.image
+        assert abs(error[inside].mean()) < 0.2 and 0.5 < error[inside].std() < 4.0  # noise around the truth
+        room = make_room(SIZE, SEED)
+        assert np.abs(pictures[n][outside] - room[outside]).mean() < 4.0
+        assert np.abs(truth.image[outside] - room[outside]).mean() > 20.0
+        # At the edge the person is as much there as the matte says, once and not squared.
+        edge = (truth.alpha > 60) & (truth.alpha < 200)
+        assert edge.sum() > 50 and abs((pictures[n] - truth.image.astype(float))[edge].mean()) < 60
+
+
+def test_noise_grows_with_the_light() -> None:
+    rng = np.random.default_rng(0)
+    spread = [expose(np.full((64, 64, 3), level, np.float32), rng).std() for level in (10, 90, 200)]
+    assert spread[0] < spread[1] < spread[2] < 5.0
+
+
+def test_it_repeats_and_every_seed_has_its_room(pictures: list[np.ndarray]) -> None:
+    for one, other in zip(pictures, filmed(FRAMES, SIZE, SEED), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert np.abs(make_room(SIZE, 1) - make_room(SIZE, 2)).mean() > 10
+
+
+def test_the_command_writes_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "me.mp4"
+    assert main(["demo-data", "--video", str(out), "--frames", "3", "--size", "96", "--seed", "1"]) == 0
+    assert f"avatar track {out}" in capsys.readouterr().out
+    video = open_video(out)
+    assert (video.width, video.height, video.rate) == (96, 96, 25.0)
+    assert len(list(video.read(whole(96, 96), Span(), lambda said: None))) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["me.mp4"]
+
+
+def test_refusals(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="a video is written as .mp4"):
+        make_video(tmp_path / "me", 3, 96)
+    (tmp_path / "me.mp4").write_bytes(b"mine")
+    with pytest.raises(UserError, match="me.mp4 exists; choose another name"):
+        make_video(tmp_path / "me.mp4", 3, 96)
+    with pytest.raises(UserError, match="frames must be from 1"):
+        make_video(tmp_path / "new.mp4", 0, 96)
+    assert (tmp_path / "me.mp4").read_bytes() == b"mine" and not (tmp_path / "new.mp4").exists()
