@@ -8,6 +8,16 @@ from pathlib import Path
 
 import avatar
 from avatar.bench import PARTS
+from avatar.commands.options import (
+    add_avatar,
+    add_device,
+    add_folder,
+    add_head,
+    add_reading,
+    add_run,
+    add_source,
+    add_tracking,
+)
 
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
@@ -255,62 +265,4 @@ def add_view(view: argparse.ArgumentParser) -> None:
     view.add_argument("--token", metavar="TEXT", help="what a browser must know (default: made up where it is needed)")
     view.add_argument(
         "--stream", type=int, metavar="PORT", help="take frames there: JSON lines, OSC, Live Link Face; 0: a free port"
-    )
-
-
-def add_source(parser: argparse.ArgumentParser) -> None:
-    """The options that name a tracked folder and what belongs to it."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
-    add_head(parser)
-    add_reading(parser)
-    add_tracking(parser)
-
-
-def add_reading(parser: argparse.ArgumentParser) -> None:
-    """How a tracked folder is read."""
-    parser.add_argument(
-        "--format", metavar="NAME", help="metrical-tracker, VHAP, INSTA or IMavatar (default: told from the files)"
-    )
-    parser.add_argument("--fps", type=float, metavar="N", help="frames a second (default: the folder's, else 25)")
-    parser.add_argument(
-        "--max-left-out", type=float, metavar="SHARE", help="of the frames that may be unusable (default: 0.05)"
-    )
-    parser.add_argument(
-        "--ignore-misfit", action="store_true", help="go on where the tracked head does not lie on the masks"
-    )
-
-
-def add_tracking(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in FOLDER")
-    parser.add_argument("--frame-offset", type=int, metavar="N", help="image number minus .frame number, if known")
-
-
-def add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder that avatar train wrote")
-    add_head(parser)
-
-
-def add_folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--folder", type=Path, metavar="DIR", help="where the tracked folder is, if it has moved")
-
-
-def add_avatar(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="AVATAR", help="folder that avatar train wrote, or its avatar file")
-    add_head(parser)
-
-
-def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
-    parser.add_argument(
-        "--device",
-        metavar="auto|cpu|cuda[:N]",
-        help=f"what computes; auto takes a GPU that passes its test (default: {default})",
-    )
-
-
-def add_head(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--head",
-        type=Path,
-        metavar="PATH",
-        help="FLAME-format head model, file or folder (default: head_model/ in the subject, then $AVATAR_HEAD)",
     )

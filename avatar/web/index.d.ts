@@ -33,6 +33,7 @@ export class AvatarView extends EventTarget {
   readonly renderer: "wasm" | "webgl";
   readonly time: number; // seconds into the recorded motion
   readonly isPlaying: boolean;
+  readonly isBusy: boolean; // whether a picture is being drawn
   readonly isSupported: boolean; // whether the camera is where the training video was
   readonly frameCount: number;
   readonly limits: { yaw: Range; pitch: Range };

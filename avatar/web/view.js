@@ -65,6 +65,11 @@ export class AvatarView extends EventTarget {
     return this.#source.kind === "recorded" && !this.#source.paused;
   }
 
+  /** Whether a picture is being drawn. */
+  get isBusy() {
+    return this.#inFlight;
+  }
+
   get frameCount() {
     return this.#core ? this.#core.poses.length / 12 : 0;
   }

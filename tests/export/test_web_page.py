@@ -24,13 +24,16 @@ from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
 
 # A pose that blends is drawn anew in every frame of the browser; what has been still for so long has come to rest.
-NEW_PICTURE = """() => new Promise(done => {
-  let timer;
-  const rest = () => { avatar.removeEventListener("drawn", wait); done(); };
-  const wait = () => { clearTimeout(timer); timer = setTimeout(rest, 150); };
-  avatar.addEventListener("drawn", wait);
-  wait();
-})"""
+NEW_PICTURE = """async () => {
+  const frame = () => new Promise(requestAnimationFrame);
+  let drawn = performance.now();
+  const note = () => (drawn = performance.now());
+  avatar.addEventListener("drawn", note);
+  await frame();
+  await frame(); // what was set has been asked for
+  while (avatar.isBusy || performance.now() - drawn < 150) await frame();
+  avatar.removeEventListener("drawn", note);
+}"""
 
 
 @pytest.fixture(scope="module")
