@@ -2,30 +2,88 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from types import FrameType
+from typing import NoReturn
 
 from avatar.errors import UserError
 
 EXIT_ERROR = 1
 EXIT_INTERRUPTED = 130
+_INTERRUPTED = "avatar: interrupted"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status. A UserError is printed as its sentence, without a stack trace."""
+def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object] = lambda: None) -> int:
+    """Run one command; returns the exit status. What a user can mend is printed as a sentence, without a stack trace.
+
+    `when_loaded` is called when everything that the command needs is imported, and nothing is done yet.
+    """
     try:
         # The commands import torch and the compiled core; --help must answer without them.
-        from avatar.commands import run_command
+        from avatar.commands import find_command
         from avatar.commands.parser import parse
 
-        return run_command(parse(argv))
+        arguments = parse(argv)
+        command = find_command(arguments.command)
+        when_loaded()
+        return command(arguments)
     except UserError as error:
-        print(f"avatar: {error}", file=sys.stderr)
-        return EXIT_ERROR
+        return _failed(str(error))
+    except BrokenPipeError:
+        return _nobody_reads()
+    except OSError as error:
+        place = "" if error.filename is None else f"{error.filename}: "
+        return _failed(f"{place}{error.strerror or error}")
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for it
+            raise
+        return _failed(f"there is not enough memory ({str(error).splitlines()[0] if str(error) else 'out of memory'})")
     except KeyboardInterrupt:
-        print("avatar: interrupted", file=sys.stderr)
+        with suppress(KeyboardInterrupt):
+            print(_INTERRUPTED, file=sys.stderr)
         return EXIT_INTERRUPTED
 
 
+def run() -> NoReturn:
+    """`main` as a process of its own, in which Ctrl-C at any moment ends without a stack trace.
+
+    While libraries are imported, an exception would come out of the middle of them, and some print it themselves; nothing
+    is lost by leaving at once. At the end Python's own clearing up is as little to be interrupted by an exception.
+    """
+    try:
+        interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is to be ignored
+        if interruptible:
+            signal.signal(signal.SIGINT, _leave)
+        status = main(when_loaded=lambda: interruptible and signal.signal(signal.SIGINT, signal.default_int_handler))
+        if interruptible:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        sys.stdout.flush()
+    except KeyboardInterrupt:  # in the moments between
+        _leave(signal.SIGINT, None)
+    except BrokenPipeError:
+        status = _nobody_reads()
+    sys.exit(status)
+
+
+def _failed(reason: str) -> int:
+    print(f"avatar: {reason}", file=sys.stderr)
+    return EXIT_ERROR
+
+
+def _nobody_reads() -> int:
+    """What was printed went to a program that has ended, such as `head`."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at the end
+    return EXIT_ERROR
+
+
+def _leave(_: int, __: FrameType | None) -> NoReturn:
+    os.write(2, f"{_INTERRUPTED}\n".encode())
+    os._exit(EXIT_INTERRUPTED)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from avatar.config_values import check_choice, check_range, checked_value, shown, typed_value
+from avatar.data.background import Colour
 from avatar.errors import UserError
 
 
@@ -29,7 +30,7 @@ class DataConfig:
     """How the prepared subject is read."""
 
     size: int | None
-    background: tuple[float, float, float]
+    background: Colour
     train_frames: int | None
     test_frames: int | None
     cache_mb: int
@@ -104,6 +105,7 @@ class Config:
 
 
 MAX_OVERRIDE = 1000  # characters; a message quotes the override
+MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -115,9 +117,9 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 RANGES: dict[str, tuple[float, float]] = {
     "data.size": (16, 8192),
-    "data.train_frames": (1, math.inf),
-    "data.test_frames": (1, math.inf),
-    "data.cache_mb": (1, math.inf),
+    "data.train_frames": (1, MOST_STEPS),
+    "data.test_frames": (1, MOST_STEPS),
+    "data.cache_mb": (1, 2**20),
     "data.workers": (1, 64),
     "model.uv_size": (2, 2048),
     "model.latent_dim": (1, 4096),
@@ -127,22 +129,22 @@ RANGES: dict[str, tuple[float, float]] = {
     "model.frequencies": (0, 30),
     "model.sh_degree": (0, 3),
     "model.initial_opacity": (1e-6, 1 - 1e-6),
-    "trainer.iterations": (1, math.inf),
+    "trainer.iterations": (1, MOST_STEPS),
     "trainer.seed": (0, 2**31 - 1),
-    "trainer.lr_warmup": (0, math.inf),
+    "trainer.lr_warmup": (0, MOST_STEPS),
     "trainer.lr_final": (0, 1),
-    "trainer.adam_eps": (0, 1),
-    "trainer.sh_interval": (1, math.inf),
-    "trainer.huber_delta": (1e-6, math.inf),
-    "trainer.mouth_weight": (0, math.inf),
-    "trainer.perceptual_weight": (0, math.inf),
-    "trainer.dssim_weight": (0, math.inf),
+    "trainer.adam_eps": (1e-30, 1),
+    "trainer.sh_interval": (1, MOST_STEPS),
+    "trainer.huber_delta": (1e-6, 1000),
+    "trainer.mouth_weight": (0, 10**6),
+    "trainer.perceptual_weight": (0, 10**6),
+    "trainer.dssim_weight": (0, 10**6),
     "trainer.perceptual_start": (0, 1),
-    "trainer.lpips_every": (1, math.inf),
-    "trainer.log_every": (1, math.inf),
-    "trainer.preview_every": (1, math.inf),
-    "trainer.checkpoint_every": (1, math.inf),
-    "trainer.keep_checkpoints": (1, math.inf),
+    "trainer.lpips_every": (1, MOST_STEPS),
+    "trainer.log_every": (1, MOST_STEPS),
+    "trainer.preview_every": (1, MOST_STEPS),
+    "trainer.checkpoint_every": (1, MOST_STEPS),
+    "trainer.keep_checkpoints": (1, 10**6),
 }
 RANGES |= {f"trainer.learning_rates.{f.name}": (0.0, 10.0) for f in dataclasses.fields(LearningRates)}
 
@@ -161,7 +163,15 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
 
     Raises UserError for an unknown key or option, a wrong type or a value out of range.
     """
-    return config_from_dict(OmegaConf.to_container(_composed(overrides), resolve=True))  # type: ignore[arg-type]
+    composed = _composed(overrides)
+    values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
+    for key, text in (override.split("=", 1) for override in overrides if override.partition("=")[0] not in _groups()):
+        *sections, name = key.split(".")
+        section = values
+        for part in sections:
+            section = section[part]
+        section[name] = typed_value(text)
+    return config_from_dict(values)
 
 
 def chosen_options(overrides: Sequence[str] = ()) -> dict[str, str]:
@@ -171,42 +181,51 @@ def chosen_options(overrides: Sequence[str] = ()) -> dict[str, str]:
 
 
 def _composed(overrides: Sequence[str], hydra: bool = False) -> DictConfig:
+    """The files of configs/ with the chosen options; what else is overridden has only been checked for its key."""
     if long := next((override for override in overrides if len(override) > MAX_OVERRIDE), None):
         raise UserError(f"the override {long[:60]}... has {len(long)} characters; no value of a key needs that many")
     _check_overrides(overrides)
+    chosen = [override for override in overrides if override.partition("=")[0] in _groups()]
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            return compose("config", overrides=list(overrides), return_hydra_config=hydra)
+            return compose("config", overrides=chosen, return_hydra_config=hydra)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"the configuration cannot be composed: {_cause(error)}") from None
 
 
 def config_from_dict(values: dict[str, Any]) -> Config:
-    """A checked Config from nested dictionaries, as a checkpoint or a composed YAML holds them."""
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(Config), values)
-        config = OmegaConf.to_object(merged)
-    except OmegaConfBaseException as error:
-        key = str(error.full_key or error.key)
-        raise UserError(f"the configuration value {key} is not valid: {_cause(error)}{_nearest_hint(key)}") from None
+    """A checked Config from nested dictionaries, as a checkpoint or a composed YAML holds them.
+
+    Raises UserError for keys that are missing or unknown, wrong types and values out of range.
+    """
+    config = _section(values, Config, "")
     assert isinstance(config, Config)
-    config.data.background = tuple(config.data.background)  # type: ignore[assignment]
-    _check_values(config)
+    flat = flatten(config.to_dict())
+    for key, choices in CHOICES.items():
+        check_choice(key, flat[key], choices)
+    for key, (low, high) in RANGES.items():
+        check_range(key, flat[key], low, high)
     return config
 
 
-def _check_values(config: Config) -> None:
-    flat = flatten(config.to_dict())
-    for key, choices in CHOICES.items():
-        if flat[key] not in choices:
-            raise UserError(f"{key}={flat[key]} is not one of {', '.join(choices)}")
-    for key, (low, high) in RANGES.items():
-        value = flat[key]
-        if value is not None and not low <= value <= high:
-            raise UserError(f"{key}={value} is out of range: it must lie between {low:g} and {high:g}")
-    if any(not 0.0 <= c <= 1.0 for c in config.data.background):
-        raise UserError(f"data.background={list(config.data.background)} must be three values from 0 to 1")
+def _section(values: Any, schema: type, prefix: str) -> Any:
+    """The dataclass `schema` of a dictionary; `prefix` is what its keys are called by."""
+    if not isinstance(values, dict):
+        raise UserError(f"the configuration has {shown(values)} where the keys {prefix}* should be")
+    kinds = get_type_hints(schema)
+    if unknown := [key for key in values if key not in kinds]:
+        raise _no_such_key(f"{prefix}{unknown[0]}")
+    if missing := [key for key in kinds if key not in values]:
+        raise UserError(f"the configuration lacks {prefix}{missing[0]}")
+    return schema(
+        **{
+            name: _section(values[name], kind, f"{prefix}{name}.")
+            if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+            else checked_value(f"{prefix}{name}", values[name], kind)
+            for name, kind in kinds.items()
+        }
+    )
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
@@ -215,12 +234,18 @@ def _check_overrides(overrides: Sequence[str]) -> None:
     for override in overrides:
         key, separator, value = override.partition("=")
         if not separator or not key:
-            raise UserError(f"'{override}' is not of the form key=value")
+            raise UserError(f"'{shown(override)}' is not of the form key=value")
         if key in groups:
             if value not in groups[key]:
-                raise UserError(f"{key}={value}: there is no such file; configs/{key}/ has {', '.join(groups[key])}")
+                raise UserError(
+                    f"{key}={shown(value)}: there is no such file; configs/{key}/ has {', '.join(groups[key])}"
+                )
         elif key not in keys:
-            raise UserError(f"there is no configuration key '{key}'{_nearest_hint(key, list(groups))}")
+            raise _no_such_key(key, list(groups))
+
+
+def _no_such_key(key: str, groups: Sequence[str] = ()) -> UserError:
+    return UserError(f"there is no configuration key '{shown(key)}'{_nearest_hint(shown(key), groups)}")
 
 
 def _groups() -> dict[str, list[str]]:
@@ -242,8 +267,6 @@ def _known_keys(schema: type = Config, prefix: str = "") -> list[str]:
 
 def _nearest_hint(key: str, groups: Sequence[str] = ()) -> str:
     known = [*_known_keys(), *groups]
-    if key in known:
-        return ""
     by_last = {name.rsplit(".", 1)[-1]: name for name in known}
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     near = near or [by_last[m] for m in difflib.get_close_matches(key.rsplit(".", 1)[-1], list(by_last), n=1)]

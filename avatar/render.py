@@ -18,9 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from avatar.errors import UserError
 from avatar.gaussians.compose import compose, split_offsets
 from avatar.model import Avatar
-from avatar.splat import splat
+from avatar.splat import CannotDraw, splat
 from avatar.splat.cpu import thread_count
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
@@ -52,7 +53,7 @@ class Renderer:
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
         """One frame as soon as possible: each step uses all threads."""
-        return splat(self.gaussians(params), camera, self.background)
+        return drawn(self.gaussians(params), camera, self.background)
 
     def stream(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         """Many frames in order, as many per second as possible: each is drawn by one thread, several at a time.
@@ -101,6 +102,17 @@ class Renderer:
 
     def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
         return compose(points, offsets=split_offsets(offsets), **self._base)
+
+
+def drawn(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:
+    """`splat` of a trained avatar, with a sentence where its parameters are beyond what can be drawn (UserError)."""
+    try:
+        return splat(gaussians, camera, background)
+    except CannotDraw as error:
+        raise UserError(
+            f"the avatar cannot be drawn: {error}; its training has gone wrong, train again with lower "
+            "trainer.learning_rates"
+        ) from error
 
 
 class FoldedNetwork:

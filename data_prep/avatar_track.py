@@ -140,8 +140,14 @@ def write_tracking(folder: Path, info: TrackingInfo, tracks: Mapping[int, FrameT
     write_atomically(folder / INFO_FILE, (json.dumps(content, indent=1) + "\n").encode())
 
 
-def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
-    path = folder / TRACKS_FILE
+def read_tracks(folder: Path, name: str, complain: Callable[[str], object]) -> Tracking:
+    """Another tracking of the folder's frames, in a file `name` of the layout of tracking.npz."""
+    arrays = _read_arrays(folder, name)
+    return _tracks(arrays, read_info(folder), dict.fromkeys(arrays["number"].tolist(), folder / name), complain)
+
+
+def _read_arrays(folder: Path, name: str = TRACKS_FILE) -> dict[str, np.ndarray]:
+    path = folder / name
     arrays = load_npz(path)
     number = arrays.get("number")
     if number is None or number.ndim != 1 or number.dtype.kind not in "iu" or not 0 < len(number) <= _MAX_FRAMES:
@@ -167,10 +173,10 @@ def _tracks(
     bad: dict[int, str] = {}
     for row, number in enumerate(arrays["number"].tolist()):
         try:
-            values = {name: vector(arrays[name][row], name) for name in ARRAYS}
+            values: dict[str, Any] = {name: vector(arrays[name][row], name) for name in ARRAYS}
             values["R"] = nearest_rotation(values["R"].reshape(3, 3), "R")
             frames[number] = FrameTrack(
-                **values,  # type: ignore[arg-type]  # the names of ARRAYS
+                **values,
                 shape=vector(arrays["shape"], "shape"),
                 intrinsics=np.array(info.intrinsics),
                 size=(info.width, info.height),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep import avatar_track, imavatar, insta, vhap
+from data_prep import avatar_track, imavatar, insta, refined, vhap
 from data_prep.frame_files import find_frame_files
 from data_prep.metrical_tracker import read_tracking
 from data_prep.tracked_folder import TrackedFolder, matte_notes
@@ -33,7 +33,7 @@ def open_tracked_folder(
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
-        return avatar_track.open_folder(folder)
+        return refined.open_folder(folder)
     frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
     name = format or detect_format(folder, frames)
     if name == METRICAL_TRACKER:

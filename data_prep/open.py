@@ -18,21 +18,29 @@ HEAD_VARIABLE = "AVATAR_HEAD"
 
 
 def find_head(folder: Path, given: Path | None = None) -> Path:
-    """The head model of a subject: the one given, else FOLDER/head_model, else the one that `avatar track` used, else
+    """The head model of a subject: the one given, else FOLDER/head_model, else the one that the folder names, else
     $AVATAR_HEAD; UserError otherwise."""
     check_folder(folder)
     if given is not None:
         return given
     if (folder / "head_model").is_dir():
         return folder / "head_model"
-    if avatar_track.recognise(folder) and (tracked := Path(avatar_track.read_info(folder).head_path)).exists():
-        return tracked
+    if (recorded := recorded_head(folder)) is not None:
+        return recorded
     if named := os.environ.get(HEAD_VARIABLE):
         return Path(named)
     raise UserError(
         f"no head model for {folder}: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can be had "
         "from https://flame.is.tue.mpg.de; put generic_model.pkl, head_template.obj and FLAME_masks.pkl into one folder"
     )
+
+
+def recorded_head(folder: Path) -> Path | None:
+    """Where the head model of the tracking was, if the folder says so and it is still there."""
+    if not avatar_track.recognise(folder):
+        return None
+    path = Path(avatar_track.read_info(folder).head_path)
+    return path if path.exists() else None
 
 
 def check_folder(folder: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avatar.data.manifest import FrameRecord, Manifest
+from avatar.data.manifest import GIVEN, FrameRecord, Manifest
 from avatar.data.source import DEFAULT_FPS, MAX_FPS, Source
 from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError, refuse
@@ -105,6 +105,9 @@ def prepare(
         total = len(pairing.pairs) + len(pairing.left_out)
         say(f"warning: left out {len(pairing.left_out)} of {total} frames: {describe_reasons(pairing.left_out)}")
     arrays = _stack_tracks(tracks, pairing)
+    if tracked.read_given is not None:
+        given = _stack_tracks(fit_coefficients(tracked.read_given(refuse), head), pairing)
+        arrays |= {f"{GIVEN}{name}": array for name, array in given.items()}
     names = files.frame_names()
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
     mouth_kind = "source" if files.mouth_masks else "derived" if files.parsing or has_lips else "none"
@@ -130,6 +133,7 @@ def prepare(
         head_fingerprint=head.fingerprint,
         input_hash=inputs,
         data_hash=_data_hash(inspection, pairing, arrays, first.intrinsics),
+        refinement=tracked.refinement,
     )
     write_prepared(
         target, manifest, arrays, lambda building: derive_masks(building, manifest, files, model, tracks, pairing.pairs)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from avatar.data.refinement import Refinement
 from avatar.data.split import DEFAULT_SIZES, Split, SplitSizes, split_frames
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
@@ -25,6 +26,8 @@ class TrackedFolder:
     division: Mapping[int, str | None] = field(default_factory=dict)  # frame number -> "train", "val", "test"
     notes: tuple[str, ...] = ()
     fps: float | None = None  # of the video, where the layout records it
+    refinement: Refinement | None = None  # where the tracking is no longer what the tracker left
+    read_given: Callable[[Callable[[str], object]], Tracking] | None = None  # what it left, for the same frames
 
     @property
     def is_paired(self) -> bool:

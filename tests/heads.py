@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -67,3 +69,55 @@ def random_params(seed: int = 0, expressions: int = EXPRESSIONS) -> HeadParams:
 def rest_params(expressions: int = EXPRESSIONS) -> HeadParams:
     identity = torch.tensor(IDENTITY_6D)
     return HeadParams(torch.zeros(expressions), identity, identity.repeat(2), torch.zeros(2), identity)
+
+
+MOUTH_ROW, MOUTH_COLUMNS = 6, (5, 25)  # of `mouth_head`
+OPEN, SMILE, BROWS = range(3)  # its expressions
+
+
+def mouth_head() -> HeadAssets:
+    """A face 60 mm wide, 2 mm between vertices, with a mouth of 40 mm that opens.
+
+    Expression OPEN lowers the lower lip by 10 mm in the middle, SMILE draws the corners outwards, BROWS lifts the upper
+    rim; the jaw carries what is below the lips.
+    """
+    head = grid_head(13, 31)
+    rows, columns = np.divmod(np.arange(13 * 31), 31)
+    x, y = (columns - 15) * 0.002, (MOUTH_ROW - rows) * 0.002
+    points = np.stack((x, y, 0.1 - 10 * x**2), axis=1)
+    left, right = MOUTH_COLUMNS
+    line = np.flatnonzero((rows == MOUTH_ROW) & (columns > left) & (columns < right))
+    V = len(points)
+    own = np.concatenate((np.arange(V), line))  # the lower lip's vertices are copies of the upper lip's
+    lower_copy = np.arange(V)
+    lower_copy[line] = V + np.arange(len(line))
+    faces = head.faces.numpy().copy()
+    is_below = rows[faces].max(axis=1) > MOUTH_ROW
+    faces[is_below] = lower_copy[faces[is_below]]
+    lower = np.concatenate((rows > MOUTH_ROW, np.ones(len(line), bool)))
+    points, x, y = points[own], points[own, 0], points[own, 1]
+    near = np.clip(1 - (x / 0.02) ** 2, 0, None)
+    moves = np.zeros((len(points), 3, 3), np.float32)
+    moves[:, 1, OPEN] = -0.010 * near * lower
+    moves[:, 0, SMILE] = 0.2 * x
+    moves[:, 1, BROWS] = 0.5 * np.clip(y, 0, None)
+    weights = np.zeros((len(points), 5), np.float32)
+    weights[:, 2] = lower * near
+    weights[:, 0] = 1 - weights[:, 2]
+    lips = np.flatnonzero((abs(y) < 0.005) & (abs(x) < 0.0215))
+    zeros = torch.zeros
+    return replace(
+        head,
+        template=torch.from_numpy(points.astype(np.float32)),
+        faces=torch.from_numpy(faces),
+        shape_dirs=zeros(len(points), 3, 300),
+        expression_dirs=torch.from_numpy(moves),
+        pose_dirs=zeros(len(points), 3, 36),
+        joint_regressor=torch.full((5, len(points)), 1 / len(points)),
+        weights=torch.from_numpy(weights),
+        eyelid_dirs=zeros(2, len(points), 3),
+        uvs=head.uvs[own],
+        uv_faces=torch.from_numpy(faces.copy()),
+        regions={"boundary": torch.arange(31), "lips": torch.from_numpy(lips)},
+        fingerprint="mouth",
+    )

@@ -30,6 +30,7 @@ SMALL = (
     "trainer.preview_every=6",
     "trainer.log_every=2",
 )
+QUICK = (*SMALL, "trainer.iterations=16")
 
 
 def small_config(*overrides: str) -> Config:

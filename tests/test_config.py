@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
+
 import pytest
 
-from avatar.config import config_dir, config_from_dict, load_config
+from avatar.config import RANGES, config_dir, config_from_dict, flatten, load_config
 from avatar.errors import UserError
 
 
@@ -43,23 +46,100 @@ def test_later_overrides_win_and_survive_a_round_trip() -> None:
         ("trainer.iteration=3", "the nearest is 'trainer.iterations'"),
         ("iterations=3", "the nearest is 'trainer.iterations'"),
         ("model=flashavtar", "configs/model/ has flashavatar, hypergaussians"),
-        ("trainer.iterations=many", "trainer.iterations is not valid: Value 'many' of type 'str'"),
-        ("trainer.iterations=0", "trainer.iterations=0 is out of range"),
-        ("trainer.iterations=null", "trainer.iterations is not valid"),
-        ("trainer.perceptual=vgg", "not one of auto, lpips, dssim, none"),
-        ("trainer.learning_rates.mlp=-1", "trainer.learning_rates.mlp=-1.0 is out of range"),
+        ("trainer.iterations=many", "trainer.iterations=many is not valid: it must be a whole number"),
+        ("trainer.iterations=1.5", "trainer.iterations=1.5 is not valid: it must be a whole number"),
+        ("trainer.iterations=true", "trainer.iterations=true is not valid: it must be a whole number"),
+        ("trainer.iterations=1,2", "trainer.iterations=1,2 is not valid: it must be a whole number"),
+        ("trainer.iterations=[1", "trainer.iterations=[1 is not valid: it must be a whole number"),
+        ("trainer.iterations=null", "trainer.iterations=null is not valid: it must be a whole number"),
+        ("data.size=big", "data.size=big is not valid: it must be a whole number, or null"),
+        ("trainer.iterations=0", "trainer.iterations=0 is out of range: it must be from 1 to 99999999"),
+        ("trainer.iterations=99999999999", "trainer.iterations=99999999999 is out of range"),
+        ("trainer.adam_eps=0", "trainer.adam_eps=0 is out of range: it must be from 1e-30 to 1"),
+        ("trainer.adam_eps=tiny", "trainer.adam_eps=tiny is not valid: it must be a number"),
+        ("trainer.mouth_weight=inf", "trainer.mouth_weight=inf is out of range: it must be from 0 to 1000000"),
+        ("trainer.huber_delta=1e400", "trainer.huber_delta=inf is out of range"),
+        (f"trainer.huber_delta={10**400}", "trainer.huber_delta=1e+300 is out of range"),
+        ("trainer.perceptual=vgg", "trainer.perceptual=vgg is not one of auto, lpips, dssim, none"),
+        ("trainer.perceptual=null", "trainer.perceptual=null is not valid: it must be a word"),
+        ("trainer.learning_rates.mlp=-1", "trainer.learning_rates.mlp=-1 is out of range: it must be from 0 to 10"),
         ("trainer.learning_rates.mlp=nan", "trainer.learning_rates.mlp=nan is out of range"),
         ("model.latent_dim=0", "model.latent_dim=0 is out of range"),
-        ("data.background=[1,2,3]", "three values from 0 to 1"),
-        ("data.background=[1,2]", "data.background"),
+        ("data.background=[1,2,3]", "three numbers from 0 to 1"),
+        ("data.background=[1,2]", "data.background=[1,2] is not valid: it must be a colour: white, black,"),
+        ("data.background=purple", "data.background=purple is not valid: it must be a colour: white, black,"),
+        ("data.background=#ff00", "data.background=#ff00 is not valid: it must be a colour"),
+        ("data.background=", "data.background= is not valid: it must be a colour"),
+        ("data.background=null", "data.background=null is not valid: it must be a colour"),
         ("protocol=strict", "no configuration key 'protocol'"),
+        ("trainer.learning_rates=1", "no configuration key 'trainer.learning_rates'"),
         ("size", "'size' is not of the form key=value"),
-        ("trainer.iterations=[1", "cannot be composed"),
     ],
 )
 def test_a_wrong_override_gets_a_sentence(override: str, message: str) -> None:
     with pytest.raises(UserError) as caught:
         load_config([override])
+    assert message in str(caught.value)
+
+
+def test_no_range_is_without_end() -> None:
+    """What is accepted is what can work: checkpoints are named with eight digits, Adam divides by its epsilon."""
+    assert all(-math.inf < low < high < math.inf for low, high in RANGES.values())
+    numbers = {key for key, value in flatten(load_config().to_dict()).items() if isinstance(value, int | float)}
+    assert numbers <= RANGES.keys()
+
+
+@pytest.mark.parametrize(
+    ("written", "colour"),
+    [
+        ("white", (1.0, 1.0, 1.0)),
+        ("Green", (0.0, 1.0, 0.0)),
+        ("#ff8000", (1.0, 128 / 255, 0.0)),
+        ("'#0000FF'", (0.0, 0.0, 1.0)),
+        ("[1,0.5,0]", (1.0, 0.5, 0.0)),
+        ("1, 0.5, 0", (1.0, 0.5, 0.0)),
+    ],
+)
+def test_a_background_may_be_written_as_people_write_colours(written: str, colour: tuple[float, ...]) -> None:
+    config = load_config([f"data.background={written}"])
+    assert config.data.background == colour and config_from_dict(config.to_dict()) == config
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "value"),
+    [
+        ("trainer.iterations=1e3", "trainer.iterations", 1000),
+        ("trainer.iterations='5'", "trainer.iterations", 5),
+        ("trainer.seed=010", "trainer.seed", 10),
+        ("trainer.lr_final=1", "trainer.lr_final", 1.0),
+        ("data.size=null", "data.size", None),
+        ("data.size=~", "data.size", None),
+        ("trainer.perceptual=none", "trainer.perceptual", "none"),
+    ],
+)
+def test_a_value_is_read_as_it_is_meant(override: str, key: str, value: object) -> None:
+    read = flatten(load_config([override]).to_dict())[key]
+    assert read == value and type(read) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda values: values.pop("model"), "the configuration lacks model"),
+        (lambda values: values["trainer"].pop("seed"), "the configuration lacks trainer.seed"),
+        (
+            lambda values: values["trainer"].update(sed=1),
+            "no configuration key 'trainer.sed'; the nearest is 'trainer.se",
+        ),
+        (lambda values: values.update(data=[1]), "the configuration has [1] where the keys data.* should be"),
+        (lambda values: values["data"].update(background=7), "data.background=7 is not valid"),
+    ],
+)
+def test_a_recorded_configuration_that_is_damaged_gets_a_sentence(damage, message: str) -> None:
+    values = load_config().to_dict()
+    damage(values)
+    with pytest.raises(UserError) as caught:
+        config_from_dict(values)
     assert message in str(caught.value)
 
 
@@ -69,3 +149,9 @@ def test_every_key_in_the_yaml_files_has_a_comment() -> None:
             continue
         for line in file.read_text().splitlines():
             assert line.startswith(("#", "name: hyper")) or " # " in line, f"{file.name}: {line}"
+
+
+def test_a_key_of_any_length_is_answered_in_a_short_sentence() -> None:
+    with pytest.raises(UserError) as refused:
+        config_from_dict({**asdict(load_config()), "x" * 20_000: 1})
+    assert "there is no configuration key 'xxx" in str(refused.value) and len(str(refused.value)) < 300

@@ -14,6 +14,7 @@ from avatar.config import load_config
 COMMANDS = (
     "train",
     "eval",
+    "refine",
     "compare",
     "reenact",
     "drive-file",

@@ -9,6 +9,7 @@ import torch
 from heads import EXPRESSIONS, grid_head, random_params
 
 from avatar.config import load_config
+from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.render import AHEAD_PER_WORKER, Renderer, single_threaded_workers
 from avatar.splat import splat
@@ -128,3 +129,16 @@ def test_workers_have_one_thread_each_and_nobody_else_loses_theirs() -> None:
             assert found == [3]
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("draw", ["render", "stream"])
+def test_an_avatar_whose_parameters_overflow_is_not_drawn_and_says_why(draw: str) -> None:
+    avatar = trained_looking()
+    with torch.no_grad():
+        avatar.log_scales[7] = 100.0
+    renderer = Renderer(avatar, BACKGROUND)
+    with pytest.raises(UserError, match="cannot be drawn: scales has [123] non-finite of .*trainer.learning_rates"):
+        if draw == "render":
+            renderer.render(random_params(0), CAMERA)
+        else:
+            list(renderer.stream([(random_params(0), CAMERA)]))

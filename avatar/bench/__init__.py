@@ -36,4 +36,5 @@ PARTS = {
     "train": Part("avatar.bench.train_report", "FOLDER"),
     "quality": Part("avatar.bench.quality_report", "RUN..."),
     "stability": Part("avatar.bench.stability"),
+    "refine": Part("avatar.bench.refine", "FOLDER"),
 }

@@ -108,7 +108,7 @@ def trainee(
     meshes = PosedMeshes(avatar.head)
     for frame in frames:
         meshes.vertices(frame)
-    term = choose_perceptual(config.trainer, say, perceptual)
+    term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size))
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
     return Trainee(config, avatar, make_optimizer(avatar, config.trainer), objective, cycle(frames), meshes)
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from importlib import import_module
 
 OK, INTERRUPTED = 0, 130
 
 MODULES = {
-    "train": "training",
+    "train": "rounds",
     "eval": "measuring",
+    "refine": "refining",
     "report": "measuring",
     "compare": "measuring",
     "track": "tracking",
@@ -27,7 +29,7 @@ MODULES = {
 }
 
 
-def run_command(arguments: Namespace) -> int:
-    """The exit status of `arguments.command`."""
-    module = import_module(f"{__name__}.{MODULES[arguments.command]}")
-    return getattr(module, f"run_{arguments.command.replace('-', '_')}")(arguments)
+def find_command(name: str) -> Callable[[Namespace], int]:
+    """What does the command `name`; it returns the exit status."""
+    module = import_module(f"{__name__}.{MODULES[name]}")
+    return getattr(module, f"run_{name.replace('-', '_')}")

@@ -8,11 +8,14 @@ from pathlib import Path
 
 from avatar.bench import PARTS, Request
 from avatar.commands import OK
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 
 
 def run_bench(arguments: Namespace) -> int:
     out: Path = arguments.out
+    check_folder_output(out)
+    check_outputs([out], [*arguments.inputs, arguments.head, arguments.tracking])
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from avatar.commands import OK
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, open_trained, source_of
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_file, check_outputs
 from avatar.commands.tracking import is_video, tracked_once
-from avatar.errors import UserError
+from avatar.files.video import VIDEO_SUFFIXES
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
 from avatar.motion.reenact import Choices, reenact, sidecars
@@ -21,11 +21,19 @@ from data_prep.open import open_subject
 def run_reenact(arguments: Namespace) -> int:
     trained = open_trained(arguments.run, arguments.head)
     choices = Choices(
-        arguments.transfer, arguments.strength, arguments.smoothing, arguments.camera, arguments.intrinsics
+        arguments.transfer,
+        arguments.strength,
+        arguments.smoothing,
+        arguments.camera,
+        arguments.intrinsics,
+        arguments.neutral,
+        arguments.driver_neutral,
     )
     driver: Path = arguments.driver
     out = arguments.out or default_video(arguments.run, driver, choices)
-    check_outputs([out, *sidecars(out)], [driver, arguments.run, arguments.head, trained.source])
+    check_file(out, VIDEO_SUFFIXES, "a video")
+    inputs = [driver, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
+    check_outputs([out, *sidecars(out)], inputs)
     if driver.suffix.lower() in DRIVE_SUFFIXES:
         reenact(trained, open_drive_file(driver, trained), out, choices)
     else:
@@ -50,10 +58,10 @@ def default_video(avatar: Path, driver: Path, choices: Choices) -> Path:
 
 
 def run_drive_file(arguments: Namespace) -> int:
-    if arguments.out.suffix.lower() != ".npz":
-        raise UserError(f"a drive file is written as .npz, not as {arguments.out}")
-    check_outputs([arguments.out], [arguments.folder, arguments.head])
-    subject, assets = open_subject(source_of(arguments))
+    check_file(arguments.out, [".npz"], "a drive file")
+    source = source_of(arguments)
+    check_outputs([arguments.out], [source.folder, source.head, source.tracking])
+    subject, assets = open_subject(source)
     write_drive(arguments.out, subject_drive(subject, None), assets.fingerprint)
     print(f"{len(subject)} frames written to {arguments.out}")
     return OK

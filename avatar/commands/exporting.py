@@ -8,8 +8,7 @@ from pathlib import Path
 
 from avatar.commands import OK
 from avatar.commands.opening import open_trained
-from avatar.commands.outputs import check_outputs
-from avatar.errors import UserError
+from avatar.commands.outputs import check_file, check_outputs
 from avatar.runs.avatar_file import read_portrait, write_portrait
 
 LICENCE = (
@@ -21,8 +20,7 @@ LICENCE = (
 def run_export(arguments: Namespace) -> int:
     trained = open_trained(arguments.run, arguments.head)
     out: Path = arguments.out or Path(f"{trained.name}.safetensors")
-    if out.suffix != ".safetensors":
-        raise UserError(f"an avatar file is called .safetensors, not {out.name}")
+    check_file(out, [".safetensors"], "an avatar file")
     check_outputs([out], [arguments.run, trained.source, arguments.head])
     portrait = read_portrait(trained.source)
     head = trained.assets if arguments.with_head else None

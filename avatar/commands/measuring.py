@@ -7,7 +7,7 @@ from argparse import Namespace
 
 from avatar.commands import OK
 from avatar.commands.opening import open_run
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
@@ -33,6 +33,7 @@ def run_report(arguments: Namespace) -> int:
 
 def run_compare(arguments: Namespace) -> int:
     if arguments.out is not None:
+        check_folder_output(arguments.out)
         check_outputs([arguments.out], [])
     comparison = compare_runs(arguments.runs, arguments.protocol)
     if arguments.out is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from avatar.errors import UserError
@@ -11,7 +11,32 @@ from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.run import RUN_FILE
 
 RUN_FILES = (RUN_FILE, AVATAR_FILE, LOCK_FILE)
-RUN_FOLDERS = ("checkpoints", "tensorboard", "previews", "eval")
+RUN_FOLDERS = ("checkpoints", "tensorboard", "previews", "eval", "rounds")
+
+
+def check_file(output: Path, suffixes: Sequence[str], what: str) -> None:
+    """Raise UserError where a file of this kind cannot be called so, or is a folder."""
+    if output.suffix.lower() not in suffixes:
+        raise UserError(f"{what} is written as {' or '.join(suffixes)}, not as {output}")
+    if output.is_dir():
+        raise UserError(f"{output} is a folder; name a file with --out")
+
+
+def check_folder_output(output: Path) -> None:
+    """Raise UserError where a folder is to be written and a file has its name."""
+    if output.exists() and not output.is_dir():
+        raise UserError(f"{output} is a file; name a folder with --out")
+
+
+def check_run_folder(run: Path, inputs: Iterable[Path | None]) -> None:
+    """Raise UserError when a new run would be, or would write over, what it is trained on."""
+    read = [path for path in inputs if path is not None]
+    check_folder_output(run)
+    check_outputs([run], read)
+    for path in read:
+        inside = path.resolve().relative_to(run.resolve()).parts if _lies_in(path, run) else ("",)
+        if inside[0] in (*RUN_FOLDERS, *RUN_FILES):
+            raise UserError(f"{path}, which is an input, lies where the run {run} would write; choose another --out")
 
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:

@@ -78,6 +78,12 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the preset's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on from RUN's newest checkpoint")
+    train.add_argument(
+        "--refine", type=int, metavar="N", help="first improve the tracking N times through a shorter training's avatar"
+    )
+    train.add_argument(
+        "--minutes", type=float, metavar="M", help="with --refine: about what all of it may take, by fewer steps"
+    )
     train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
@@ -95,6 +101,11 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="write them, and compute PSNR and SSIM again from the files, with scikit-image",
     )
+
+    refine = commands.add_parser("refine", help="improve the tracking of a run's video through its avatar")
+    add_run(refine)
+    add_folder(refine)
+    refine.add_argument("--out", type=Path, metavar="SUBJECT", help="a new tracked folder (default: RUN/refined/NAME)")
 
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
     add_run(report)
@@ -121,6 +132,14 @@ def build_parser() -> argparse.ArgumentParser:
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
     reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
     reenact.add_argument("--transfer", choices=("raw", "relative", "mean", "pca"), default="relative")
+    reenact.add_argument(
+        "--neutral",
+        metavar="N",
+        help="training frame with the avatar's neutral face, by its name or number (12 is 00012; default: found)",
+    )
+    reenact.add_argument(
+        "--driver-neutral", metavar="N", help="frame of DRIVER with the driver's neutral face, likewise"
+    )
     reenact.add_argument("--strength", type=float, default=1.0, metavar="S", help="scales the departure from neutral")
     reenact.add_argument(
         "--smoothing", type=float, default=0.0, metavar="FRAMES", help="Gaussian over time (default: off)"

@@ -10,13 +10,14 @@ from tqdm import tqdm
 
 from avatar.commands import OK
 from avatar.commands.opening import source_of
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
+from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.train.cost import measure_cost
-from data_prep.check.folder import as_text, check_tracked_folder
+from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
 from data_prep.open import find_head
 from data_prep.prepare import prepare
@@ -25,7 +26,8 @@ from data_prep.prepare import prepare
 def run_prepare(arguments: Namespace) -> int:
     source = source_of(arguments)
     if arguments.out is not None:
-        check_outputs([arguments.out], [source.folder, source.head])
+        check_folder_output(arguments.out)
+        check_outputs([arguments.out], [source.folder, source.head, source.tracking])
     prepared = prepare(source, load_head_assets(source.head), out=arguments.out)
     subject = Subject.open(prepared)
     print(
@@ -39,7 +41,8 @@ def run_prepare(arguments: Namespace) -> int:
 def run_check(arguments: Namespace) -> int:
     """Exit status 0: fine, 1: warnings, 2: errors."""
     if arguments.out is not None:
-        check_outputs([arguments.out], [arguments.folder, arguments.head])
+        check_folder_output(arguments.out)
+        check_outputs([arguments.out], [arguments.folder, arguments.head, arguments.tracking])
     outcome = check_tracked_folder(
         arguments.folder,
         lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
@@ -55,11 +58,18 @@ def run_check(arguments: Namespace) -> int:
     if arguments.out is not None:
         from data_prep.check.page import write_page  # imports matplotlib, which takes half a second
 
-        cost = None
-        if outcome.clip is not None and outcome.clip.head is not None and outcome.coverage is not None:
-            frame, identity = first_training_frame(outcome.clip, outcome.coverage)
-            frames = len(outcome.coverage.images)
-            cost = measure_cost(frame, outcome.clip.head.assets, identity, frames, load_config())
-        page = write_page(outcome, None if cost is None else cost.facts(), arguments.out)
+        page = write_page(outcome, training_facts(outcome), arguments.out)
         print(f"Page   {page}", file=sys.stderr if arguments.json else sys.stdout)
     return outcome.status
+
+
+def training_facts(outcome: Check) -> dict[str, str] | None:
+    """What training will take, where the folder can be trained on."""
+    if outcome.clip is None or outcome.clip.head is None or outcome.coverage is None:
+        return None
+    frame, identity = first_training_frame(outcome.clip, outcome.coverage)
+    try:
+        frames = len(outcome.coverage.images)
+        return measure_cost(frame, outcome.clip.head.assets, identity, frames, load_config()).facts()
+    except UserError as error:  # frames that are too small
+        return {"training": f"not possible: {error}"}

@@ -8,13 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from avatar.commands import INTERRUPTED, OK
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.evaluation.compare_tables import FORMATS, text, write_tables
 from avatar.sweep.conduct import conduct
 from avatar.sweep.engines import EngineOptions, make_engine
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Spec, read_spec
-from avatar.sweep.state import State, read_state, read_sweep, write_state, write_sweep
+from avatar.sweep.state import SWEEP_FILE, State, read_state, read_sweep, write_state, write_sweep
 from avatar.sweep.table import Progress, full_table, overview
 
 FAILED = 1
@@ -23,7 +24,9 @@ FAILED = 1
 def run_sweep(arguments: Namespace) -> int:
     folder = sweep_folder(arguments.spec, arguments.out)
     if arguments.spec is not None and not arguments.status:
-        write_sweep(folder, read_spec(arguments.spec))
+        asked = read_spec(arguments.spec)
+        check_sweep_folder(folder, arguments.spec, asked)
+        write_sweep(folder, asked)
     spec = read_sweep(folder)
     if arguments.status:
         return show_status(folder, spec)
@@ -51,6 +54,15 @@ def sweep_folder(spec: Path | None, out: Path | None) -> Path:
     if spec is None:
         raise UserError("say which sweep: avatar sweep SPEC.yaml, or avatar sweep --out DIR to go on with one")
     return Path("runs") / spec.stem
+
+
+def check_sweep_folder(folder: Path, file: Path, spec: Spec) -> None:
+    """Raise UserError where a sweep would write over its file, or into what its jobs train on."""
+    check_folder_output(folder)
+    keys = ("folder", "head", "tracking")
+    inputs = {Path(job.source[key]) for job in spec.jobs for key in keys if key in job.source}
+    check_outputs([folder], sorted(inputs))
+    check_outputs([folder / SWEEP_FILE], [file])
 
 
 def show_status(folder: Path, spec: Spec) -> int:

@@ -11,7 +11,9 @@ import torch
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import check_data, moved_source, source_of, split_sizes
+from avatar.commands.outputs import check_run_folder
 from avatar.commands.tracking import head_for_video, is_video, tracked_once
+from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, flatten, load_config
 from avatar.data.source import Source
 from avatar.data.split import check_divided
@@ -22,6 +24,7 @@ from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
+from avatar.runs.footprint import training_needs
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
@@ -37,10 +40,14 @@ def run_train(arguments: Namespace) -> int:
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder)
     load_config(overrides)  # a mistake in it before one in the folder
-    if is_video(arguments.folder):
-        head = head_for_video(arguments.folder, arguments.head)
-        arguments.head, arguments.folder = head, tracked_once(arguments.folder, head)
-    return train_new(source_of(arguments), overrides, run)
+    video = arguments.folder if is_video(arguments.folder) else None
+    if video is not None:
+        head = head_for_video(video, arguments.head)
+        check_run_folder(run, [video, head])
+        arguments.head, arguments.folder = head, tracked_once(video, head)
+    source = source_of(arguments)
+    check_run_folder(run, [source.folder, source.head, source.tracking])
+    return train_new(source, overrides, run)
 
 
 def default_run(folder: Path | None) -> Path:
@@ -55,9 +62,8 @@ def train_new(source: Source, overrides: list[str], run: Path) -> int:
         refuse_trained(run)
         subject, assets = open_subject(source, split_sizes(config))
         check_divided(subject.split)
-        perceptual = choose_perceptual(config.trainer, print)
-        torch.manual_seed(config.trainer.seed)
-        avatar = Avatar(assets, subject.identity, config.model)
+        perceptual = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
+        avatar = new_avatar(assets, subject, config, perceptual.name)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
         return finish_training(avatar, subject, config, run, perceptual)
 
@@ -80,14 +86,25 @@ def go_on(run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, as
             f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
             f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
         )
-    avatar = Avatar(assets, subject.identity, config.model)
+    avatar = new_avatar(assets, subject, config, info.perceptual)
     if checkpoint.step >= config.trainer.iterations:
         leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
         return OK
-    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual)
+    size = subject.image_size(config.data.size)
+    perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, size=size)
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
     return finish_training(avatar, subject, config, run, perceptual, checkpoint)
+
+
+def new_avatar(assets: HeadAssets, subject: Subject, config: Config, perceptual: str) -> Avatar:
+    """An avatar with its initial parameters. Raises UserError, before any is made, when training it needs more memory than
+    there is."""
+    size = subject.image_size(config.data.size)
+    frames = len(subject.split.train)
+    check_memory("training", training_needs(config, assets, frames=frames, size=size, perceptual=perceptual))
+    torch.manual_seed(config.trainer.seed)
+    return Avatar(assets, subject.identity, config.model)
 
 
 def finish_training(
@@ -139,7 +156,11 @@ def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: li
                     f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
                     "start a new run"
                 )
-    source = info.source
+    refuse_other_source(run, info.source, arguments)
+
+
+def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None:
+    """Of the options that say how the folder is read, none may change."""
     given = replace(
         source,
         tracking=source.tracking if arguments.tracking is None else arguments.tracking.resolve(),

@@ -12,7 +12,7 @@ from avatar.types import Frame
 
 DEFAULT_CACHE_BYTES = 2**30
 BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
-_AHEAD_PER_WORKER = 3
+FRAMES_AHEAD = 3  # of every worker
 
 
 def cache_estimate(subject: Subject, size: int | None = None, count: int | None = None) -> int:
@@ -43,7 +43,7 @@ class FrameLoader:
         self.cache_bytes = cache_bytes
         self.cached_bytes = 0
         self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
-        self._ahead = workers * _AHEAD_PER_WORKER
+        self._ahead = workers * FRAMES_AHEAD
         self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="frames")
         self._closed = False
 

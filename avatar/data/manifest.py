@@ -12,10 +12,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+from avatar.data.refinement import Refinement
 from avatar.errors import UserError
 
-MANIFEST_VERSION = 3
+MANIFEST_VERSION = 4
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
+GIVEN = "given."  # before the names of the tracks as they were before their refinement
 _MAX_BYTES = 2**28
 
 
@@ -54,6 +56,7 @@ class Manifest:
     head_fingerprint: str
     input_hash: str  # of names, sizes and times of the inputs, and the options: decides whether to prepare again
     data_hash: str  # of the contents: the same data gives the same hash on every machine
+    refinement: Refinement | None = None  # of the tracking; None where it is the tracker's own
 
     def to_json(self) -> str:
         return json.dumps({"version": MANIFEST_VERSION, **asdict(self)}, indent=1)
@@ -107,6 +110,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         head_fingerprint=_of(raw, "head_fingerprint", str),
         input_hash=_of(raw, "input_hash", str),
         data_hash=_of(raw, "data_hash", str),
+        refinement=None if raw["refinement"] is None else _refinement(raw["refinement"]),
     )
     if not 1 <= manifest.width < 2**16 or not 1 <= manifest.height < 2**16:
         raise ValueError(f"an image size of {manifest.width}x{manifest.height} is impossible")
@@ -118,6 +122,13 @@ def _parse(raw: dict[str, Any]) -> Manifest:
     if set(manifest.train) & set(manifest.test):
         raise ValueError("a frame is in both train and test")
     return manifest
+
+
+def _refinement(raw: Any) -> Refinement:
+    try:
+        return Refinement.from_dict(raw)
+    except UserError as error:
+        raise ValueError(f"refinement: {error}") from None
 
 
 def _parse_frame(entry: Any) -> FrameRecord:

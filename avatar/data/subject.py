@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from avatar.data.images import read_image, read_mask, read_matte
-from avatar.data.manifest import TRACKS_FILE, FrameRecord, Manifest, read_manifest
+from avatar.data.manifest import GIVEN, TRACKS_FILE, FrameRecord, Manifest, read_manifest
 from avatar.data.recording import Recording, checked_tracks
 from avatar.data.split import Split
 from avatar.errors import UserError
@@ -49,12 +49,14 @@ class Subject:
     folder: Path  # the prepared subject
     manifest: Manifest
     recording: Recording
+    given: Recording | None = None  # with the tracker's own tracks, where they have been refined since
 
     @classmethod
     def open(cls, prepared: Path | str) -> Subject:
         """Read manifest and tracks, no images. Raises UserError when something is missing, damaged or too old."""
         prepared = Path(prepared)
         manifest = read_manifest(prepared)
+        tracks, given = _read_tracks(prepared / TRACKS_FILE, manifest)
         recording = Recording(
             name=manifest.name,
             fps=manifest.fps,
@@ -63,11 +65,11 @@ class Subject:
             intrinsics=manifest.intrinsics,
             names=tuple(record.name for record in manifest.frames),
             split=Split(manifest.train, manifest.test),
-            tracks=_read_tracks(prepared / TRACKS_FILE, len(manifest.frames)),
+            tracks=tracks,
             data_hash=manifest.data_hash,
             head_fingerprint=manifest.head_fingerprint,
         )
-        return cls(prepared, manifest, recording)
+        return cls(prepared, manifest, recording, None if given is None else replace(recording, tracks=given))
 
     def __len__(self) -> int:
         return len(self.recording)
@@ -176,14 +178,17 @@ class Subject:
         return pixels
 
 
-def _read_tracks(file: Path, count: int) -> dict[str, Tensor]:
+def _read_tracks(file: Path, manifest: Manifest) -> tuple[dict[str, Tensor], dict[str, Tensor] | None]:
+    """The tracks, and what they were before their refinement."""
     try:
         tracks = load_file(file)
     except FileNotFoundError:
         raise UserError(f"{file} is missing; prepare the subject again") from None
     except (SafetensorError, OSError, ValueError) as error:
         raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None
+    count = len(manifest.frames)
+    given = {name.removeprefix(GIVEN): value for name, value in tracks.items() if name.startswith(GIVEN)}
     try:
-        return checked_tracks(tracks, count)
+        return checked_tracks(tracks, count), None if manifest.refinement is None else checked_tracks(given, count)
     except (ValueError, TypeError) as error:
         raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None

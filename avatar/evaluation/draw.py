@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from avatar.data.background import Colour
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
-from avatar.evaluation.protocol import Colour, Look
+from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
-from avatar.render import Renderer
-from avatar.splat import splat
+from avatar.render import Renderer, drawn
 from avatar.splat.cpu import thread_count
 from avatar.types import Frame
 
@@ -34,7 +34,7 @@ def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, 
     for look in looks:
         if look.background not in images:
             colour = torch.tensor(look.background)
-            images[look.background] = Pair(splat(gaussians, frame.camera, colour).image, frame.composite(colour))
+            images[look.background] = Pair(drawn(gaussians, frame.camera, colour).image, frame.composite(colour))
         pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
     return pairs
 

@@ -1,6 +1,7 @@
 """Evaluation of a run on frames that it has not seen: figures, the pictures they come from, and a video.
 
-    RUN/eval/results.json                  every choice, what was evaluated, means, intervals
+    RUN/eval/results.json                  every choice, what was evaluated, means, intervals; by the protocols of earlier
+                                           evaluations too, where they are of the same avatar and frames
     RUN/eval/curves.png                    the figures along the video
     RUN/eval/worst.png                     truth, render and error of the first protocol's worst frames
     RUN/eval/truth_render_error.mp4        frames and background of the first protocol
@@ -21,19 +22,22 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from avatar.data.background import colour_name
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
+from avatar.evaluation.earlier import FRAMES_FILE, earlier_results, protocol_of, remove_others
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import FrameMeasurer
 from avatar.evaluation.networks import find_networks
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
 from avatar.evaluation.protocol import HELD_OUT, SHARED_CHOICES, Protocol, choose_protocols
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
-from avatar.evaluation.report import colour_name, frames_csv, table
+from avatar.evaluation.report import frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
+from avatar.evaluation.tracked import describe_tracking, measure_tracked, tracking_notes
 from avatar.files.atomic import write_atomically
 from avatar.files.video import video_writer
 from avatar.losses.lpips_network import Lpips, Net
@@ -100,6 +104,7 @@ def evaluate(
 
     for protocol in chosen:
         add_jitter(results[protocol.name], jitter[protocol.look], run)
+    tracking = describe_tracking(run, order)
     summary: dict[str, Any] = {
         "format": RESULTS_FORMAT,
         "subject": subject.name,
@@ -110,7 +115,13 @@ def evaluate(
         "config": run.config.to_dict(),
         "versions": versions(),
         "shared_choices": SHARED_CHOICES,
-        "notes": [*left_out.values(), *background_notes(chosen, data.background), *region_notes(chosen, run)],
+        "tracking": tracking,
+        "notes": [
+            *left_out.values(),
+            *background_notes(chosen, data.background),
+            *region_notes(chosen, run),
+            *tracking_notes(tracking),
+        ],
         "left_out": left_out,
         "rendering": speed(renderer, subject, order, data.size),
         "protocols": {
@@ -118,20 +129,38 @@ def evaluate(
             for protocol in chosen
         },
     }
+    if subject.given is not None:
+        for name, entry in measure_tracked(run, subject.given, renderer, indices, chosen, lpips).items():
+            summary["protocols"][name]["tracked"] = entry
     for protocol in chosen:
         rows = frames_csv(protocol.columns, results[protocol.name]).encode()
-        write_atomically(folder / protocol.name / "frames.csv", rows)
+        write_atomically(folder / protocol.name / FRAMES_FILE, rows)
         summary["protocols"][protocol.name]["frames_sha256"] = hashlib.sha256(rows).hexdigest()
     worst = summary["protocols"][chosen[0].name]["worst"]
     (folder / "worst.png").unlink(missing_ok=True)
     if worst:  # none where every frame is drawn without an error
         write_atomically(folder / "worst.png", worst_sheet(run, renderer, chosen[0], worst))
     write_atomically(folder / "curves.png", curves(chosen, results, [entry["frame"] for entry in worst]))
+    others = earlier_results(folder, summary)
+    measured = [*chosen, *(protocol_of(name, entry) for name, entry in others.items())]
+    whole = {
+        **summary,
+        "notes": [*left_out.values(), *background_notes(measured, data.background), *region_notes(measured, run)],
+        "protocols": {**summary["protocols"], **others},
+    }
     path = folder / "results.json"
-    write_atomically(path, json.dumps(summary, indent=2, allow_nan=False).encode())
+    write_atomically(path, json.dumps(whole, indent=2, allow_nan=False).encode())
+    removed = remove_others(folder, whole["protocols"])
     say(table(summary))
     places = {"Results": path, "Curves": folder / "curves.png", "Worst": folder / "worst.png", "Video": video}
-    say("\n".join(f"{name:8} {place}" for name, place in places.items() if place.exists()))
+    lines = [f"{name:8} {place}" for name, place in places.items() if place.exists()]
+    if others:
+        lines.append(f"Kept     {', '.join(others)}: measured before, of the same avatar and frames")
+    if removed:
+        lines.append(
+            f"Removed  {', '.join(removed)}: measured before, of another step, other data or by another program"
+        )
+    say("\n".join(lines))
     return path
 
 
@@ -182,7 +211,7 @@ def background_notes(protocols: Sequence[Protocol], trained: Sequence[float]) ->
             notes.append(
                 f"{' and '.join(names)}: drawn over {colour_name(background)}, trained over {colour_name(trained)}; where "
                 "the avatar has learned to let its background through, the other colour shines through and counts as "
-                f"error; train with 'data.background={list(background)}' to compare by this protocol"
+                f"error; train with 'data.background={colour_name(background)}' to compare by this protocol"
             )
     return notes
 

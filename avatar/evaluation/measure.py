@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avatar.evaluation.protocol import MEASURES, Levels, Look, Protocol, Region, column
 from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
-from avatar.losses.metrics import SSIM_RADIUS, bounding_box, squared_error, ssim_map, weighted_mean
+from avatar.losses.metrics import SSIM_RADIUS, bounding_box, grown_box, squared_error, ssim_map, weighted_mean
 
 LPIPS_CROP = 64  # pixels; a region is given at least so much context
 INSIDE = slice(SSIM_RADIUS, -SSIM_RADIUS)  # where SSIM's windows have their centres
@@ -104,14 +104,7 @@ class FrameMeasurer:
 def lpips_crop(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
     """The mask's bounding box, each side grown about its middle to `LPIPS_CROP` pixels where the image has them."""
     box = bounding_box(mask)
-    if box is None:
-        return None
-    sides = []
-    for side, size in zip(box, mask.shape, strict=True):
-        length = min(max(side.stop - side.start, LPIPS_CROP), size)
-        start = min(max((side.start + side.stop - length) // 2, 0), size - length)
-        sides.append(slice(start, start + length))
-    return sides[0], sides[1]
+    return None if box is None else grown_box(box, (mask.shape[0], mask.shape[1]), least=LPIPS_CROP)
 
 
 def lpips_in_mask(network: Lpips | None, images: tuple[Tensor, Tensor], mask: Float[Tensor, "H W"]) -> float:

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import yaml
 
 from avatar.config import config_dir
+from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
 from avatar.data.split import Split
 from avatar.errors import UserError
 from avatar.losses.lpips_network import Net
@@ -24,11 +25,9 @@ from avatar.losses.lpips_network import Net
 Region = str  # one of REGIONS
 Mask = Literal["multiply", "none", "only"]
 Levels = Literal["round", "truncate", "float"]
-Colour = tuple[float, float, float]
 
 MEASURES = ("psnr", "ssim", "lpips")
 REGIONS: tuple[Region, ...] = ("head", "mouth", "eyes", "rest")
-COLOURS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "green": (0.0, 1.0, 0.0), "black": (0.0, 0.0, 0.0)}
 HELD_OUT = "held-out"
 MAX_BYTES = 1 << 16  # of a protocol file: those that come with the program have 2 KB
 
@@ -204,11 +203,11 @@ def _frames(path: Path, key: str, value: Any) -> str | int:
 
 
 def _colour(path: Path, key: str, value: Any) -> Colour:
-    if isinstance(value, str) and value in COLOURS:
-        return COLOURS[value]
-    if isinstance(value, list) and len(value) == 3 and all(_is_number(v) and 0 <= v <= 1 for v in value):
-        return float(value[0]), float(value[1]), float(value[2])
-    raise _wrong(path, key, value, f"{', '.join(COLOURS)}, or three numbers from 0 to 1")
+    try:
+        return parse_colour(value)
+    except (ValueError, OverflowError):
+        words = COLOUR_WORDS.replace("#rrggbb", '"#rrggbb"')  # without quotes it is a comment
+        raise _wrong(path, key, value, words) from None
 
 
 def _flag(path: Path, key: str, value: Any) -> bool:

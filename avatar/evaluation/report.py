@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from avatar.evaluation.conditions import Conditions
-from avatar.evaluation.protocol import COLOURS, MEASURES, REGIONS, Region, column
+from avatar.evaluation.protocol import MEASURES, REGIONS, Region, column
 from avatar.evaluation.results import FrameResult
 
 MAIN_TITLE = "by the protocol"
@@ -28,9 +28,12 @@ def table(results: Mapping[str, Any]) -> str:
     for first in range(0, len(shown), REGIONS_BESIDE):
         lines += [*_means(protocols, shown[first : first + REGIONS_BESIDE]), ""]
     lines += [*_intervals(protocols), ""]
+    if any("tracked" in entry for entry in protocols.values()):
+        lines += [*_tracked(protocols), ""]
     name, entry = next(iter(protocols.items()))
     lines += [*_details(name, entry), _speed(results["rendering"]), ""]
     lines += [f"{name}: {entry['choices']['summary']}" for name, entry in protocols.items()]
+    lines += _tracking(results["tracking"])
     lines += [f"LPIPS: {note}" for note in dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())]
     lines += [f"Note: {note}" for note in results["notes"]]
     return "\n".join(line.rstrip() for line in lines)
@@ -73,6 +76,35 @@ def _intervals(protocols: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _tracked(protocols: Mapping[str, Any]) -> list[str]:
+    """Two lines for each protocol: the same avatar and frames with the tracker's tracking and with the refined one."""
+    regions: tuple[Region | None, ...] = (None, "head")
+    name_width = _name_width(protocols)
+    width = sum(len(_cell(measure, None)) for measure in MEASURES)
+    titles = "   ".join((f"{region} only" if region else MAIN_TITLE).center(width) for region in regions)
+    lines = ["the same avatar and frames by both trackings", f"{'protocol':{name_width}} {'driven by':9}   {titles}"]
+    for name, entry in protocols.items():
+        for title, means in (("tracked", entry["tracked"]["means"]), ("refined", entry["means"])):
+            cells = (
+                "".join(_cell(measure, means.get(column(measure, region))) for measure in MEASURES)
+                for region in regions
+            )
+            lines.append(f"{name:{name_width}} {title:9}   {'   '.join(cells)}")
+    return lines
+
+
+def _tracking(tracking: Mapping[str, Any]) -> list[str]:
+    """What the tracking of the measured frames has seen."""
+    lines = [f"tracked: as {tracking['tracker']} left it; {tracking['tracked']}"]
+    for one in tracking["rounds"]:
+        both = one["measured_frames_trained_on"] or "none"
+        lines.append(
+            f"refined: each frame fitted to its own picture through the avatar of {one['run']} (step {one['step']}), which "
+            f"was trained on {one['frames_trained_on']} frames, {both} of them measured"
+        )
+    return lines
+
+
 def _details(name: str, entry: Mapping[str, Any]) -> list[str]:
     """How the first protocol's PSNR depends on the frame; of the head where it is measured by itself."""
     figure, what = ("psnr_head", "PSNR of the head") if "psnr_head" in entry["means"] else ("psnr", "PSNR")
@@ -103,11 +135,6 @@ def frames_csv(columns: Sequence[str], rows: Iterable[FrameResult]) -> str:
         values = (*(row.figures[key] for key in columns), *row.conditions)
         writer.writerow((row.index, row.name, *(f"{value:.6f}" for value in values)))
     return text.getvalue()
-
-
-def colour_name(colour: Sequence[float]) -> str:
-    """`white` where a colour has a name, else its values."""
-    return next((name for name, values in COLOURS.items() if values == tuple(colour)), str(list(colour)))
 
 
 def _name_width(protocols: Mapping[str, Any]) -> int:

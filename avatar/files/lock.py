@@ -23,9 +23,12 @@ LOCK_FILE = ".lock"
 def locked(folder: Path) -> Iterator[None]:
     """Hold the folder's lock; the system lets go of it when the process ends, however it ends.
 
+    A folder that this made, and that nothing was written into, is gone afterwards.
+
     Raises UserError naming the process that holds it, and when the folder cannot be written.
     """
     path = folder / LOCK_FILE
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = _acquire(path)
@@ -37,6 +40,9 @@ def locked(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             path.unlink()
         os.close(file)
+        if is_new:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
 
 
 def _acquire(path: Path) -> int:

@@ -16,7 +16,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.files.atomic import temporary_name
 
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv")
 CAPTION_SHARE = 0.08  # of the height of the pictures
 MIN_CAPTION = 16  # pixels
 INK, PAPER = (40, 40, 40), 245
@@ -29,7 +31,7 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[UInt8[np.ndarray,
     An odd size gets one more row or column, a copy of the last. The file appears under its name when the block ends
     without an exception. Raises UserError for no frames, another size on the way, or an encoder that fails.
     """
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    partial = temporary_name(path)
     shape: tuple[int, ...] | None = None
     encoder: subprocess.Popen[bytes] | None = None
 

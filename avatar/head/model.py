@@ -6,6 +6,8 @@ eyelid blendshapes after skinning as in metrical-tracker.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -99,6 +101,31 @@ class HeadModel:
         posed = (blended_R @ shape[:, :, None]).squeeze(-1) + self._weights @ t
         return posed + torch.einsum("s,svc->vc", params.eyelids.to(dtype), self._eyelid_dirs)
 
+    def still_vertices(
+        self, expression: Float[Tensor, "N E"], jaw: Float[Tensor, "N 3 3"], rows: Int[Tensor, " R"]
+    ) -> Float[Tensor, "N R 3"]:
+        """The vertices `rows` of N heads, as `vertices` poses them with neck, eyes and eyelids at rest; metres.
+
+        All at once, so much faster. `jaw` holds rotation matrices. Raises ValueError for more expression coefficients than
+        the basis has.
+        """
+        sizes = check_shapes(expression=(expression, "N E"), jaw=(jaw, "N 3 3"))
+        E, directions = sizes["E"], self._expression_dirs.shape[1]
+        if directions < E:
+            raise ValueError(f"expression has {E} coefficients, but the head model has {directions} directions")
+        dtype = self._identity_shape.dtype
+        expression, turn = expression.to(dtype), jaw.to(dtype) - torch.eye(3, dtype=dtype)
+        by_expression = self._expression_dirs.unflatten(0, (-1, 3))[rows, :, :E].flatten(0, 1)
+        by_jaw = self._pose_dirs.unflatten(0, (-1, 3))[rows, :, 9 * (JAW - 1) : 9 * JAW].flatten(0, 1)
+        moved = expression @ by_expression.T + turn.flatten(1) @ by_jaw.T
+        shape = self._identity_shape[rows] + moved.unflatten(1, (-1, 3))
+        pivot = self._identity_joints[JAW] + expression @ self._expression_joints[3 * JAW : 3 * JAW + 3, :E].T
+        # All other transforms are the identity, so what the jaw carries turns about its joint and the rest stays.
+        carried = self._weights[rows][:, [_follows(self._parents, j, JAW) for j in range(len(self._parents))]].sum(
+            dim=1
+        )
+        return shape + carried[:, None] * ((shape - pivot[:, None]) @ turn.mT)
+
     def _joint_transforms(
         self, rotations: Float[Tensor, "J 3 3"], joints: Float[Tensor, "J 3"]
     ) -> tuple[Float[Tensor, "J 3 3"], Float[Tensor, "J 3"]]:
@@ -110,3 +137,8 @@ class HeadModel:
             # The joint itself moves with its parent; rotate about it.
             t.append(R[parent] @ joints[joint] + t[parent] - R[joint] @ joints[joint])
         return torch.stack(R), torch.stack(t)
+
+
+def _follows(parents: Sequence[int], joint: int, ancestor: int) -> bool:
+    """Whether a joint is another one or is carried by it."""
+    return joint == ancestor or (parents[joint] >= 0 and _follows(parents, parents[joint], ancestor))

@@ -82,6 +82,24 @@ def bounding_box(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
+def grown_box(
+    box: tuple[slice, slice], shape: tuple[int, int], *, margin: int = 0, least: int = 0
+) -> tuple[slice, slice]:
+    """A box with `margin` pixels more on every side, then each side grown about its middle to `least` pixels.
+
+    Inside an image of `shape` (rows, columns), which a box never leaves; a side is shorter only where the image is.
+    """
+    sides = []
+    for side, size in zip(box, shape, strict=True):
+        start, stop = max(side.start - margin, 0), min(side.stop + margin, size)
+        if stop - start < least:
+            length = min(least, size)
+            start = min(max((start + stop - length) // 2, 0), size - length)
+            stop = start + length
+        sides.append(slice(start, stop))
+    return sides[0], sides[1]
+
+
 def weighted_mean(values: Float[Tensor, "H W"], mask: Float[Tensor, "H W"] | None) -> Float[Tensor, ""]:
     """Mean over the mask's weights, over all for None; NaN for a mask of zeros."""
     if mask is None:

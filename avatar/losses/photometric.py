@@ -18,7 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.losses.dssim_cpu import dssim_cpu
-from avatar.losses.metrics import SSIM_RADIUS, SSIM_WINDOW, bounding_box, ssim_map
+from avatar.losses.lpips_network import MIN_SIZE
+from avatar.losses.metrics import SSIM_RADIUS, SSIM_WINDOW, bounding_box, grown_box, ssim_map
 from avatar.tensors import check_shapes
 
 HUBER_DELTA = 0.1
@@ -104,24 +105,22 @@ def dssim(
     return (1.0 - similarity).sum() / (2.0 * similarity.shape[-1] * windows)
 
 
-def on_head(perceptual: Perceptual, margin: int = 16) -> Perceptual:
+def on_head(perceptual: Perceptual, margin: int = 16, least: int = MIN_SIZE) -> Perceptual:
     """`perceptual` of the mask's bounding box, grown by `margin` pixels, in place of the whole frame.
 
     The value is scaled by the box's share of the frame, so it weighs what the mean over the whole frame does: both images
-    are black outside the mask. Only networks that see the frame's border where the box ends can tell.
+    are black outside the mask. Only networks that see the frame's border where the box ends can tell. A head far away gets
+    a box of `least` pixels a side, which LPIPS needs, where the frame has them.
     """
 
     def cropped(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
         box = bounding_box(mask)
         if box is None:
             return (image * 0.0).sum()
-        rows, columns = (
-            slice(max(side.start - margin, 0), min(side.stop + margin, length))
-            for side, length in zip(box, mask.shape, strict=True)
-        )
-        inside = mask[rows, columns]
+        crop = grown_box(box, (mask.shape[0], mask.shape[1]), margin=margin, least=least)
+        inside = mask[crop]
         share = inside.numel() / mask.numel()
-        return share * perceptual(image[rows, columns], target[rows, columns], inside)
+        return share * perceptual(image[crop], target[crop], inside)
 
     return cropped
 

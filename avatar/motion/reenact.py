@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ from avatar.files.video import side_by_side, write_video
 from avatar.head.model import HeadModel
 from avatar.motion.distance_strip import DistanceStrip, distances_csv
 from avatar.motion.drive import Drive, Whose, choose_cameras, smoothed, subject_drive
-from avatar.motion.transfer import RestPose, Transfer, transfer_motion
+from avatar.motion.rest import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
+from avatar.motion.transfer import NEUTRAL_MODES, Transfer, transfer_motion
 from avatar.runs.run import versions
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera
@@ -46,6 +47,8 @@ class Choices:
     smoothing: float = 0.0  # standard deviation in frames; 0 is off
     camera: Whose = "driver"  # whose head pose is shown
     intrinsics: Whose = "driver"  # through whose lens, where the driver's head pose is shown
+    neutral: str | None = None  # the training frame that shows the avatar's neutral face; None finds one
+    driver_neutral: str | None = None  # the driver's frame that shows his
 
 
 DEFAULT_CHOICES = Choices()
@@ -68,21 +71,21 @@ def reenact(
     if isinstance(driver, Subject):
         check_same_head(driver, trained)
     drive = smoothed(subject_drive(driver, data.size) if isinstance(driver, Subject) else driver, choices.smoothing)
+    trained, rest = choose_neutrals(trained, drive, choices)
+    driver_head = HeadModel(trained.assets, drive.identity)
     moved, source, goal = transfer_motion(
-        drive.params,
-        trained.repertoire,
-        choices.transfer,
-        HeadModel(trained.assets, drive.identity),
-        strength=choices.strength,
+        drive.params, trained.repertoire, choices.transfer, driver_head, strength=choices.strength, rest=rest
     )
-    recording = trained.recording
-    training_names = [recording.names[i] for i in recording.split.train]
     neutral = {
         drive.name: frame_name(source, drive.names),
-        trained.name: frame_name(goal, training_names),
+        trained.name: frame_name(goal, training_names(trained)),
     }
     if all(neutral.values()):
         say("Neutral expression: " + ", ".join(f"frame {frame} of {name}" for name, frame in neutral.items()))
+    if choices.driver_neutral is None:
+        say_open_lips(source, driver_head, drive.name, "--driver-neutral", say)
+    if choices.neutral is None:
+        say_open_lips(goal, trained.avatar.head, trained.name, "--neutral", say)
 
     distances = trained.repertoire.expressions.distances(moved)
     say_distances(distances, say)
@@ -113,6 +116,38 @@ def check_choices(choices: Choices) -> None:
     for name, value, high in (("strength", choices.strength, 10.0), ("smoothing", choices.smoothing, 1000.0)):
         if not 0.0 <= value <= high:  # a NaN is refused too
             raise UserError(f"--{name} must be from 0 to {high:g}, not {value}")
+    for option, frame in (("--neutral", choices.neutral), ("--driver-neutral", choices.driver_neutral)):
+        if frame is not None and choices.transfer not in NEUTRAL_MODES:
+            raise UserError(
+                f"{option} chooses what --transfer {' or '.join(NEUTRAL_MODES)} measures from; {choices.transfer} does not "
+                "look at it"
+            )
+
+
+def choose_neutrals(trained: TrainedAvatar, drive: Drive, choices: Choices) -> tuple[TrainedAvatar, RestPose | None]:
+    """The avatar with the neutral face that was chosen, and the driver's, where one was. Raises UserError for a frame that
+    there is not."""
+    if choices.neutral is not None:
+        recording = trained.recording
+        frame = chosen_frame(choices.neutral, training_names(trained), f"the training of {trained.name}")
+        trained = replace(trained, neutral=frame_rest(recording.motion(recording.split.train), frame))
+    if choices.driver_neutral is None:
+        return trained, None
+    return trained, frame_rest(drive.params, chosen_frame(choices.driver_neutral, drive.names, drive.name))
+
+
+def training_names(trained: TrainedAvatar) -> list[str]:
+    return [trained.recording.names[i] for i in trained.recording.split.train]
+
+
+def say_open_lips(rest: RestPose | None, head: HeadModel, name: str, option: str, say: Callable[[str], None]) -> None:
+    """Say when the neutral face that was found has open lips: expressions are measured from it as if they were closed."""
+    apart = None if rest is None or rest.frame is None else lips_apart(rest, head)
+    if apart is not None and apart > LIPS_OPEN:
+        say(
+            f"The lips of {name} are {1000 * apart:.1f} mm apart in the neutral face, for want of a frame with closed "
+            f"ones, and that passes for a closed mouth; {option} N takes frame N instead"
+        )
 
 
 def check_same_head(driver: Subject, trained: TrainedAvatar) -> None:

@@ -24,6 +24,7 @@ from avatar.types import HeadParams
 
 Transfer = Literal["raw", "relative", "mean", "pca"]
 TRANSFERS: tuple[Transfer, ...] = ("raw", "relative", "mean", "pca")
+NEUTRAL_MODES: tuple[Transfer, ...] = ("relative", "pca")  # measure from neutral faces
 
 
 class Transferred(NamedTuple):
@@ -39,12 +40,14 @@ def transfer_motion(
     driver_head: HeadModel,
     *,
     strength: float = 1.0,
+    rest: RestPose | None = None,
 ) -> Transferred:
     """The driver's motion as the target's parameters, as many frames as the driver has.
 
-    `driver_head` is the head model with the driver's identity; it finds his neutral face. `strength` scales the departure
-    from rest of expression and jaw: 0 is the rest itself, 1 the driver's departure; with `raw` the rest is zero. Raises
-    ValueError when the driver has no frame or another number of expression coefficients.
+    `driver_head` is the head model with the driver's identity; it finds his neutral face where that is not given as `rest`
+    (`raw` and `mean` do not look at it). `strength` scales the departure from rest of expression and jaw: 0 is the rest
+    itself, 1 the driver's departure; with `raw` the rest is zero. Raises ValueError when the driver has no frame or another
+    number of expression coefficients.
     """
     if not driver:
         raise ValueError("a transfer needs frames of the driver, got none")
@@ -58,8 +61,8 @@ def transfer_motion(
     source = goal = None
     if mode == "mean":
         source, goal = find_mean(driver), target.mean
-    elif mode != "raw":
-        source, goal = find_neutral(driver, driver_head), target.neutral
+    elif mode in NEUTRAL_MODES:
+        source, goal = rest or find_neutral(driver, driver_head), target.neutral
     zero = RestPose(torch.zeros_like(driver[0].expression), torch.eye(3), None)
     moved = _moved(driver, source or zero, goal or zero, strength)
     if mode == "pca":

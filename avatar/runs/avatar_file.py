@@ -20,6 +20,7 @@ from safetensors.torch import save as serialize
 from torch import Tensor
 
 import avatar
+from avatar.compute.memory import check_memory
 from avatar.config import Config, config_from_dict
 from avatar.data.manifest import parse_intrinsics, parse_number, parse_positions
 from avatar.data.recording import TRACK_SHAPES, Recording, checked_tracks
@@ -31,7 +32,8 @@ from avatar.head.expression_names import ExpressionNames, parse_expression_names
 from avatar.head.packed import head_from_tensors, head_tensors
 from avatar.model import Avatar
 from avatar.motion.rest import RestPose
-from avatar.runs.checkpoint import load_module, module_tensors
+from avatar.runs.checkpoint import check_fit, load_module, module_tensors
+from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shapes
 
 AVATAR_FILE = "avatar.safetensors"
 AVATAR_FORMAT = 1
@@ -178,9 +180,17 @@ def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def build_avatar(portrait: Portrait, assets: HeadAssets, source: Path | str) -> Avatar:
-    """The avatar with its parameters, ready to draw. Raises UserError for another head model than it was trained with."""
+    """The avatar with its parameters, ready to draw.
+
+    Raises UserError for another head model than it was trained with, and, before anything large is made, for parameters
+    that do not fit the configuration or the machine's memory.
+    """
     check_head(portrait.recording.head_fingerprint, assets, source)
-    model = Avatar(assets, portrait.recording.identity, portrait.config.model)
+    config = portrait.config.model
+    gaussians = count_gaussians(config, assets)
+    check_fit(parameter_shapes(config, assets, gaussians), portrait.parameters, source)
+    check_memory(f"opening {source}", drawing_needs(config, assets, gaussians))
+    model = Avatar(assets, portrait.recording.identity, config)
     load_module(model, portrait.parameters, source)
     return model.eval()
 

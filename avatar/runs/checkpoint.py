@@ -1,6 +1,5 @@
-"""Run folders on disk: what a run was made from (run.json) and its checkpoints.
+"""The checkpoints of a run.
 
-    RUN/run.json                                  input, head model, configuration, versions
     RUN/checkpoints/step_00001000.safetensors     parameters and optimizer state; step and hashes in its header
 
 A checkpoint is one file, written to a temporary name, flushed to the disk and renamed, so that it is there whole or not
@@ -27,7 +26,7 @@ from avatar.files.atomic import write_atomically
 from avatar.tensors import describe_non_finite
 
 CHECKPOINT_FORMAT = 1
-RUN_FORMAT = 1
+_MODEL = "model."  # begins the names of parameters
 _NAME = re.compile(r"step_(\d{8})\.safetensors")
 
 
@@ -71,7 +70,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("avatar", "null"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise UserError(f"the checkpoint {path} is damaged ({error}); delete it to use the one before") from None
     if not isinstance(meta, dict) or meta.get("format") != CHECKPOINT_FORMAT or not isinstance(meta.get("step"), int):
         found = meta.get("format") if isinstance(meta, dict) else "none"
@@ -87,43 +86,27 @@ def newest_checkpoint(run: Path) -> Checkpoint:
     return load_checkpoint(files[-1])
 
 
-def write_run_info(run: Path, info: Mapping[str, Any]) -> None:
-    """Write RUN/run.json: where the data and the head model are, the configuration, versions."""
-    write_atomically(run / "run.json", json.dumps({"format": RUN_FORMAT, **info}, indent=2).encode())
-
-
-def read_run_info(run: Path) -> dict[str, Any]:
-    """RUN/run.json; UserError when the folder is not a run."""
-    path = run / "run.json"
-    if not path.is_file():
-        raise UserError(
-            f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out)"
-        )
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise UserError(f"{path} cannot be read as JSON ({error})") from None
-    if not isinstance(info, dict) or info.get("format") != RUN_FORMAT:
-        raise UserError(f"{path} is not of format {RUN_FORMAT}; it was written by another version of the program")
-    return info
-
-
 def module_tensors(module: torch.nn.Module) -> dict[str, Tensor]:
     """The parameters of a module under the names that checkpoints give them."""
-    return {f"model.{name}": value for name, value in module.state_dict().items()}
+    return {f"{_MODEL}{name}": value for name, value in module.state_dict().items()}
 
 
 def load_module(module: torch.nn.Module, tensors: Mapping[str, Tensor], source: Path | str) -> None:
     """Put the parameters among a file's tensors into a module; UserError naming the first that does not fit."""
-    own = module_tensors(module)
-    given = {name: value for name, value in tensors.items() if name.startswith("model.")}
-    for name in own.keys() | given.keys():
+    own = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    check_fit(own, tensors, source)
+    module.load_state_dict({name: tensors[f"{_MODEL}{name}"] for name in own})
+
+
+def check_fit(own: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor], source: Path | str) -> None:
+    """Raise UserError naming the first of a file's parameters that does not have the shape in `own`."""
+    given = {name.removeprefix(_MODEL): value for name, value in tensors.items() if name.startswith(_MODEL)}
+    for name in sorted(own.keys() | given.keys()):
         if name not in given or name not in own:
             where = "lacks" if name not in given else "has, but this model lacks,"
-            raise UserError(f"the avatar in {source} {where} {name}; it belongs to another model")
-        if own[name].shape != given[name].shape:
+            raise UserError(f"the avatar in {source} {where} {_MODEL}{name}; it belongs to another model")
+        if own[name] != tuple(given[name].shape):
             raise UserError(
-                f"the avatar in {source} has {name} of shape {list(given[name].shape)}, this model needs "
-                f"{list(own[name].shape)}; it belongs to another model or head model"
+                f"the avatar in {source} has {_MODEL}{name} of shape {list(given[name].shape)}, this model needs "
+                f"{list(own[name])}; it belongs to another model or head model"
             )
-    module.load_state_dict({name.removeprefix("model."): value for name, value in given.items()})

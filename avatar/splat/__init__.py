@@ -11,14 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.splat.counters import Counters
-from avatar.splat.cpu import count_cpu, splat_cpu
+from avatar.splat.cpu import CannotDraw, count_cpu, splat_cpu
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["Counters", "counters", "splat"]
+__all__ = ["CannotDraw", "Counters", "counters", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
@@ -62,8 +62,8 @@ def splat(
     zero quaternion is the identity, with zero gradient. The sign of a scale has no effect.
 
     The image and alpha of the "cpu" backend are the same to the last bit for any number of threads.
-    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device, for non-finite values
-    (with count and first index), for colours that overflow, and for scenes beyond the kernel's stated limits.
+    Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
+    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits.
     """
     options = _checked_options(
         gaussians,
@@ -80,7 +80,10 @@ def splat(
         region=region,
     )
     if backend == "reference":
-        check_finite(**gaussians._asdict(), background=background)
+        try:
+            check_finite(**gaussians._asdict(), background=background)
+        except ValueError as error:
+            raise CannotDraw(str(error)) from None
         return splat_reference(gaussians, camera, background, **options)
     return splat_cpu(gaussians, camera, background, **options)
 

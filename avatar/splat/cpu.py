@@ -13,8 +13,12 @@ from avatar import _core
 from avatar.compute.native import instruction_set, thread_count
 from avatar.splat.counters import Counters
 from avatar.splat.region import Region
-from avatar.tensors import check_finite
+from avatar.tensors import describe_non_finite
 from avatar.types import Camera, Gaussians, Rendering
+
+
+class CannotDraw(ValueError):
+    """The values of the Gaussians are at fault: one is not finite, a colour overflows, or they are too large."""
 
 
 def splat_cpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
@@ -69,11 +73,16 @@ def _draw(
 ) -> tuple[Tensor, Tensor, _core.Drawing]:
     image = torch.empty((*size, 3), dtype=torch.float32)
     alpha = torch.empty(size, dtype=torch.float32)
-    drawing = _core.splat_forward(
-        **gaussians._asdict(), background=background.contiguous(), **settings, image=image, alpha=alpha
-    )
+    try:
+        drawing = _core.splat_forward(
+            **gaussians._asdict(), background=background.contiguous(), **settings, image=image, alpha=alpha
+        )
+    except ValueError as error:  # colours that overflow, too many splats to a tile; types and shapes are checked before
+        raise CannotDraw(str(error)) from None
     if drawing is None:
-        check_finite(**gaussians._asdict(), background=background)
+        for name, tensor in {**gaussians._asdict(), "background": background}.items():
+            if message := describe_non_finite(name, tensor):
+                raise CannotDraw(message)
         raise AssertionError("the kernel found a value that is not finite")
     return image, alpha, drawing
 

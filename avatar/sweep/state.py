@@ -22,6 +22,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.sweep.spec import Job, Resources, Spec
 
+SWEEP_FILE = "sweep.json"
 SWEEP_FORMAT = 1
 HEARTBEAT_SECONDS = 5.0
 SILENT_SECONDS = 60.0  # after which a running job counts as lost: its worker was killed, or its machine is gone
@@ -43,7 +44,7 @@ class State:
 
 def write_sweep(folder: Path, spec: Spec) -> None:
     """Write the jobs that are not there yet. Raises UserError for a folder that holds another sweep's jobs."""
-    known = {job.name: job for job in read_jobs(folder)} if (folder / "sweep.json").is_file() else {}
+    known = {job.name: job for job in read_jobs(folder)} if (folder / SWEEP_FILE).is_file() else {}
     for job in spec.jobs:
         if job.name in known and known[job.name] != job:
             raise UserError(
@@ -58,12 +59,12 @@ def write_sweep(folder: Path, spec: Spec) -> None:
         "resources": asdict(spec.resources),
         "retries": spec.retries,
     }
-    write_atomically(folder / "sweep.json", json.dumps(content, indent=1).encode())
+    write_atomically(folder / SWEEP_FILE, json.dumps(content, indent=1).encode())
 
 
 def read_sweep(folder: Path) -> Spec:
     """The sweep in a folder. Raises UserError where there is none."""
-    raw = _read_json(folder / "sweep.json", f"{folder} holds no sweep; start one with avatar sweep SPEC.yaml --out")
+    raw = _read_json(folder / SWEEP_FILE, f"{folder} holds no sweep; start one with avatar sweep SPEC.yaml --out")
     if raw.get("format") != SWEEP_FORMAT:
         raise UserError(f"{folder / 'sweep.json'} was written by another version of this program; start a new sweep")
     try:

@@ -43,13 +43,16 @@ class Cost:
 
 
 def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"], frames: int, config: Config) -> Cost:
-    """Train an avatar of this head on one of its frames for a few steps, and throw it away; the video has `frames`."""
+    """Train an avatar of this head on one of its frames for a few steps, and throw it away; the video has `frames`.
+
+    Raises UserError for frames that are too small to train on.
+    """
     torch.manual_seed(config.trainer.seed)
     avatar = Avatar(assets, identity, config.model)
     optimizer = make_optimizer(avatar, config.trainer)
-    objective = Objective(
-        config.trainer, torch.tensor(config.data.background), choose_perceptual(config.trainer, lambda _: None)
-    )
+    size = frame.camera.width, frame.camera.height
+    term = choose_perceptual(config.trainer, lambda _: None, size=size)
+    objective = Objective(config.trainer, torch.tensor(config.data.background), term)
     vertices = avatar.head.vertices(frame.params)
     seconds = []
     last = config.trainer.iterations - 1  # when all of the loss and of the colour takes part

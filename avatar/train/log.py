@@ -45,7 +45,10 @@ class TrainingLog:
             for name, term in loss._asdict().items():
                 self._writer.add_scalar(f"loss/{name}", float(term.detach()), step)
             self._writer.add_scalar("train/psnr", value, step)
-        self._bar.set_postfix(loss=f"{self._loss:.5f}", psnr=f"{self._psnr:.2f}", refresh=False)
+        shown = {"loss": f"{self._loss:.5f}"}
+        if not math.isnan(self._psnr):  # none is measured before the first step that is logged
+            shown["psnr"] = f"{self._psnr:.2f}"
+        self._bar.set_postfix(shown, refresh=False)
 
     def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, cast
@@ -12,10 +13,12 @@ from torch import Tensor
 
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.losses.lpips import Net, load_lpips
+from avatar.losses.lpips import load_lpips
+from avatar.losses.lpips_network import MIN_SIZE, Net
+from avatar.losses.metrics import SSIM_WINDOW
 from avatar.losses.photometric import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
 from avatar.model import Avatar
-from avatar.splat import splat
+from avatar.splat import CannotDraw, splat
 from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
 from avatar.types import Frame, Gaussians
@@ -93,10 +96,14 @@ def training_step(
 ) -> Outcome:
     """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`.
 
-    Raises UserError, leaving the parameters as they were, when the loss or a gradient is not finite.
+    Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
+    is not finite.
     """
     target = frame.composite(objective.background)
-    image = objective.draw(step, frame, avatar(frame.params, vertices), avatar.config.sh_degree)
+    try:
+        image = objective.draw(step, frame, avatar(frame.params, vertices), avatar.config.sh_degree)
+    except CannotDraw as error:
+        raise stopped(step + 1, frame, str(error)) from error
     loss = objective.loss(step, frame, image, target)
     optimizer.zero_grad()
     loss.total.backward()
@@ -106,18 +113,29 @@ def training_step(
     return Outcome(loss, image.detach(), target)
 
 
-def choose_perceptual(config: TrainerConfig, say: Callable[[str], None], recorded: str | None = None) -> PerceptualTerm:
+def choose_perceptual(
+    config: TrainerConfig,
+    say: Callable[[str], None],
+    recorded: str | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+) -> PerceptualTerm:
     """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
 
-    `recorded` is the name of what a run began with, which it keeps whatever this machine has. Raises UserError when LPIPS
-    is asked for by name, or recorded, and cannot be had.
+    `recorded` is the name of what a run began with, which it keeps whatever this machine has. `size` is that of the frames
+    (width, height), where it is known: LPIPS needs 32 pixels a side, SSIM 11. Raises UserError when LPIPS is asked for by
+    name, or recorded, and cannot be had, and for frames that are too small.
     """
+    if size is not None and min(size) < SSIM_WINDOW:
+        raise UserError(too_small("SSIM, which training and evaluation compare by,", SSIM_WINDOW, size))
     if config.perceptual == "none":
         return PerceptualTerm("none")
     in_its_place = Weighted(dssim, config.dssim_weight)
     lpips_name = f"lpips-{config.lpips_net}"
     if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
         try:
+            if size is not None and min(size) < MIN_SIZE:
+                raise UserError(too_small("LPIPS", MIN_SIZE, size))
             lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips")
             function = masked_lpips(lpips) if config.lpips_region == "frame" else on_head(masked_lpips(lpips))
             term = Weighted(function, config.perceptual_weight)
@@ -131,6 +149,15 @@ def choose_perceptual(config: TrainerConfig, say: Callable[[str], None], recorde
     return PerceptualTerm("dssim", in_its_place)
 
 
+def too_small(term: str, side: int, size: tuple[int, int]) -> str:
+    width, height = size
+    enough = math.ceil(side * max(1.0, width / (height - 0.5)))  # the height is rounded
+    return (
+        f"{term} needs frames of at least {side}x{side} pixels, these have {width}x{height}; train with --size {enough} or "
+        "more"
+    )
+
+
 def check_step(step: int, frame: Frame, loss: PhotometricLoss, avatar: Avatar) -> None:
     """Stop before the optimizer when the loss or a gradient is not finite, naming the step, the frame and the tensor."""
     gradients: dict[str, Tensor] = {n: p.grad for n, p in avatar.named_parameters() if p.grad is not None}
@@ -141,9 +168,15 @@ def check_step(step: int, frame: Frame, loss: PhotometricLoss, avatar: Avatar) -
     suspects |= {f"the gradient of {n}": g for n, g in gradients.items()}
     for name, tensor in suspects.items():
         if message := describe_non_finite(name, tensor.detach()):
-            raise UserError(
-                f"training stopped at step {step + 1}, frame {frame.name}: {message}; the last checkpoint is untouched, "
-                "go on from it with --resume and lower learning rates, or leave the frame out"
-            )
+            raise stopped(step + 1, frame, message)
     # Every value is finite but a norm overflows float32: as useless to Adam as a NaN.
-    raise UserError(f"training stopped at step {step + 1}, frame {frame.name}: a gradient's norm is beyond float32")
+    largest = max(gradients, key=lambda name: float(gradients[name].abs().max()))
+    raise stopped(step + 1, frame, f"the norm of the gradient of {largest} is beyond float32")
+
+
+def stopped(step: int, frame: Frame, problem: str) -> UserError:
+    """What is said when the parameters have left what can be computed with; `step` counts from 1."""
+    return UserError(
+        f"training stopped at step {step}, frame {frame.name}: {problem}; what was saved before is untouched. Train "
+        "again into another --out with lower trainer.learning_rates, or without that frame"
+    )

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,13 +14,14 @@ from avatar.model import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
-from avatar.splat import splat
+from avatar.splat import CannotDraw, splat
 from avatar.train.colours import colour_from_frames
+from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
 from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.posed import PosedMeshes
-from avatar.train.step import Objective, PerceptualTerm, training_step
+from avatar.train.step import Objective, PerceptualTerm, stopped, training_step
 
 
 def train(
@@ -41,8 +36,8 @@ def train(
     """Train `avatar` on the subject's training frames and write checkpoints, avatar file, curves and previews into `run`.
 
     Returns the number of steps done when it ends, which is less than `trainer.iterations` after an interruption (Ctrl-C
-    or SIGTERM; the state is saved first). Raises UserError, leaving the last good checkpoint, when a loss or gradient is
-    not finite.
+    or SIGTERM; the state is saved first). Raises UserError, leaving the last good checkpoint, when the avatar cannot be
+    drawn any more or a loss or gradient is not finite.
     """
     trainer = config.trainer
     optimizer = make_optimizer(avatar, trainer)
@@ -84,7 +79,7 @@ def train(
             step += 1
             log.step(step, outcome.loss, outcome.render, outcome.target)
             if step % trainer.preview_every == 0 or step == trainer.iterations:
-                log.preview(step, *render_held_out(avatar, loader, subject, background))
+                log.preview(step, *render_held_out(avatar, loader, subject, background, step))
             if step % trainer.checkpoint_every == 0 or step == trainer.iterations:
                 save(step)
                 saved = step
@@ -106,33 +101,12 @@ def leave_avatar(
 
 
 @torch.no_grad()
-def render_held_out(avatar: Avatar, loader: FrameLoader, subject: Subject, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Truth and render of the first held-out frame."""
+def render_held_out(
+    avatar: Avatar, loader: FrameLoader, subject: Subject, background: Tensor, step: int
+) -> tuple[Tensor, Tensor]:
+    """Truth and render of the first held-out frame after `step` steps. Raises UserError when it cannot be drawn."""
     frame = next(iter(loader.frames([subject.split.test[0]])))
-    return frame.composite(background), splat(avatar(frame.params), frame.camera, background).image
-
-
-@contextmanager
-def interruption() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a flag that the loop reads between steps; a second one acts at once.
-
-    A signal that is ignored (a job in the background of a shell, nohup) stays ignored, and outside the main thread the
-    signals are somebody else's.
-    """
-    caught = False
-    previous: dict[int, Any] = {}
-
-    def note(number: int, _: FrameType | None) -> None:
-        nonlocal caught
-        caught = True
-        signal.signal(number, previous[number])
-
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) != signal.SIG_IGN:
-                previous[number] = signal.signal(number, note)
     try:
-        yield lambda: caught
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        return frame.composite(background), splat(avatar(frame.params), frame.camera, background).image
+    except CannotDraw as error:
+        raise stopped(step, frame, str(error)) from error

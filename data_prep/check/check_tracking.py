@@ -183,7 +183,8 @@ def _jumps(clip: Clip) -> list[Finding]:
         if not jumping:
             continue
         worst = numbers[int(np.nanargmax(values))]
-        size = f"{np.nanmax(values):.1f} {unit}".strip()
+        largest = float(np.nanmax(values))
+        size = f"{largest:{'.1f' if largest < 1e5 else '.1e'}} {unit}".strip()
         findings.append(
             Finding(
                 "warning",

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avatar.bench import transfer
 from avatar.cli import main
 from avatar.demo.head import demo_head
 from avatar.demo.subject import make_subject, tracking_bias
@@ -18,11 +19,14 @@ def test_quick_run_prints_a_table_and_writes_figures(tmp_path: Path, capsys: pyt
     assert main(["bench", "transfer", "--quick", "--out", str(tmp_path)]) == 0
     written = json.loads((tmp_path / "bench_transfer.json").read_text())
     rows = {row["transfer"]: row for row in written["rows"]}
+    assert {row["tracking"] for row in written["rows"]} == {"as given"}
     assert set(rows) == {"raw", "relative", "mean", "pca", "true motion"}
     assert all(row["full"] > row["head"] > 10.0 for row in rows.values()), "the avatar is not where the truth is"
     printed = capsys.readouterr().out
     assert all(f"{row['full']:.2f}" in printed for row in rows.values())
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["bench_transfer.json"], "the scratch folder is gone"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bench_transfer.json", "bench_transfer.md"], (
+        "the scratch folder is gone"
+    )
 
 
 def test_the_bias_is_a_persons_own_and_shape_makes_up_for_most_of_it(tmp_path: Path) -> None:
@@ -37,3 +41,11 @@ def test_the_bias_is_a_persons_own_and_shape_makes_up_for_most_of_it(tmp_path: P
     assert not still.expression.any() and not still.shape.any()
     with pytest.raises(UserError, match="neutral_bias must be from 0 to 1"):
         make_subject(tmp_path / "x", 1, 64, neutral_bias=2.0)
+
+
+@pytest.mark.slow
+def test_avatars_of_disturbed_and_refined_tracking_are_driven_too(tmp_path: Path) -> None:
+    rows = transfer.measure(transfer.QUICK, tmp_path, ["trainer.iterations=40"], transfer.TRACKINGS)
+    by_tracking = {row.tracking: row for row in rows if row.transfer == "relative"}
+    assert tuple(by_tracking) == transfer.TRACKINGS
+    assert len({row.head for row in by_tracking.values()}) == 3

@@ -2,50 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import io
 import json
-import shutil
 import signal
 import subprocess
 import sys
 import time
-import urllib.error
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
-from avatar.cli import main
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
-
-QUICK = [*SMALL, "trainer.iterations=16"]
-
-
-def avatar(*arguments: object, status: int = 0) -> str:
-    """Run `avatar ...` in this process; returns stdout and stderr together after checking the exit status."""
-    output = io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-        try:
-            returned = main([str(argument) for argument in arguments])
-        except SystemExit as stop:  # argparse: --help, --version, usage
-            returned = int(stop.code or 0)
-    assert returned == status, output.getvalue()
-    return output.getvalue()
-
-
-@pytest.fixture(scope="module")
-def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("runs") / "run"
-    output = avatar("train", tracked_folder, "--out", run, "--frame-offset", 1, "--size", 40, "--seed", 3, *QUICK)
-    assert "16/16" in output and "loss=" in output and "psnr=" in output
-    assert f"avatar eval {run}" in output
-    return run
 
 
 def test_help_and_version_answer_for_every_command() -> None:
@@ -138,6 +111,8 @@ def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, dr
         "smoothing": 1.5,
         "camera": "driver",
         "intrinsics": "target",
+        "neutral": None,
+        "driver_neutral": None,
     }
     assert recorded["driver"] == {"name": "driver", "frames": 8, "fps": 25.0, "has_cameras": True}
     assert recorded["intrinsics"]["shown"]["fx"] == recorded["intrinsics"]["avatar"]["fx"]
@@ -223,115 +198,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tracked_folder: Path, tmp_path: Path
     assert process.returncode == 130
     step = newest_checkpoint(run).step
     assert f"Interrupted at step {step}" in output and "Add --resume" in output
-
-
-def fresh_copy(trained: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(trained, tmp_path / "run"))
-
-
-def _no_network(*_: object, **__: object) -> None:
-    raise urllib.error.URLError("no network")
-
-
-MISTAKES = {
-    "no such folder": (["train", "{tmp}/nothing"], "nothing is not a folder; give the tracked video folder"),
-    "no head model": (["train", "{tmp}"], "no head model for {tmp}: give --head PATH, or set AVATAR_HEAD"),
-    "head model gone": (["train", "{data}", "--head", "{tmp}/x.pkl"], "x.pkl does not exist; give --head"),
-    "unknown key": (["train", "{data}", "trainer.iteration=5"], "the nearest is 'trainer.iterations'"),
-    "bad size": (["train", "{data}", "--size", "3"], "data.size=3 is out of range"),
-    "no iterations": (["train", "{data}", "--iterations", "0"], "trainer.iterations=0 is out of range"),
-    "run exists": (["train", "{data}", "--out", "{run}"], "holds a run already: add --resume"),
-    "nothing to resume": (["train", "{data}", "--out", "{tmp}/new", "--resume"], "is not a run folder"),
-    "resume with another key": (
-        ["train", "{data}", "--out", "{run}", "--resume", "model.latent_dim=4"],
-        "began with model.latent_dim=8, not 4",
-    ),
-    "resume of other data": (
-        ["train", "{twin}", "--out", "{run}", "--resume"],
-        "the data of twin is not what {run} was trained on",
-    ),
-    "eval of no run": (["eval", "{tmp}"], "is not a run folder: it has no run.json"),
-    "reenactment of no avatar": (["reenact", "{tmp}", "--driver", "{data}"], "is neither a run nor an avatar file"),
-    "reenactment of a missing avatar": (["reenact", "{tmp}/x", "--driver", "{data}"], "there is no avatar file"),
-    "eval with another head": (["eval", "{run}", "--head", "{other}/head_model"], "trained with another head model"),
-    "unknown protocol": (["eval", "{run}", "--protocol", "paper"], "paper"),
-    "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody is not a folder"),
-    "driver of another head": (
-        ["reenact", "{run}", "--driver", "{other}", "--frame-offset", "1"],
-        "was tracked with another head model",
-    ),
-    "LPIPS without weights": (
-        ["train", "{data}", "--frame-offset", "1", "--out", "{tmp}/l", "trainer.perceptual=lpips", *QUICK],
-        "fetch it by other means to",
-    ),
-}
-
-
-@pytest.fixture(scope="module")
-def other_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A driver whose head model has another expression basis."""
-    return write_tracked_folder(tmp_path_factory.mktemp("other") / "other", frames=6, size=48, expressions=12)
-
-
-@pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Another video of the same head model."""
-    return write_tracked_folder(tmp_path_factory.mktemp("twin") / "twin", frames=30, size=48, seed=9)
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_gets_one_sentence_and_a_status(
-    mistake: str,
-    trained: Path,
-    tracked_folder: Path,
-    other_head: Path,
-    twin: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    arguments, sentence = MISTAKES[mistake]
-    places = {"tmp": tmp_path, "data": tracked_folder, "run": trained, "other": other_head, "twin": twin}
-    monkeypatch.setattr("urllib.request.urlopen", _no_network)
-    output = avatar(*(a.format(**places) for a in arguments), status=1)
-    assert sentence.format(**places) in output
-    assert output.strip().splitlines()[-1].startswith("avatar: ")
-
-
-def test_a_run_without_a_checkpoint_is_not_evaluated(trained: Path, tmp_path: Path) -> None:
-    run = fresh_copy(trained, tmp_path)
-    (run / "avatar.safetensors").unlink()
-    assert "no checkpoint has been written yet" in avatar("eval", run, status=1)
-
-
-def test_a_damaged_checkpoint_is_named(trained: Path, tracked_folder: Path, tmp_path: Path) -> None:
-    run = fresh_copy(trained, tmp_path)
-    newest = list_checkpoints(run / "checkpoints")[-1]
-    newest.write_bytes(newest.read_bytes()[:1000])
-    assert f"{newest.name} is damaged" in avatar("train", tracked_folder, "--out", run, "--resume", status=1)
-    newest.unlink()
-    output = avatar("train", tracked_folder, "--out", run, "--resume")  # the one before is whole
-    assert "Resuming" in output and "at step 12 of 16" in output
-
-
-def test_a_damaged_avatar_file_is_named_and_resuming_writes_it_again(
-    trained: Path, tracked_folder: Path, tmp_path: Path
-) -> None:
-    run = fresh_copy(trained, tmp_path)
-    file = run / "avatar.safetensors"
-    whole = file.read_bytes()
-    file.write_bytes(whole[:1000])
-    assert "avatar.safetensors is damaged" in avatar("eval", run, status=1)
-    assert "is complete (16 steps)" in avatar("train", tracked_folder, "--out", run, "--resume")
-    assert file.read_bytes() == whole
-
-
-def test_data_that_changed_since_training_is_noticed(tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "someone", frames=12, size=48)
-    run = tmp_path / "run"
-    avatar("train", folder, "--out", run, "--frame-offset", 1, *SMALL, "trainer.iterations=2")
-    image = folder / "imgs" / "00003.jpg"
-    image.write_bytes((folder / "imgs" / "00004.jpg").read_bytes())
-    assert "the data of someone is not what" in avatar("eval", run, status=1)
 
 
 def test_prepare_says_what_it_found(tracked_folder: Path, tmp_path: Path) -> None:

@@ -64,10 +64,11 @@ CHANGES = {
     "no frames": (("frames: held-out", "frames: 0"), "frames is 0, and has to be held-out, or how many frames"),
     "frames as a flag": (("frames: held-out", "frames: true"), "frames is True"),
     "an unknown colour": (
-        ("background: white", "background: blue"),
-        "background is 'blue', and has to be white, green",
+        ("background: white", "background: purple"),
+        "background is 'purple', and has to be a colour: white, black",
     ),
     "two channels": (("background: white", "background: [1, 0]"), "background is [1, 0]"),
+    "a colour without quotes": (("background: white", "background: #00ff00"), "and has to be a colour"),
     "a colour out of range": (("background: white", "background: [1, 0, 255]"), "three numbers from 0 to 1"),
     "not a number": (("background: white", "background: [1, 0, .nan]"), "three numbers from 0 to 1"),
     "an unknown mask": (("mask: none", "mask: head"), "mask is 'head', and has to be one of multiply, none, only"),
@@ -117,6 +118,15 @@ def test_files_that_are_no_protocols(tmp_path: Path) -> None:
     odd.write_text(builtin_protocols()["strict"].read_text())
     with pytest.raises(UserError, match="use letters, digits"):
         read_protocol(odd)
+
+
+@pytest.mark.parametrize(
+    ("written", "colour"), [("blue", (0, 0, 1)), ('"#00ff00"', (0, 1, 0)), ("[1, 0, 0]", (1, 0, 0))]
+)
+def test_a_background_is_written_as_everywhere_else(written: str, colour: tuple[float, ...], tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(builtin_protocols()["strict"].read_text().replace("background: white", f"background: {written}"))
+    assert read_protocol(path).background == colour
 
 
 def test_every_choice_can_be_made(tmp_path: Path) -> None:

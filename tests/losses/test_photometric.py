@@ -98,12 +98,34 @@ def test_the_heads_box_weighs_what_the_whole_frame_does() -> None:
         return (((a - b) * m[..., None]) ** 2).mean()
 
     whole = mean_error(image, target, head)
-    torch.testing.assert_close(on_head(mean_error, margin=3)(image, target, head), whole)
+    torch.testing.assert_close(on_head(mean_error, margin=3, least=0)(image, target, head), whole)
     assert seen == [(24, 31), (14, 14)]
     leaf = image.clone().requires_grad_()
     nothing = on_head(mean_error)(leaf, target, torch.zeros(24, 31, dtype=torch.float64))
     (gradient,) = torch.autograd.grad(nothing, leaf)
     assert nothing.item() == 0.0 and not gradient.any()
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (70, 20), (97, 60)])
+def test_a_head_far_away_gets_a_box_that_lpips_can_see(corner: tuple[int, int]) -> None:
+    """3x4 pixels in a frame of 100x64, in a corner of it or not: a box of 32x32 with the head in it, weighed as before."""
+    head = torch.zeros(100, 64)
+    row, column = corner
+    head[row : row + 3, column : column + 4] = 1.0
+    image, target = torch.rand(100, 64, 3), torch.rand(100, 64, 3)
+    seen = []
+
+    def mean_error(a, b, m):
+        seen.append((tuple(m.shape), float(m.sum())))
+        return (((a - b) * m[..., None]) ** 2).mean()
+
+    whole = mean_error(image, target, head)
+    torch.testing.assert_close(on_head(mean_error, margin=2)(image, target, head), whole)
+    assert seen[1] == ((32, 32), 12.0)
+    leaf = image.clone().requires_grad_()
+    with torch.enable_grad():
+        on_head(masked_lpips(Lpips("squeeze")), margin=2)(leaf, target, head).backward()
+    assert leaf.grad is not None and bool(leaf.grad.isfinite().all()) and bool(leaf.grad.any())
 
 
 def test_a_network_sees_in_the_heads_box_nearly_what_it_sees_in_the_frame() -> None:

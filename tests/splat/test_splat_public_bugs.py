@@ -22,6 +22,7 @@ from splat.scenes import (
 )
 
 from avatar import _core
+from avatar.splat import CannotDraw
 from avatar.types import Gaussians
 
 BACKENDS = ["cpu", "reference"]
@@ -295,5 +296,5 @@ def test_a_colour_that_overflows_is_named() -> None:
     g = random_gaussians(9)
     sh = g.sh.clone()
     sh[7] = 3e38
-    with pytest.raises(ValueError, match="sh gives splat 7 a colour beyond the range of float32"):
+    with pytest.raises(CannotDraw, match="sh gives splat 7 a colour beyond the range of float32"):
         render(Scene(g._replace(sh=sh, means=g.means * 0.1), camera(20, 20)))

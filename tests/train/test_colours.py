@@ -3,11 +3,17 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
+from heads import grid_head, rest_params
 from small_runs import new_avatar, open_small, small_config
 
+from avatar.model import Avatar
 from avatar.splat.sh import C0
+from avatar.train import colours as colours_module
 from avatar.train.colours import colour_from_frames, sample, seen_colours
+from avatar.types import Camera, Frame
 
 
 def test_a_head_of_one_colour_gives_that_colour_where_it_is_seen(tracked_folder: Path) -> None:
@@ -50,3 +56,94 @@ def test_nothing_is_sampled_outside_the_image_or_in_the_cameras_plane() -> None:
     )
     expected = torch.tensor([1.0, 12.0, 2.5, 0.0, 0.0, 0.0])
     torch.testing.assert_close(sample(image, points, "bilinear")[:, 0], expected, rtol=0, atol=1e-5)
+
+
+def two_sheets(apart: float) -> tuple[Avatar, Frame]:
+    """A flat sheet of 20 x 20 cm that faces the camera at 1 m, and another one `apart` metres behind it, of another colour.
+
+    Half of the Gaussians, the first, lie on the front sheet; the picture shows a gradient, so that places differ.
+    """
+    sheet = grid_head()
+    V = sheet.num_vertices
+    flat = sheet.template * torch.tensor([1.0, 1.0, 0.0])
+    behind = flat * 0.9 - torch.tensor([0.0, 0.0, apart])
+    left, right = sheet.uvs * torch.tensor([0.5, 1.0]), sheet.uvs * torch.tensor([0.5, 1.0]) + torch.tensor([0.5, 0.0])
+    assets = replace(
+        sheet,
+        template=torch.cat((flat, behind)),
+        faces=torch.cat((sheet.faces, sheet.faces + V)),
+        shape_dirs=torch.zeros(2 * V, 3, 300),
+        expression_dirs=torch.zeros(2 * V, 3, 5),
+        pose_dirs=torch.zeros(2 * V, 3, 36),
+        joint_regressor=torch.full((5, 2 * V), 0.5 / V),
+        weights=sheet.weights.repeat(2, 1),
+        eyelid_dirs=torch.zeros(2, 2 * V, 3),
+        uvs=torch.cat((left, right)),
+        uv_faces=torch.cat((sheet.uv_faces, sheet.uv_faces + len(sheet.uvs))),
+        regions={},
+    )
+    avatar = Avatar(assets, torch.zeros(0), small_config().model)
+    camera = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0, 1]), 400, 400, 64, 64, 128, 128)
+    ones = torch.ones(128, 128)
+    ramp = torch.linspace(0, 1, 128).expand(128, 128)[..., None].repeat(1, 1, 3)
+    return avatar, Frame(0, "00000", camera, rest_params(), ramp, ones, ones, ones)
+
+
+def on_back(avatar: Avatar) -> torch.Tensor:
+    return avatar.embedding.corners[:, 0] >= avatar.head.assets.num_vertices // 2
+
+
+def test_what_another_surface_hides_has_no_colour() -> None:
+    avatar, frame = two_sheets(apart=0.02)
+    _, seen = seen_colours(avatar, frame)
+    back = on_back(avatar)
+    assert bool((seen[~back] > 0.9).all()), "the front sheet is seen, nearly from straight ahead"
+    assert bool((seen[back] == 0).all()), "the sheet behind it is hidden, though it faces the camera too"
+
+
+def test_what_lies_a_little_under_the_surface_counts_as_seen() -> None:
+    """Lids and lips lie on each other; a raster's depth is no more exact than a pixel."""
+    avatar, frame = two_sheets(apart=0.001)
+    assert bool((seen_colours(avatar, frame)[1] > 0.9).all())
+
+
+def test_a_place_counts_by_the_square_of_the_cosine_under_which_it_is_seen(tracked_folder: Path) -> None:
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar = new_avatar(assets, subject, config)
+    frame = subject.frame(0)
+    whole = torch.ones_like(frame.alpha)
+    _, seen = seen_colours(avatar, replace(frame, alpha=whole, head_mask=whole))
+    vertices = avatar.head.vertices(frame.params).double().numpy()
+    a, b, c = vertices[avatar.embedding.corners.numpy()].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    eye = -frame.camera.R_cam_world.double().numpy().T @ frame.camera.t_cam_world.double().numpy()
+    sight = eye - avatar.embedding.points(avatar.head.vertices(frame.params)).double().numpy()
+    cosine = (normals * sight).sum(1) / np.linalg.norm(normals, axis=1) / np.linalg.norm(sight, axis=1)
+    shown = seen.numpy() > 0
+    assert cosine[shown].min() < 0.5 < 0.9 < cosine[shown].max(), "no slants to tell from"
+    np.testing.assert_allclose(seen.numpy()[shown], cosine[shown] ** 2, atol=1e-4)
+
+
+def test_several_frames_are_averaged_by_how_well_they_show_a_place(
+    tracked_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar = new_avatar(assets, subject, config)
+    N = len(avatar)
+    looks = iter([(torch.full((N, 3), 0.2), torch.full((N,), 0.25)), (torch.full((N, 3), 0.6), torch.full((N,), 0.75))])
+    monkeypatch.setattr(colours_module, "seen_colours", lambda *_: next(looks))
+    assert colour_from_frames(avatar, subject, None, frames=2) == N
+    torch.testing.assert_close(avatar.sh_dc[:, 0] * C0 + 0.5, torch.full((N, 3), 0.5))
+
+
+def test_the_matte_and_the_head_mask_are_weights(tracked_folder: Path) -> None:
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar = new_avatar(assets, subject, config)
+    frame = subject.frame(0)
+    whole, half = torch.ones_like(frame.alpha), torch.full_like(frame.alpha, 0.5)
+    _, full = seen_colours(avatar, replace(frame, alpha=whole, head_mask=whole))
+    _, less = seen_colours(avatar, replace(frame, alpha=half, head_mask=half))
+    torch.testing.assert_close(less, 0.25 * full)

@@ -12,6 +12,7 @@ from small_runs import new_avatar, open_small, small_config, train_small
 from avatar.errors import UserError
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
+from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
@@ -153,6 +154,62 @@ def test_a_gradient_that_is_not_finite_stops_and_leaves_the_last_checkpoint(
     files = list_checkpoints(tmp_path / "run" / "checkpoints")
     assert [load_checkpoint(p).step for p in files] == [4]
     assert bool(torch.isfinite(avatar.opacity_logits).all()), "the optimizer ran on the bad gradient"
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, avatar: Avatar, tensor: str, value: float, at: int) -> None:
+    """Let one Gaussian's values of a parameter become `value` in the update of step `at`."""
+    log_step = trainer_module.TrainingLog.step
+
+    def spoiling(self, step, loss, render, truth) -> None:
+        log_step(self, step, loss, render, truth)
+        if step == at:
+            avatar.get_parameter(tensor).data[3] = value
+
+    monkeypatch.setattr(trainer_module.TrainingLog, "step", spoiling)
+
+
+@pytest.mark.parametrize(
+    ("tensor", "value", "problem"),
+    [
+        ("log_scales", 100.0, "scales has 3 non-finite of"),
+        ("sh_rest", float("inf"), "sh has 45 non-finite of"),
+        ("quats", float("nan"), "quats has 4 non-finite of"),
+        ("opacity_logits", float("nan"), "opacities has 1 non-finite of"),
+    ],
+)
+@pytest.mark.parametrize(("at", "stops"), [(6, 7), (8, 8)])  # in the next step, or in the preview
+def test_a_parameter_that_overflows_stops_with_step_frame_and_tensor(
+    tracked_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tensor: str,
+    value: float,
+    problem: str,
+    at: int,
+    stops: int,
+) -> None:
+    config = small_config("trainer.perceptual=none", "trainer.preview_every=8", "trainer.checkpoint_every=4")
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar = new_avatar(assets, subject, config)
+    spoil(monkeypatch, avatar, tensor, value, at)
+    with pytest.raises(UserError) as caught:
+        train(avatar, subject, config, tmp_path / "run", PerceptualTerm("none"))
+    message = str(caught.value)
+    assert f"training stopped at step {stops}, frame 000" in message and problem in message
+    assert "lower trainer.learning_rates" in message
+    assert [load_checkpoint(p).step for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == [4]
+
+
+def test_a_learning_rate_that_is_far_too_high_ends_in_a_sentence(tracked_folder: Path, tmp_path: Path) -> None:
+    rates = ["trainer.learning_rates.scale=10", "trainer.lr_warmup=0", "trainer.lr_final=1"]
+    with pytest.raises(UserError, match="training stopped at step [0-9]+, frame .* the gradient of [a-z_.]+ "):
+        train_small(tracked_folder, tmp_path / "run", [*rates, "trainer.iterations=60"])
+    newest = newest_checkpoint(tmp_path / "run")
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in newest.tensors.values())
+
+
+def test_the_smallest_epsilon_of_adam_works(tracked_folder: Path, tmp_path: Path) -> None:
+    assert train_small(tracked_folder, tmp_path / "run", ["trainer.adam_eps=1e-30"])[1] == 12
 
 
 def test_lpips_by_name_without_weights_fails_before_training(tracked_folder: Path, tmp_path: Path) -> None:

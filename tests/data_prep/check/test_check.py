@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from itertools import pairwise
@@ -137,6 +138,12 @@ DEFECTS: dict[str, tuple[Edit, str, str, str]] = {
         "jumps",
         "expression jumps at",
     ),
+    "position jumps far": (
+        edit_frame(12, opencv__t=lambda t: t + np.full_like(t, 1e15)),
+        "warning",
+        "jumps",
+        "from half-way between its neighbours",
+    ),
     "wide focal length": (every(lambda n: edit_frame(n, opencv__K=set_K(0.1))), "warning", "focal-length", "degrees"),
     "pixels not square": (
         every(lambda n: edit_frame(n, opencv__K=lambda K: K * np.array([[1.05, 1, 1], [1, 1, 1], [1, 1, 1]], "f4"))),
@@ -217,6 +224,13 @@ def test_a_defect_is_found_by_its_check_and_named(defect: str, folder: Path) -> 
     assert {found_name: finding.severity for found_name, finding in found.items()} == expected
     assert all(finding.advice and finding.problem for finding in check.findings)
     assert check.status == max({"note": 0, "warning": 1, "error": 2}[one] for one in expected.values())
+
+
+def test_no_figure_has_more_digits_than_one_can_read(folder: Path) -> None:
+    DEFECTS["position jumps far"][0](folder)
+    problems = [finding.problem for finding in checked(folder).findings]
+    assert any("e+" in problem for problem in problems)
+    assert not any(re.search(r"\d{7}", problem) for problem in problems), problems
 
 
 @pytest.mark.parametrize("case", CASES)

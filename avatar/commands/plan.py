@@ -1,0 +1,122 @@
+"""What `avatar train --refine` began with, and how many steps its time allows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from avatar.commands.opening import split_sizes
+from avatar.commands.training import new_avatar
+from avatar.config import load_config
+from avatar.data.source import Source
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.refine.refine import estimated_seconds
+from avatar.train.cost import measure_cost
+from avatar.train.step import choose_perceptual
+from data_prep.open import open_subject
+
+ROUNDS_FOLDER = "rounds"
+PLAN_FORMAT = 1
+# Of the iterations: an avatar that has seen enough to tell where a head is.
+FIRST_SHARE = 0.4
+LEAST_STEPS = 500  # fewer make no avatar
+
+
+@dataclass(frozen=True)
+class Plan:
+    rounds: int
+    source: Source
+    overrides: tuple[str, ...]  # as they were asked for
+    minutes: float | None  # that all of it may take
+    iterations: int  # of the run itself
+
+    def save(self, run: Path) -> None:
+        content = {
+            "format": PLAN_FORMAT,
+            "rounds": self.rounds,
+            "source": self.source.to_dict(),
+            "overrides": self.overrides,
+            "minutes": self.minutes,
+            "iterations": self.iterations,
+        }
+        write_atomically(plan_file(run), json.dumps(content, indent=1).encode())
+
+    @classmethod
+    def load(cls, run: Path) -> Plan:
+        """Raises UserError for a file that `save` did not write."""
+        path = plan_file(run)
+        try:
+            raw = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise UserError(f"{path} cannot be read ({error})") from None
+        if not isinstance(raw, dict) or raw.get("format") != PLAN_FORMAT:
+            raise UserError(f"{path} was written by another version of this program; start a new run")
+        rounds, overrides, minutes, iterations = (
+            raw.get(key) for key in ("rounds", "overrides", "minutes", "iterations")
+        )
+        if (
+            not isinstance(rounds, int)
+            or not isinstance(iterations, int)
+            or not isinstance(minutes, int | float | None)
+            or not isinstance(overrides, list)
+            or not all(isinstance(o, str) for o in overrides)
+        ):
+            raise UserError(f"{path} is damaged; start a new run")
+        return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations)
+
+    def final_overrides(self) -> list[str]:
+        """Of the run itself."""
+        asked = load_config(self.overrides).trainer.iterations
+        limit = [] if self.iterations == asked else [f"trainer.iterations={self.iterations}"]
+        return [*self.overrides, *limit]
+
+    def round_overrides(self) -> list[str]:
+        """Of the avatars that are only refined through."""
+        return [*self.overrides, f"trainer.iterations={round_steps(self.iterations)}"]
+
+
+def plan_file(run: Path) -> Path:
+    return run / ROUNDS_FOLDER / "plan.json"
+
+
+def round_steps(iterations: int) -> int:
+    return max(1, round(FIRST_SHARE * iterations))
+
+
+def affordable_iterations(seconds: float, step: float, refinement: float, rounds: int) -> int:
+    """Steps of the run itself where each takes `step` seconds and each of the rounds is followed by a `refinement`."""
+    return int((seconds - rounds * refinement) / (step * (1.0 + FIRST_SHARE * rounds)))
+
+
+def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: float | None) -> int:
+    """The configuration's steps, or as many as the minutes allow by what this machine shows on a few.
+
+    Raises UserError where they allow too few.
+    """
+    config = load_config(overrides)
+    asked = config.trainer.iterations
+    if minutes is None:
+        return asked
+    subject, assets = open_subject(source, split_sizes(config), print)
+    term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))
+    avatar = new_avatar(assets, subject, config, term.name)
+    refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
+    frame = subject.frame(subject.split.train[0], config.data.size)
+    step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds
+    able = affordable_iterations(60.0 * minutes, step, refinement, rounds)
+    if able < min(LEAST_STEPS, asked):
+        least = rounds * refinement + min(LEAST_STEPS, asked) * step * (1.0 + FIRST_SHARE * rounds)
+        raise UserError(
+            f"--minutes {minutes:g} is too little for --refine {rounds} of {len(subject)} frames on this machine: it takes "
+            f"about {refinement:.0f} s to refine them and {step:.3f} s a step, so give at least {least / 60:.1f}"
+        )
+    chosen = min(asked, able)
+    print(
+        f"Time         {minutes:g} minutes: about {refinement:.0f} s a refinement and {step:.3f} s a step allow "
+        f"{able:,} steps; {chosen:,} are taken"
+    )
+    return chosen

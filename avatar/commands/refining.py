@@ -1,0 +1,74 @@
+"""avatar refine: tracking made sharper by the avatar itself."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from avatar.commands import INTERRUPTED, OK
+from avatar.commands.opening import open_run
+from avatar.commands.outputs import check_outputs
+from avatar.data.refinement import Refinement, Round
+from avatar.refine.record import frames_csv, sheet, summary
+from avatar.refine.refine import fingerprint, refine_subject
+from avatar.runs.run import Run
+from data_prep.refined import check_target, frame_numbers, write_folder
+
+REFINED_FOLDER = "refined"
+
+
+def run_refine(arguments: Namespace) -> int:
+    run = open_run(arguments.run, arguments.head, arguments.folder)
+    target: Path = arguments.out or arguments.run / REFINED_FOLDER / run.subject.name
+    check_outputs([target], [Path(run.subject.manifest.source)])
+    status = refine_run(run, target)
+    if status == OK:
+        print(f"Next         avatar train {target} --out ANOTHER_RUN")
+    return status
+
+
+def refine_run(run: Run, target: Path) -> int:
+    """Write the run's subject with refined tracking to `target`."""
+    check_target(target)
+    subject, config = run.subject, run.config
+    background = torch.tensor(config.data.background)
+    print(
+        f"Refining {len(subject)} frames of {subject.name} through the avatar of {run.path}, trained on "
+        f"{len(subject.split.train)} of them"
+    )
+    begin = time.monotonic()
+    progress = target.with_name(f".{target.name}.progress.safetensors")
+    refined = refine_subject(run.avatar, subject, config.data.size, background, progress)
+    if refined is None:
+        print(f"\nInterrupted; what is done is saved in {progress}. The same command goes on from there.")
+        return INTERRUPTED
+    seconds = time.monotonic() - begin
+    centre = run.avatar.head.neutral_vertices().mean(dim=0)
+    after = replace(subject.recording, tracks=refined.tracks)
+    extras = {
+        "refinement.csv": frames_csv(subject, refined, centre).encode(),
+        "refinement.png": sheet(run.avatar, subject, refined, after, config.data.size, background),
+    }
+    write_folder(target, subject, refined.tracks, next_refinement(run), extras)
+    print(f"Refined in {seconds:.0f} s ({seconds / len(subject):.3f} s per frame).")
+    print("\n".join(summary(subject, refined, centre)))
+    print(f"Subject      {target}")
+    print(f"Frames       {target / 'refinement.csv'}")
+    print(f"Pictures     {target / 'refinement.png'}")
+    return OK
+
+
+def next_refinement(run: Run) -> Refinement:
+    """What the subject's refinement becomes by one more round through the run's avatar."""
+    subject = run.subject
+    numbers = frame_numbers(subject)
+    trained_on = tuple(sorted(numbers[index] for index in subject.split.train))
+    this = Round(str(run.path.resolve()), run.step, fingerprint(run.avatar), trained_on)
+    before = subject.manifest.refinement
+    if before is None:
+        return Refinement(subject.manifest.format, (this,))
+    return replace(before, rounds=(*before.rounds, this))

@@ -1,0 +1,116 @@
+"""avatar train --refine N: training and refinement in turns, and then the run itself.
+
+RUN/rounds/plan.json      what the rounds began with
+RUN/rounds/1/run          a first, shorter training
+RUN/rounds/1/NAME         the subject, refined through its avatar: what the next round, or the run itself, trains on
+"""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+from avatar.commands import OK, training
+from avatar.commands.opening import open_run, source_of
+from avatar.commands.outputs import check_run_folder
+from avatar.commands.plan import ROUNDS_FOLDER, Plan, plan_file, steps_in_time
+from avatar.commands.refining import refine_run
+from avatar.commands.training import resume_run, train_new
+from avatar.config import load_config
+from avatar.data.source import Source
+from avatar.errors import UserError
+from avatar.files.lock import locked
+from avatar.runs.checkpoint import list_checkpoints
+from avatar.runs.run import RUN_FILE, refuse_trained
+
+MAX_ROUNDS = 10
+
+
+def run_train(arguments: Namespace) -> int:
+    """With rounds where they are asked for, or were when the run began; else `training`."""
+    run = arguments.out or training.default_run(arguments.folder)
+    overrides = training.config_overrides(arguments)
+    if arguments.resume and plan_file(run).exists():
+        plan = Plan.load(run)
+        refuse_changes(run, plan, arguments, overrides)
+        source = moved_source(run, plan.source, arguments)
+        with locked(run / ROUNDS_FOLDER):
+            return train_refined(run, plan, source)
+    if arguments.refine is None:
+        if arguments.minutes is not None:
+            raise UserError("--minutes goes with --refine; without it, say --iterations")
+        return training.run_train(arguments)
+    if arguments.resume:
+        raise UserError(f"{run} began without --refine: leave it out to resume, or start a new run")
+    source = source_of(arguments)
+    check_run_folder(run, [source.folder, source.head, source.tracking])
+    return begin_rounds(run, arguments.refine, arguments.minutes, source, overrides)
+
+
+def begin_rounds(run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str]) -> int:
+    """Raises UserError where the folder holds a run, or rounds, already."""
+    if not 1 <= rounds <= MAX_ROUNDS:
+        raise UserError(f"--refine must be from 1 to {MAX_ROUNDS}, not {rounds}")
+    if minutes is not None and not 0.0 < minutes < float("inf"):
+        raise UserError(f"--minutes must be a positive number, not {minutes:g}")
+    load_config(overrides)  # a mistake in it before one in the folder
+    refuse_trained(run)
+    if plan_file(run).exists():
+        raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")
+    begin = time.monotonic()
+    iterations = steps_in_time(source, overrides, rounds, minutes)
+    plan = Plan(rounds, source, tuple(overrides), minutes, iterations)
+    with locked(run / ROUNDS_FOLDER):
+        plan.save(run)
+        status = train_refined(run, plan, source)
+    if status == OK and minutes is not None:
+        print(f"Time         {(time.monotonic() - begin) / 60:.1f} of {minutes:g} minutes")
+    return status
+
+
+def refuse_changes(run: Path, plan: Plan, arguments: Namespace, overrides: list[str]) -> None:
+    """A resumed run keeps its decisions."""
+    for option, was, now in (
+        ("--refine", plan.rounds, arguments.refine),
+        ("--minutes", plan.minutes, arguments.minutes),
+    ):
+        if now not in (None, was):
+            began = f"without {option}" if was is None else f"with {option} {was:g}"
+            raise UserError(f"{run} began {began}, not {now:g}: leave it out to resume")
+    if overrides and load_config(overrides) != load_config(plan.overrides):
+        began = " ".join(plan.overrides) or "no override"
+        raise UserError(f"{run} began with {began}: leave the overrides out to resume, or start a new run")
+    training.refuse_other_source(run, plan.source, arguments)
+
+
+def moved_source(run: Path, source: Source, arguments: Namespace) -> Source:
+    """The source, at its new place where the folder or the head model has moved. Raises UserError for another folder."""
+    folder, head = arguments.folder, arguments.head
+    if folder is not None and folder.resolve() != source.folder and source.folder.is_dir():
+        raise UserError(f"{run} began on {source.folder}, not on {folder}: leave it out to resume")
+    source = source if folder is None else replace(source, folder=folder.resolve())
+    return source if head is None else replace(source, head=head)
+
+
+def train_refined(run: Path, plan: Plan, source: Source) -> int:
+    """Train, refine, and so on, and at last train the run itself; what is done already is not done again."""
+    name = plan.source.folder.resolve().name
+    for number in range(1, plan.rounds + 1):
+        stage = run / ROUNDS_FOLDER / str(number)
+        if not (stage / name).is_dir():
+            print(f"Round {number} of {plan.rounds}: a first avatar, and the tracking refined through it")
+            status = go_on_or_begin(source, plan.round_overrides(), stage / "run")
+            if status == OK:
+                status = refine_run(open_run(stage / "run", source.head, source.folder), stage / name)
+            if status != OK:
+                return status
+        # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
+        source = replace(source, folder=stage / name, tracking=None, frame_offset=None, format=None, fps=None)
+    return go_on_or_begin(source, plan.final_overrides(), run)
+
+
+def go_on_or_begin(source: Source, overrides: list[str], run: Path) -> int:
+    begun = (run / RUN_FILE).is_file() and list_checkpoints(run / "checkpoints")
+    return resume_run(run, source.head, source.folder) if begun else train_new(source, overrides, run)

@@ -1,0 +1,74 @@
+"""Values of configuration keys: read from what was typed, and checked, with plain words about what is wrong."""
+
+from __future__ import annotations
+
+import types
+from typing import Any, Union, get_args, get_origin
+
+from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
+from avatar.errors import UserError
+
+_CONSTANTS = {"null": None, "~": None, "true": True, "false": False}
+_KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word"}
+
+
+def typed_value(text: str) -> int | float | bool | str | None:
+    """What was typed after `key=`: a number, null, true, false, or else the text itself, without quotes around it."""
+    word = text.strip()
+    if len(word) >= 2 and word[0] == word[-1] and word[0] in "'\"":
+        word = word[1:-1]
+    if word.lower() in _CONSTANTS:
+        return _CONSTANTS[word.lower()]
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            continue
+    return word
+
+
+def checked_value(key: str, value: Any, kind: Any) -> Any:
+    """`value` as the type annotation `kind` of a field of the configuration wants it.
+
+    A number without a fraction counts as whole however it is written (1e3). Raises UserError with what is expected.
+    """
+    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    wanted = next(option for option in options if option is not types.NoneType)
+    if value is None and types.NoneType in options:
+        return None
+    if get_origin(wanted) is tuple:
+        return checked_colour(key, value)
+    if isinstance(value, wanted) and not isinstance(value, bool):
+        return value
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(max(min(value, 10**300), -(10**300)))  # beyond that there is no float; every range refuses it
+    if wanted is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    or_null = ", or null" if types.NoneType in options else ""
+    raise UserError(f"{key}={shown(value)} is not valid: it must be {_KINDS[wanted]}{or_null}")
+
+
+def checked_colour(key: str, value: Any) -> Colour:
+    try:
+        return parse_colour(value)
+    except (ValueError, OverflowError):
+        raise UserError(f"{key}={shown(value)} is not valid: it must be {COLOUR_WORDS}") from None
+
+
+def check_choice(key: str, value: Any, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise UserError(f"{key}={shown(value)} is not one of {', '.join(choices)}")
+
+
+def check_range(key: str, value: float | None, low: float, high: float) -> None:
+    """Raise UserError where `value` is not from `low` to `high`; NaN never is."""
+    if value is not None and not low <= value <= high:
+        raise UserError(f"{key}={shown(value)} is out of range: it must be from {shown(low)} to {shown(high)}")
+
+
+def shown(value: Any) -> str:
+    """A value as it is typed, short enough for a message."""
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
+        value = int(value)
+    text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

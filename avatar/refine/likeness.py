@@ -1,0 +1,170 @@
+"""How well the avatar's picture of a frame fits the frame, as a function of the frame's tracking, with its gradient.
+
+The avatar is drawn with the frame's own camera, which the splatter does not differentiate. Moving a camera is moving the
+head the other way, so the gradient in the head's pose is put together from the splatter's gradients in the Gaussians'
+means and rotations, exactly; colours depend on the direction from which they are seen, and are computed here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import torch
+from jaxtyping import Float
+from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
+from torch import Tensor
+from torch.nn.functional import huber_loss, normalize
+
+from avatar.losses.metrics import bounding_box, psnr
+from avatar.model import Avatar
+from avatar.refine.motion import HeadPose, head_params, moved_pose
+from avatar.splat import splat
+from avatar.splat.sh import C0, sh_colours
+from avatar.types import Camera, Frame, Gaussians
+
+# The squared error of a frame counts as this many independent observations with this standard deviation. Errors of
+# neighbouring pixels come from the same fault of the avatar, so that a picture says far less than its pixels would.
+OBSERVATIONS, PIXEL_SIGMA = 60.0, 0.05
+HUBER_DELTA = 0.1
+MARGIN = 8  # pixels around the head mask: what the avatar paints there is wrong
+BLUR = 0.3  # pixels^2, that the splatter adds in training
+
+
+class Target(NamedTuple):
+    """What the avatar is compared with, at one size."""
+
+    camera: Camera
+    box: tuple[slice, slice]  # rows and columns that are compared
+    picture: Float[Tensor, "h w 3"]  # of the box
+    mask: Float[Tensor, "h w"]  # of the head
+    area: float  # of the head, pixels
+    blur: float  # for the splatter: as much of the scene as the full size's
+
+
+def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Target] | None:
+    """The frame at its own size and at `levels` - 1 halves of it; None where no head is to be seen."""
+    picture, mask = frame.composite(background), frame.head_mask
+    if bounding_box(mask) is None:
+        return None
+    made = []
+    for level in range(levels):
+        width, height = (max(1, side >> level) for side in (frame.camera.width, frame.camera.height))
+        small, head = (_resized(image, width, height) for image in (picture, mask))
+        box = bounding_box(head)
+        assert box is not None  # what is there at full size leaves something in the mean
+        margin = max(1, MARGIN >> level)
+        rows, columns = (
+            slice(max(side.start - margin, 0), min(side.stop + margin, length))
+            for side, length in zip(box, head.shape, strict=True)
+        )
+        camera = frame.camera.resized(width, height)
+        made.append(
+            Target(
+                camera=camera,
+                box=(rows, columns),
+                picture=small[rows, columns].contiguous(),
+                mask=head[rows, columns].contiguous(),
+                area=float(head.sum()),
+                blur=BLUR * (width / frame.camera.width) ** 2,
+            )
+        )
+    return made
+
+
+def _resized(image: Tensor, width: int, height: int) -> Tensor:
+    if image.shape[:2] == (height, width):
+        return image
+    return torch.from_numpy(cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA))
+
+
+def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> float:
+    """Of the head alone, dB."""
+    return float(psnr(picture.clamp(0.0, 1.0), target.picture, target.mask))
+
+
+class Measure(NamedTuple):
+    """Of one frame at one tracking."""
+
+    misfit: float
+    psnr: float  # of the head alone, dB
+
+
+class Fit(NamedTuple):
+    """Of one frame at one tracking."""
+
+    misfit: float
+    gradient: Float[Tensor, " P"]  # of the misfit in the frame's values
+    picture: Float[Tensor, "h w 3"]
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """An avatar that is not trained any more, over a background. Any number of threads may use it."""
+
+    avatar: Avatar
+    background: Float[Tensor, 3]
+    centre: Float[Tensor, 3]  # that the head turns about, metres
+
+    def picture(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, "h w 3"]:
+        """The avatar in the target's box; without a gradient."""
+        with torch.no_grad():
+            pose = moved_pose(values, given, self.centre)
+            gaussians = self.avatar(head_params(values))
+            return self._draw(gaussians, pose, gaussians.sh, target)
+
+    def measure(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Measure:
+        """Without a gradient."""
+        picture = self.picture(values, given, target)
+        return Measure(float(misfit(picture, target)), head_psnr(picture, target))
+
+    def fit(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Fit:
+        """How far the avatar's picture is from the target's, and how that changes with the values."""
+        values = values.detach().requires_grad_()
+        pose = moved_pose(values, given, self.centre)
+        eye = -(pose.R.T @ pose.t)  # where the camera is, in the head's space
+        gaussians = self.avatar(head_params(values))
+        # Leaves and nodes of their own, so that the ways to the picture stay apart: through the drawing and the colours.
+        drawn = gaussians._replace(means=gaussians.means.view_as(gaussians.means))
+        camera = HeadPose(*(part.detach() for part in pose))
+        seen_from = eye.detach().requires_grad_()
+        colours = sh_colours(gaussians.sh, normalize(gaussians.means - seen_from, dim=-1), self.avatar.config.sh_degree)
+        flat = ((colours - 0.5) / C0)[:, None]
+        picture = self._draw(drawn, camera, flat, target)
+        error = misfit(picture, target)
+        sources = (values, drawn.means, drawn.quats, seen_from)
+        by_values, by_means, by_quats, by_eye = torch.autograd.grad(error, sources)
+        by_pose = camera_gradient(drawn, camera, by_means, by_quats)
+        (through_pose,) = torch.autograd.grad((*pose, eye), values, (*by_pose, by_eye))
+        return Fit(error.item(), by_values + through_pose, picture.detach())
+
+    def _draw(self, gaussians: Gaussians, pose: HeadPose, sh: Tensor, target: Target) -> Float[Tensor, "h w 3"]:
+        camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)
+        drawing = splat(gaussians._replace(sh=sh), camera, self.background, region=target.box, blur=target.blur)
+        return drawing.image[target.box]
+
+
+def misfit(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
+    """Half the sum of squared errors, in observations; of large errors less."""
+    total = huber_loss(picture, target.picture, delta=HUBER_DELTA, reduction="sum")
+    return OBSERVATIONS / PIXEL_SIGMA**2 * total / (3.0 * target.area)
+
+
+@torch.no_grad()
+def camera_gradient(
+    gaussians: Gaussians, camera: HeadPose, by_means: Float[Tensor, "N 3"], by_quats: Float[Tensor, "N 4"]
+) -> HeadPose:
+    """The gradient in the camera's R and t of a drawing whose gradients in means and quats are known.
+
+    What is drawn depends on R m + t and on the covariances turned by R. So t takes the sum of the points' gradients, turned
+    into the camera's axes, and R their products with the points. Turning the camera by a small rotation vector d is turning
+    every covariance by a = R^T d in the head's space, which changes its quaternion q by (0, a) q / 2.
+    """
+    R = camera.R
+    w, v = gaussians.quats[:, :1], gaussians.quats[:, 1:]
+    by_w, by_v = by_quats[:, :1], by_quats[:, 1:]
+    spin = 0.5 * (w * by_v - by_w * v + torch.linalg.cross(v, by_v)).sum(dim=0)
+    # The matrix whose product with a change of R, [d]x R, is d times the spin in the camera's axes.
+    by_R = R @ (by_means.T @ gaussians.means) + 0.5 * vector_to_skew_symmetric_matrix((R @ spin)[None])[0] @ R
+    return HeadPose(by_R, R @ by_means.sum(dim=0))

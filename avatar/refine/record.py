@@ -1,0 +1,103 @@
+"""What a refinement leaves beside the tracking: figures of every frame, a sheet of pictures, a summary in words."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avatar.data.recording import Recording
+from avatar.data.subject import Subject
+from avatar.files.video import error_map, side_by_side
+from avatar.model import Avatar
+from avatar.refine.refine import Refined
+from avatar.render import Renderer
+
+COLUMNS = ("frame", "name", "part", "psnr_before", "psnr_after", "turn_degrees", "shift_mm")
+ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
+SHEET_FRAMES = 4  # evenly spread over the held-out ones, besides those that gained most and least
+
+
+def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> str:
+    """A line for each frame: how well the head fitted before and after (dB), and how far it was turned and shifted."""
+    turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    parts = {index: part for part in ("train", "test") for index in getattr(subject.split, part)}
+    for index, name in enumerate(subject.recording.names):
+        figures = (refined.before[index], refined.after[index], math.degrees(turns[index]), 1e3 * shifts[index])
+        writer.writerow((index, name, parts.get(index, ""), *(f"{figure:.4f}" for figure in figures)))
+    return text.getvalue()
+
+
+def movements(
+    before: Mapping[str, Tensor], after: Mapping[str, Tensor], centre: Float[Tensor, 3]
+) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
+    """How far the head was turned, radians, and its centre was shifted, metres."""
+    R = after["R"].double() @ before["R"].double().mT
+    # By the chord of the turn: the trace near 3 would hide small ones.
+    turns = 2.0 * torch.asin(((R - torch.eye(3)).square().sum(dim=(1, 2)) / 8.0).sqrt().clamp(max=1.0))
+    places = [tracks["R"].double() @ centre.double() + tracks["t"].double() for tracks in (before, after)]
+    return turns.numpy(), (places[1] - places[0]).norm(dim=1).numpy()
+
+
+def summary(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> list[str]:
+    """For people."""
+    lines = []
+    for part, title in (("train", "training frames"), ("test", "held-out frames")):
+        chosen = list(getattr(subject.split, part))
+        before, after = (_mean(values[chosen]) for values in (refined.before, refined.after))
+        lines.append(f"{title + ':':17} head-only PSNR {before:.2f} -> {after:.2f} dB with the avatar as it is")
+    turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
+    turn, shift = math.degrees(float(np.median(turns))), 1e3 * float(np.median(shifts))
+    lines.append(f"{'moved:':17} {turn:.2f} degrees and {shift:.2f} mm, medians")
+    if refined.kept.any():
+        lines.append(f"{'as they were:':17} {int(refined.kept.sum())} frames, which would have fitted no better")
+    return lines
+
+
+@torch.no_grad()
+def sheet(
+    avatar: Avatar, subject: Subject, refined: Refined, after: Recording, size: int | None, background: Tensor
+) -> bytes:
+    """A PNG file: a row for each of some frames, truth, avatar before and after, and the errors of both."""
+    renderer = Renderer(avatar, background)
+    rows: list[UInt8[np.ndarray, "H W 3"]] = []
+    for index in sheet_frames(subject.split.test, refined):
+        frame = subject.frame(index, size)
+        truth = frame.composite(background)
+        weight = frame.head_mask[..., None]
+        renders = [
+            renderer.render(recording.params(index), recording.camera(index, size)).image
+            for recording in (subject.recording, after)
+        ]
+        errors = [error_map(render * weight, truth * weight, ERROR_SCALE) for render in renders]
+        captions = (
+            f"truth of {frame.name}",
+            f"before, {refined.before[index]:.2f} dB",
+            f"after, {refined.after[index]:.2f} dB",
+            f"error before, 0 to {ERROR_SCALE:g}",
+            "error after",
+        )
+        rows.append(side_by_side((truth, *renders, *errors), captions))
+    return cv2.imencode(".png", np.concatenate(rows)[..., ::-1])[1].tobytes()
+
+
+def sheet_frames(test: Sequence[int], refined: Refined) -> list[int]:
+    """Held-out frames for the sheet, in order."""
+    gain = np.where(np.isfinite(refined.after - refined.before), refined.after - refined.before, 0.0)[list(test)]
+    spread = np.linspace(0, len(test) - 1, min(SHEET_FRAMES, len(test))).round().astype(int)
+    return sorted({test[i] for i in (*spread.tolist(), int(gain.argmax()), int(gain.argmin()))})
+
+
+def _mean(values: Float[np.ndarray, " T"]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else math.nan

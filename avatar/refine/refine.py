@@ -1,0 +1,230 @@
+"""A whole subject: every frame's tracking moved until the trained avatar's picture of it fits, then smoothed over time.
+
+The avatar stands still; frames are independent until the smoothing, so that they are refined side by side and an
+interruption loses a few seconds. What is found does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as serialize
+from torch import Tensor
+from tqdm import tqdm
+
+from avatar.compute.native import thread_count
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
+from avatar.model import Avatar
+from avatar.refine.descent import Problem, curvature, descend
+from avatar.refine.freedom import Freedom, find_freedom
+from avatar.refine.likeness import Likeness, Measure, Target, head_psnr, targets
+from avatar.refine.motion import HeadPose, moved_tracks
+from avatar.refine.parallel import in_order
+from avatar.refine.smoothing import smoothed
+from avatar.train.interruption import interruption
+
+COARSEST = 112  # pixels of width: a coarser picture shows nothing that a finer one does not
+COARSE_STEPS, FINE_STEPS = 3, 5
+SAMPLES = 6  # training frames whose mean curvature stands for all
+SAVE_EVERY = 50  # frames
+TIMED_FRAMES = 4  # for an estimate
+UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
+PROGRESS_FORMAT = 1  # grows with every change of what refinement finds
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What became of a subject's T frames; PSNR of the head alone in dB, NaN where a frame shows no head."""
+
+    tracks: dict[str, Tensor]  # as `Recording.tracks`
+    before: Float[np.ndarray, " T"]
+    after: Float[np.ndarray, " T"]
+    kept: Bool[np.ndarray, " T"]  # frames whose pictures fitted no better, and so kept the tracking that they had
+
+
+class _Found(NamedTuple):
+    moves: Float[Tensor, " F"]
+    before: Measure
+    psnr: float  # with the moves
+
+
+def refine_subject(
+    avatar: Avatar,
+    subject: Subject,
+    size: int | None,
+    background: Float[Tensor, 3],
+    progress: Path,
+    say: Callable[[str], object] = print,
+) -> Refined | None:
+    """Refine all frames at `size` pixels of width; None after an interruption (Ctrl-C or SIGTERM).
+
+    progress   file for what is done so far: the next call with the same avatar and subject goes on from it
+    Raises UserError for a frame that cannot be read, when no training frame shows a head and when the disk refuses.
+    """
+    with frozen(avatar), interruption() as interrupted:
+        work = _Work(avatar, subject, size, background)
+        key = work.key()
+        moves, figures = _read_progress(progress, key, len(work.freedom.index))
+        if len(moves):
+            say(f"going on after {len(moves)} of {len(subject)} frames ({progress})")
+        factors = [torch.linalg.cholesky(matrix) for matrix in work.curvatures()]
+        todo = range(len(moves), len(subject))
+        with tqdm(total=len(subject), initial=len(moves), desc="refine", unit="frame", dynamic_ncols=True) as bar:
+            for found in in_order(lambda frame: work.refine(frame, factors), todo):
+                moves.append(found.moves)
+                figures.append((*found.before, found.psnr))
+                bar.update(1)
+                bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
+                if len(moves) % SAVE_EVERY == 0 or interrupted():
+                    _write_progress(progress, key, moves, figures)
+                if interrupted():
+                    return None
+        result = work.finish(torch.stack(moves), factors[0] @ factors[0].T, np.array(figures)[:, :2])
+    with suppress(OSError):
+        progress.unlink()
+    return result
+
+
+def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, background: Float[Tensor, 3]) -> float:
+    """About how long `refine_subject` would take, from a few frames; an avatar that has not been trained will do.
+
+    Raises UserError as `refine_subject`.
+    """
+    workers = thread_count()
+    with frozen(avatar):
+        work = _Work(avatar, subject, size, background)
+        frames = work.samples(max(TIMED_FRAMES, workers))
+        begin = time.perf_counter()
+        factors = [torch.linalg.cholesky(matrix) for matrix in work.curvatures(workers)]
+        middle = time.perf_counter()
+        list(in_order(lambda frame: work.refine(frame, factors), frames))
+        list(in_order(lambda frame: work.measure(frame, work.freedom.given[frame]), frames))
+        end = time.perf_counter()
+    return (middle - begin) * SAMPLES / workers + (end - middle) * len(subject) / len(frames)
+
+
+@contextmanager
+def frozen(avatar: Avatar) -> Iterator[None]:
+    """The parameters ask for no gradients inside, and again what they asked for after."""
+    wanted = [parameter.requires_grad for parameter in avatar.parameters()]
+    avatar.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter, want in zip(avatar.parameters(), wanted, strict=True):
+            parameter.requires_grad_(want)
+
+
+def fingerprint(avatar: Avatar) -> str:
+    """SHA-256 of the parameters."""
+    digest = hashlib.sha256()
+    for name, value in sorted(avatar.state_dict().items()):
+        digest.update(f"{name} {list(value.shape)}".encode() + value.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()
+
+
+class _Work:
+    """An avatar and a subject, with what refining any of its frames needs."""
+
+    def __init__(self, avatar: Avatar, subject: Subject, size: int | None, background: Tensor) -> None:
+        self.subject, self.size = subject, size
+        centre = avatar.head.neutral_vertices().mean(dim=0)
+        self.likeness = Likeness(avatar, background, centre)
+        self.tracks = subject.recording.tracks
+        self.freedom: Freedom = find_freedom(self.tracks, subject.split.train, centre)
+        width = subject.image_size(size)[0]
+        self.levels = 1 + sum(width >> level >= COARSEST for level in range(1, 16))
+
+    def key(self) -> str:
+        """Changes with everything that the result depends on."""
+        avatar, background = fingerprint(self.likeness.avatar), self.likeness.background.tolist()
+        choices = (PROGRESS_FORMAT, avatar, self.subject.data_hash, self.size, background)
+        return hashlib.sha256(repr(choices).encode()).hexdigest()
+
+    def pose(self, frame: int) -> HeadPose:
+        return HeadPose(self.tracks["R"][frame], self.tracks["t"][frame])
+
+    def targets(self, frame: int, levels: int) -> list[Target] | None:
+        return targets(self.subject.frame(frame, self.size), self.likeness.background, levels)
+
+    def samples(self, count: int) -> list[int]:
+        """Training frames, evenly spread; fewer where there are fewer."""
+        train = self.subject.split.train
+        return [train[i] for i in np.unique(np.linspace(0, len(train) - 1, count).round().astype(int))]
+
+    def curvatures(self, count: int = SAMPLES) -> list[Float[Tensor, "F F"]]:
+        """By level: the mean over a few training frames, with the prior's, which is one."""
+        sampled = [found for found in in_order(self._curvatures, self.samples(count)) if found is not None]
+        if not sampled:
+            raise UserError(
+                f"no head is to be seen in the training frames of {self.subject.recording.name}: look at its masks"
+            )
+        prior = torch.eye(len(self.freedom.index))
+        return [torch.stack(level).mean(dim=0) + prior for level in zip(*sampled, strict=True)]
+
+    def _curvatures(self, frame: int) -> list[Float[Tensor, "F F"]] | None:
+        made = self.targets(frame, self.levels)
+        if made is None:
+            return None
+        problem = Problem(self.pose(frame), made, frame, self.freedom)
+        return [curvature(self.likeness, problem, level) for level in range(self.levels)]
+
+    def refine(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> _Found:
+        made = self.targets(frame, self.levels)
+        if made is None:
+            return _Found(torch.zeros(len(self.freedom.index)), UNSEEN, UNSEEN.psnr)
+        problem = Problem(self.pose(frame), made, frame, self.freedom)
+        steps = [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)]
+        found = descend(self.likeness, problem, factors, steps)
+        before = self.likeness.measure(self.freedom.given[frame], problem.given, made[0])
+        return _Found(found.moves, before, head_psnr(found.picture, made[0]))
+
+    def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
+        """Smooth over time, and keep the given tracking of frames that then fit no better than with it."""
+        freedom, numbers = self.freedom, [record.tracking for record in self.subject.manifest.frames]
+        moves = smoothed(moves, matrix, freedom.acceleration, freedom.calm, numbers)
+        values = freedom.all_values(moves)
+        after = np.array(list(in_order(lambda frame: self.measure(frame, values[frame]), range(len(values)))))
+        kept = ~(after[:, 0] <= before[:, 0])
+        after[kept] = before[kept]
+        tracks = moved_tracks(self.tracks, values, freedom.changed(), self.likeness.centre)
+        keep = torch.from_numpy(kept)
+        for name, given in self.tracks.items():
+            if name != "shape":
+                tracks[name] = torch.where(keep.reshape(-1, *[1] * (given.ndim - 1)), given, tracks[name])
+        return Refined(tracks, before[:, 1], after[:, 1], kept)
+
+    def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:
+        made = self.targets(frame, 1)
+        return UNSEEN if made is None else self.likeness.measure(values, self.pose(frame), made[0])
+
+
+def _read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list[tuple[float, ...]]]:
+    """Moves and figures of the frames that are done; none from a file that is damaged or of something else."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get("key") != key:
+                return [], []
+            moves, figures = file.get_tensor("moves"), file.get_tensor("figures")
+    except (SafetensorError, OSError, ValueError):
+        return [], []
+    if moves.shape[1:] != (values,) or figures.shape != (len(moves), 3):
+        return [], []
+    return list(moves), [tuple(row) for row in figures.tolist()]
+
+
+def _write_progress(path: Path, key: str, moves: list[Tensor], figures: list[tuple[float, ...]]) -> None:
+    tensors = {"moves": torch.stack(moves), "figures": torch.tensor(figures, dtype=torch.float64)}
+    write_atomically(path, serialize(tensors, metadata={"key": key}))

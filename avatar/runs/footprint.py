@@ -1,0 +1,126 @@
+"""How much memory an avatar takes, from its configuration and head model, before anything of it is allocated.
+
+The figures are of the tensors that are alive at once; tests/runs/test_footprint.py compares them with what a process takes.
+"""
+
+from __future__ import annotations
+
+import math
+
+from avatar.compute.memory import Need
+from avatar.config import Config, ModelConfig
+from avatar.data.loader import BYTES_PER_PIXEL, FRAMES_AHEAD
+from avatar.errors import UserError
+from avatar.gaussians.encoding import encoded_size
+from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
+from avatar.gaussians.uv import uv_texels
+from avatar.head.assets import HeadAssets
+from avatar.model import CONDITION_EXTRAS
+
+Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
+
+FLOAT = 4  # bytes
+STEP_COPIES = 4  # of a parameter during a step: itself, its gradient, Adam's two moments
+SAVING_COPIES = (
+    4 + 2 * 3
+)  # while a checkpoint is written: all but the gradient once more as a file, which is copied once
+UNPACKING_COPIES = 2  # of the HyperGaussians more, because a file holds them in another order
+DRAWING_COPIES = 3  # while an avatar is opened: what the file holds, the model, what the renderer makes of it
+# Floats for a Gaussian in a step, beside its parameters and latents: colours and their gradients (3 times 48), what is
+# drawn and its gradient, offsets, points and their corners.
+STEP_FLOATS = 250
+# Bytes for a pixel in a step, by the perceptual term; measured with 256x256 to 1024x1024 pixels.
+PIXEL_BYTES = {"none": 100, "dssim": 110, "lpips-squeeze": 1050, "lpips-alex": 360, "lpips-vgg": 3600}
+
+_NETWORK = ("the deformation network", "model.mlp_width or model.mlp_layers")
+_HEADS = ("the HyperGaussians", "model.uv_size or model.latent_dim")
+_OTHERS = ("colours and shapes of the Gaussians", "model.uv_size")
+
+
+def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
+    """How many Gaussians an avatar of this head has. Raises UserError where the UV raster is too coarse to have any."""
+    try:
+        return len(uv_texels(assets, config.uv_size).face)
+    except ValueError as error:
+        raise UserError(f"model.uv_size={config.uv_size} is too small: {error}") from None
+
+
+def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) -> Shapes:
+    """The shape of every tensor in the state dict of the `Avatar` that this makes."""
+    N, n, width = gaussians, config.latent_dim, config.mlp_width
+    is_hyper = config.name == "hypergaussians"
+    inputs = encoded_size(config.frequencies) + assets.num_expressions + CONDITION_EXTRAS
+    shapes: Shapes = {
+        "log_scales": (N, 3),
+        "quats": (N, 4),
+        "opacity_logits": (N,),
+        "sh_dc": (N, 1, 3),
+        "sh_rest": (N, (config.sh_degree + 1) ** 2 - 1, 3),
+    }
+    layers = [("input", inputs, width), *((f"hidden.{i}", width, width) for i in range(config.mlp_layers - 1))]
+    for name, given, made in (*layers, ("output", width, n if is_hyper else OFFSETS)):
+        shapes |= {f"deformation.{name}.weight": (made, given), f"deformation.{name}.bias": (made,)}
+    if is_hyper:
+        for name, m in HEADS.items():
+            shapes |= {f"hyper.{name}.mean": (N, m + n), f"hyper.{name}.lower": (N, m, m)}
+            shapes |= {f"hyper.{name}.cross": (N, n, m)}
+    return shapes
+
+
+def training_needs(
+    config: Config, assets: HeadAssets, *, frames: int, size: tuple[int, int], perceptual: str
+) -> list[Need]:
+    """What training takes at its peak, which is in a step or while a checkpoint is written.
+
+    frames      that are trained on, of `size` (width, height) pixels
+    perceptual  the name of the perceptual term
+    """
+    model, pixels = config.model, size[0] * size[1]
+    gaussians = count_gaussians(model, assets)
+    shapes = parameter_shapes(model, assets, gaussians)
+    cached = min(config.data.cache_mb << 20, frames * pixels * BYTES_PER_PIXEL)
+    ahead = config.data.workers * FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
+    lasting = [
+        Need("the cache of decoded frames", cached, "data.cache_mb"),
+        Need("a frame and its losses", ahead + pixels * PIXEL_BYTES.get(perceptual, PIXEL_BYTES["dssim"]), "--size"),
+    ]
+    layers = encoded_size(model.frequencies) + (model.mlp_layers + 2) * model.mlp_width
+    step = [
+        *parameter_needs(shapes, STEP_COPIES),
+        Need(
+            "the network's layers at every place",
+            FLOAT * places(model, gaussians) * layers,
+            "model.mlp_width, model.mlp_layers or model.latent_grid",
+        ),
+        Need("drawing", FLOAT * gaussians * (STEP_FLOATS + 3 * model.latent_dim), "model.uv_size"),
+    ]
+    saving = parameter_needs(shapes, SAVING_COPIES, UNPACKING_COPIES)
+    return [*lasting, *max(step, saving, key=lambda needs: sum(need.size for need in needs))]
+
+
+def drawing_needs(config: ModelConfig, assets: HeadAssets, gaussians: int) -> list[Need]:
+    """What opening a trained avatar and drawing it takes."""
+    shapes = parameter_shapes(config, assets, gaussians)
+    layers = (
+        encoded_size(config.frequencies) + 3 * config.mlp_width
+    )  # the first layer's, and two that are filled in turn
+    return [
+        *parameter_needs(shapes, DRAWING_COPIES, UNPACKING_COPIES),
+        Need("the network's layers at every place", FLOAT * places(config, gaussians) * layers, "model.mlp_width"),
+    ]
+
+
+def parameter_needs(shapes: Shapes, copies: int, more_of_heads: int = 0) -> list[Need]:
+    """What the parameters take, `copies` times; `more_of_heads`: and the HyperGaussians so many times more."""
+    sizes = dict.fromkeys((_NETWORK, _HEADS, _OTHERS), 0)
+    for name, shape in shapes.items():
+        part = _NETWORK if name.startswith("deformation.") else _HEADS if name.startswith("hyper.") else _OTHERS
+        sizes[part] += FLOAT * math.prod(shape) * (copies + more_of_heads * (part is _HEADS))
+    return [Need(what, size, lower) for (what, lower), size in sizes.items()]
+
+
+def places(config: ModelConfig, gaussians: int) -> int:
+    """Where the network is evaluated: at every Gaussian, or at the nodes of a grid, of which each needs four at most."""
+    if config.name != "hypergaussians" or config.latent_grid is None:
+        return gaussians
+    return min(4 * gaussians, (config.latent_grid + 2) ** 2)

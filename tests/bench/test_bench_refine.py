@@ -1,0 +1,134 @@
+"""The disturbance, the figures and the report of the benchmark of refinement."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from drawn_clip import drawn_clip, patterned_avatar, true_tracks
+from tracked_folder import write_tracked_folder
+
+from avatar.bench import refine as bench
+from avatar.bench.disturb import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed, tracking_noise
+from avatar.bench.refine import Figures, Row, coefficients_outside, recovered, report, vertex_errors
+from avatar.cli import main
+from avatar.data.recording import Recording
+from avatar.model import Avatar
+from avatar.refine.motion import EXPRESSION, EYELIDS, NECK, values_of
+from avatar.refine.record import movements
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Avatar:
+    return patterned_avatar(tmp_path_factory.mktemp("head"))
+
+
+@pytest.fixture(scope="module")
+def recording(avatar: Avatar) -> Recording:
+    few = drawn_clip(avatar, frames=4, train=3).recording
+    return replace(few, tracks=true_tracks(4000), names=tuple(map(str, range(4000))))
+
+
+def test_the_disturbance_is_as_large_as_it_says(avatar: Avatar, recording: Recording) -> None:
+    bent = disturbed(recording, avatar.head, seed=1)
+    centre = avatar.head.neutral_vertices().mean(dim=0)
+    turns, shifts = movements(recording.tracks, bent.tracks, centre)
+    assert math.degrees(np.sqrt(np.mean(turns**2))) == pytest.approx(TURN_DEGREES, rel=0.1)
+    assert 1e3 * np.sqrt(np.mean(shifts**2)) == pytest.approx(SHIFT_MM, rel=0.1)
+    errors = values_of(bent.tracks) - values_of(recording.tracks)
+    spread = values_of(recording.tracks).std(dim=0)
+    for part in (EXPRESSION, EYELIDS):
+        shares = errors[:, part].square().mean(dim=0).sqrt() / spread[part]
+        assert shares.tolist() == pytest.approx([COEFFICIENT_SHARE] * len(shares), rel=0.2)
+    assert torch.equal(bent.tracks["neck"], recording.tracks["neck"]) and not errors[:, NECK].any()
+    assert torch.equal(bent.tracks["shape"], recording.tracks["shape"])
+
+
+def test_it_is_the_same_for_a_seed_and_grows_with_the_scale(avatar: Avatar, recording: Recording) -> None:
+    first, again, other = (disturbed(recording, avatar.head, seed) for seed in (1, 1, 2))
+    assert torch.equal(first.tracks["t"], again.tracks["t"]) and not torch.equal(first.tracks["t"], other.tracks["t"])
+    double = disturbed(recording, avatar.head, 1, scale=2.0)
+    one, two = (values_of(bent.tracks)[:, EXPRESSION] for bent in (first, double))
+    expected = 2.0 * (one - values_of(recording.tracks)[:, EXPRESSION])
+    assert torch.allclose(two - values_of(recording.tracks)[:, EXPRESSION], expected, atol=1e-5)
+
+
+def test_most_of_the_noise_drifts_and_a_fifth_does_not() -> None:
+    noise = tracking_noise(np.random.default_rng(0), 40_000, 1, 25.0)[:, 0]
+    assert float(noise.std()) == pytest.approx(1.0, rel=0.05)
+    fourth = noise[4:] - 4 * noise[3:-1] + 6 * noise[2:-2] - 4 * noise[1:-3] + noise[:-4]
+    assert float(fourth.std()) / math.sqrt(70) == pytest.approx(0.2, rel=0.1)
+    assert float((noise[20:] * noise[:-20]).mean()) > 0.3 > float((noise[60:] * noise[:-60]).mean())
+
+
+def test_vertex_errors_are_in_the_cameras_millimetres_and_the_videos_pixels(avatar: Avatar) -> None:
+    truth = drawn_clip(avatar, frames=4, train=2).recording
+    off = replace(truth, tracks={**truth.tracks, "t": truth.tracks["t"] + torch.tensor([0.002, 0.0, 0.0])})
+    mm, px = vertex_errors(avatar.head, off, truth)
+    assert mm == pytest.approx(2.0, rel=1e-3)
+    assert px == pytest.approx(truth.intrinsics[0] * 0.002 / 0.8, rel=0.1)
+    assert vertex_errors(avatar.head, truth, truth) == (0.0, 0.0)
+
+
+def test_coefficients_outside_are_those_that_left_the_range_of_training(avatar: Avatar) -> None:
+    before = drawn_clip(avatar, frames=6, train=4).recording
+    highest = before.tracks["expression"][:4].amax(dim=0)
+
+    def moved(frame: int, coefficient: int, value: torch.Tensor) -> Recording:
+        expression = before.tracks["expression"].clone()
+        expression[frame, coefficient] = value
+        return replace(before, tracks={**before.tracks, "expression": expression})
+
+    assert coefficients_outside(before, before) == 0
+    assert coefficients_outside(moved(2, 1, highest[1]), before) == 0
+    assert coefficients_outside(moved(2, 1, highest[1] + 0.01), before) == 1
+    was_outside = moved(5, 0, highest[0] + 1.0)
+    assert coefficients_outside(moved(5, 0, highest[0] + 0.5), was_outside) == 0
+
+
+def figures(value: float) -> Figures:
+    return Figures(value, 0.9, 0.05, 20.0)
+
+
+def test_the_share_recovered_and_the_report() -> None:
+    rows = [
+        Row("as given", figures(28.0), None, figures(28.0), 0.0, 0.0, 0, None),
+        Row("given, refined", figures(28.5), figures(28.1), figures(28.2), 0.2, 0.1, 0, 12.4),
+        Row("disturbed", figures(25.0), None, figures(26.0), 1.2, 0.8, 0, None),
+        Row("disturbed, refined", figures(27.4), figures(25.2), figures(26.5), 0.6, 0.3, 2, 13.6),
+    ]
+    assert recovered(rows) == pytest.approx(0.8)
+    config = SimpleNamespace(trainer=SimpleNamespace(iterations=1500))
+    text = report(rows, config)  # type: ignore[arg-type]
+    assert "80% of the PSNR lost" in text and "12 and 14 s" in text and "1500 steps" in text
+    line = next(line for line in text.splitlines() if "disturbed, refined" in line)
+    assert line.split()[2:6] == ["27.40", "0.9000", "0.0500", "20.00"] and line.split()[-3:] == ["0.600", "0.300", "2"]
+
+
+def test_a_quick_run_leaves_its_figures_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "QUICK", ("data.size=40", "model.uv_size=20", "model.mlp_width=16"))
+    folder = write_tracked_folder(tmp_path / "someone", frames=20, size=48)
+    words = ["bench", "refine", str(folder), "--quick", "--frame-offset", "1", "trainer.iterations=20"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    written = json.loads((tmp_path / "out" / "bench_refine_someone.json").read_text())
+    assert [row["tracking"] for row in written["rows"]] == [
+        "as given",
+        "given, refined",
+        "disturbed",
+        "disturbed, refined",
+    ]
+    first, better, bent, again = written["rows"]
+    assert first["vertices_mm"] == 0.0 < bent["vertices_mm"] and bent["outside"] == again["outside"] == 0
+    assert first["own"] == first["given"] and first["before"] is None and better["before"] is not None
+    assert written["config"]["data"]["size"] == 40 and written["disturbance"]["degrees"] == TURN_DEGREES
+    assert f"{again['own']['psnr']:.2f}" in capsys.readouterr().out
+    left = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert left == ["bench_refine_someone.json", "bench_refine_someone.md"]

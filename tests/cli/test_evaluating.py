@@ -1,0 +1,106 @@
+"""Evaluating a run protocol by protocol: what was measured before stays while it is true."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import avatar
+from small_runs import SMALL
+
+
+@pytest.fixture(scope="module")
+def evaluated(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was measured by two protocols."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    avatar("train", tracked_folder, "--frame-offset", 1, "--out", run, *SMALL, "trainer.iterations=8")
+    avatar("eval", run, "--protocol", "strict", "--protocol", "flashavatar", "--frames")
+    return run
+
+
+@pytest.fixture
+def run(evaluated: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(evaluated, tmp_path / "run"))
+
+
+def read_results(run: Path) -> dict[str, Any]:
+    return json.loads((run / "eval" / "results.json").read_text())
+
+
+def tables(run: Path) -> set[str]:
+    return {path.parent.name for path in (run / "eval").glob("*/frames.csv")}
+
+
+def test_a_protocol_more_keeps_the_others_results(run: Path) -> None:
+    before = read_results(run)["protocols"]
+    output = avatar("eval", run, "--protocol", "rgbavatar")
+    after = read_results(run)
+    assert list(after["protocols"]) == ["rgbavatar", "strict", "flashavatar"]
+    assert {name: after["protocols"][name] for name in before} == before
+    assert tables(run) == {"rgbavatar", "strict", "flashavatar"}
+    assert len(list((run / "eval" / "strict" / "renders").glob("*.png"))) == 6
+    assert "Kept     strict, flashavatar: measured before" in output and "Removed" not in output
+    assert [note.split(":")[0] for note in after["notes"]] == ["rgbavatar", "flashavatar"], "every background is noted"
+    printed = output.partition("Results")[0]
+    assert "rgbavatar" in printed and "strict" not in printed, "the table shows what was asked for"
+    compared = avatar("compare", run, run)
+    assert all(name in compared for name in ("rgbavatar", "strict", "flashavatar"))
+
+
+def test_measuring_again_replaces_the_own_result(run: Path) -> None:
+    avatar("eval", run, "--protocol", "strict")
+    assert list(read_results(run)["protocols"]) == ["strict", "flashavatar"]
+    assert not (run / "eval" / "strict" / "renders").exists(), "pictures of the evaluation before"
+
+
+def change(key: str, value: object) -> Callable[[Path], None]:
+    def apply(run: Path) -> None:
+        results = read_results(run)
+        results[key] = value
+        (run / "eval" / "results.json").write_text(json.dumps(results))
+
+    return apply
+
+
+def damage(run: Path) -> None:
+    (run / "eval" / "results.json").write_text('{"format": 2, "protocols": [')
+
+
+STALE = {
+    "another step": change("step", 4),
+    "other data": change("data_hash", "0" * 64),
+    "another size": change("image_size", [40, 40]),
+    "another head model": change("head_fingerprint", "0" * 64),
+    "another configuration": change("config", {}),
+    "another program": change("versions", {"torch": "1.0", "threads": "1"}),
+    "another format": change("format", 1),
+    "protocols that are none": change("protocols", {"flashavatar": [1]}),
+    "results that are damaged": damage,
+    "no results": lambda run: (run / "eval" / "results.json").unlink(),
+}
+
+
+@pytest.mark.parametrize("reason", STALE)
+def test_results_that_are_not_true_any_more_go_with_their_files(run: Path, reason: str) -> None:
+    STALE[reason](run)
+    (run / "eval" / "flashavatar" / "notes.txt").write_text("mine")
+    output = avatar("eval", run, "--protocol", "strict")
+    assert list(read_results(run)["protocols"]) == ["strict"] and tables(run) == {"strict"}
+    assert [path.name for path in (run / "eval" / "flashavatar").iterdir()] == ["notes.txt"], "what is not ours stays"
+    assert "Removed  flashavatar: measured before" in output and "Kept" not in output
+
+
+def test_a_table_that_does_not_belong_to_the_results_goes(run: Path) -> None:
+    table = run / "eval" / "flashavatar" / "frames.csv"
+    table.write_text(table.read_text().replace("0", "1"))
+    assert "Removed  flashavatar" in avatar("eval", run, "--protocol", "strict")
+    assert not table.parent.exists()
+
+
+def test_another_number_of_threads_is_the_same_evaluation(run: Path) -> None:
+    change("versions", {**read_results(run)["versions"], "threads": "99"})(run)
+    assert "Kept     flashavatar" in avatar("eval", run, "--protocol", "strict")

@@ -1,0 +1,255 @@
+"""avatar refine, train --refine and what eval says of refined tracking, as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from command_line import avatar
+from small_runs import SMALL
+from tracked_folder import write_tracked_folder
+
+from avatar.commands import plan, rounds
+from avatar.data.source import Source
+from avatar.refine import refine as refine_module
+from avatar.runs.checkpoint import list_checkpoints
+
+QUICK = [*SMALL, "trainer.iterations=10"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With heads tracked some millimetres beside where they are."""
+    folder = write_tracked_folder(tmp_path_factory.mktemp("tracked") / "someone", frames=14, size=40)
+    rng = np.random.default_rng(0)
+    for path in sorted((folder / "checkpoint").glob("*.frame")):
+        content = torch.load(path, weights_only=False)
+        content["opencv"]["t"] = content["opencv"]["t"] + rng.normal(0, (0.004, 0.004, 0)).astype(np.float32)
+        torch.save(content, path)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "first"
+    avatar("train", folder, "--out", run, "--frame-offset", 1, *QUICK)
+    return run
+
+
+@pytest.fixture(scope="module")
+def refined(run: Path) -> Path:
+    output = avatar("refine", run)
+    target = run / "refined" / "someone"
+    assert "14/14" in output and "frame/s" in output and "PSNR" in output
+    assert "training frames:  head-only PSNR" in output and "held-out frames:" in output
+    assert f"Subject      {target}" in output and f"avatar train {target}" in output
+    return target
+
+
+def test_a_refined_folder_is_complete(refined: Path) -> None:
+    names = {path.name for path in refined.iterdir()}
+    assert {
+        "tracking.json",
+        "tracking.npz",
+        "given.npz",
+        "refinement.json",
+        "refinement.csv",
+        "refinement.png",
+    } <= names
+    assert {"frames", "matte", "head", "mouth", "head_model"} <= names
+    assert not [path for path in refined.parent.iterdir() if path.name.startswith(".")]
+    raw = json.loads((refined / "refinement.json").read_text())["refinement"]
+    assert raw["tracker"] == "metrical-tracker" and raw["rounds"][0]["step"] == 10
+    assert raw["rounds"][0]["trained_on"] == list(range(1, 12))
+
+
+def test_it_is_trained_on_and_measured_by_both_trackings(refined: Path, folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    avatar("train", refined, "--out", again, *QUICK)
+    output = avatar("eval", again, "--protocol", "hypergaussians", "--protocol", "strict")
+    assert "the same avatar and frames by both trackings" in output
+    lines = [line.split() for line in output.splitlines() if line.startswith("strict")]
+    both = {words[1]: words for words in lines if words[1] in ("tracked", "refined")}
+    results = json.loads((again / "eval" / "results.json").read_text())
+    entry = results["protocols"]["strict"]
+    assert both["refined"][2] == f"{entry['means']['psnr']:.2f}"
+    assert both["tracked"][2] == f"{entry['tracked']['means']['psnr']:.2f}"
+    assert entry["tracked"]["means"]["psnr"] != entry["means"]["psnr"]
+    assert len(entry["tracked"]["intervals"]["psnr_head"]) == 2
+    tracking = results["tracking"]
+    assert (tracking["tracking"], tracking["tracker"]) == ("refined", "metrical-tracker")
+    assert tracking["rounds"][0]["measured_frames_trained_on"] == 0
+    assert tracking["rounds"][0]["frames_trained_on"] == 11
+    assert "which was trained on 11 frames, none of them measured" in output
+    assert "tracked: as metrical-tracker left it" in output
+    reenacted = avatar("reenact", again, "--driver", refined, "--out", tmp_path / "x.mp4")
+    assert "14 frames written" in reenacted
+
+
+def test_the_tracked_figures_are_those_of_the_tracker(refined: Path, run: Path, tmp_path: Path) -> None:
+    """The avatar that the tracking was refined through, measured on the refined folder: `tracked` is its own evaluation."""
+    first = avatar("eval", run, "--protocol", "strict")
+    assert "by both trackings" not in first and "tracked: as metrical-tracker left it" in first
+    own = json.loads((run / "eval" / "results.json").read_text())
+    assert own["tracking"]["tracking"] == "tracked" and "tracked" not in own["protocols"]["strict"]
+    again = tmp_path / "again"
+    avatar("train", refined, "--out", again, *QUICK)
+    for name in ("avatar.safetensors",):
+        (again / name).write_bytes((run / name).read_bytes())
+    avatar("eval", again, "--protocol", "strict")
+    both = json.loads((again / "eval" / "results.json").read_text())["protocols"]["strict"]
+    for figure in ("psnr", "psnr_head", "ssim_head", "psnr_mouth"):
+        assert both["tracked"]["means"][figure] == pytest.approx(own["protocols"]["strict"]["means"][figure], abs=1e-4)
+    # the very avatar that the frames were refined through draws them better than before
+    assert both["means"]["psnr"] > both["tracked"]["means"]["psnr"]
+
+
+def test_frames_that_the_avatar_had_seen_are_called_so(refined: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    avatar("train", refined, "--out", again, *QUICK, "data.test_frames=5")
+    output = avatar("eval", again, "--protocol", "strict")
+    assert "Note: 2 of the measured frames were refined through the avatar of" in output
+    results = json.loads((again / "eval" / "results.json").read_text())
+    assert results["tracking"]["rounds"][0]["measured_frames_trained_on"] == 2
+
+
+def test_what_cannot_be_is_a_sentence(run: Path, refined: Path, tmp_path: Path) -> None:
+    assert "exists already" in avatar("refine", run, status=1)
+    assert "is not a run" in avatar("refine", tmp_path, status=1)
+    inside = Path(json.loads((run / "run.json").read_text())["source"]["folder"]) / "new"
+    assert "which is an input" in avatar("refine", run, "--out", inside, status=1)
+    assert "belongs to the run" in avatar("refine", run, "--out", run / "checkpoints", status=1)
+
+
+def test_an_interrupted_refinement_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def soon():
+        count = iter(range(100))
+        yield lambda: next(count) >= 4
+
+    target = tmp_path / "refined"
+    with monkeypatch.context() as patch:
+        patch.setattr(refine_module, "interruption", soon)
+        output = avatar("refine", run, "--out", target, status=130)
+    assert "Interrupted" in output and "goes on from there" in output and not target.exists()
+    output = avatar("refine", run, "--out", target)
+    assert "going on after 3 of 14 frames" in output and (target / "tracking.npz").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["refined"]
+
+
+def test_training_in_rounds(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    output = avatar("train", folder, "--out", run, "--frame-offset", 1, "--refine", 2, *QUICK)
+    assert "Round 1 of 2" in output and "Round 2 of 2" in output
+    assert output.count("4/4") >= 2 and "10/10" in output  # two shorter trainings, and the run's own
+    info = json.loads((run / "run.json").read_text())
+    assert info["source"]["folder"] == str((run / "rounds" / "2" / "someone").resolve())
+    raw = json.loads((run / "rounds" / "2" / "someone" / "refinement.json").read_text())["refinement"]
+    assert [Path(one["run"]).parts[-2:] for one in raw["rounds"]] == [("1", "run"), ("2", "run")]
+    assert "by both trackings" in avatar("eval", run, "--protocol", "strict")
+    assert "is complete" in avatar("train", "--resume", "--out", run)
+    assert "holds a run already" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
+
+
+def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    words = ["train", folder, "--out", run, "--frame-offset", 1, *QUICK, "trainer.iterations=1000"]
+    assert "--minutes goes with --refine" in avatar(*words, "--minutes", 2, status=1)
+    assert "must be a positive number" in avatar(*words, "--refine", 1, "--minutes", 0, status=1)
+    output = avatar(*words, "--refine", 1, "--minutes", 0.001, status=1)
+    assert "too little for --refine 1 of 14 frames" in output and not (run / "rounds").exists()
+
+    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 4.0)
+    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.5))
+    monkeypatch.setattr(plan, "LEAST_STEPS", 5)
+    output = avatar(*words, "--refine", 1, "--minutes", 0.2)
+    assert "allow 11 steps; 11 are taken" in output and "of 0.2 minutes" in output
+    steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (run, first(run))]
+    assert steps == [11, 4]
+    assert "with --minutes 0.2, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
+    assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 0.2, "--resume")
+
+
+def first(run: Path) -> Path:
+    """The run of the first round."""
+    return run / "rounds" / "1" / "run"
+
+
+def test_what_the_first_folder_was_allowed_later_ones_are(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Source] = []
+    monkeypatch.setattr(rounds, "go_on_or_begin", lambda source, *_: opened.append(source) or 0)
+    monkeypatch.setattr(rounds, "open_run", lambda *_: None)
+    monkeypatch.setattr(rounds, "refine_run", lambda *_: 0)
+    words = ("--frame-offset", 1, "--fps", 30, "--max-left-out", 0.5, "--ignore-misfit", "--refine", 1)
+    avatar("train", folder, "--out", tmp_path / "run", *words, *QUICK)
+    given, later = opened
+    assert (given.folder, given.frame_offset, given.fps) == (folder, 1, 30.0)
+    assert later == Source(
+        tmp_path / "run" / "rounds" / "1" / "someone", given.head, max_left_out=0.5, ignore_misfit=True
+    )
+
+
+def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after, run = tmp_path / "before" / "someone", tmp_path / "after" / "other", tmp_path / "run"
+    shutil.copytree(folder, before)
+
+    @contextmanager
+    def at_once():
+        yield lambda: True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(refine_module, "interruption", at_once)
+        avatar("train", before, "--out", run, "--frame-offset", 1, "--refine", 1, *QUICK, status=130)
+    after.parent.mkdir()
+    before.rename(after)
+    assert "give the tracked video folder" in avatar("train", "--resume", "--out", run, status=1)
+    head = after / "head_model"
+    output = avatar("train", after, "--head", head, "--resume", "--out", run)
+    assert "going on after 1 of 14 frames" in output and "10/10" in output
+    assert (run / "rounds" / "1" / "someone" / "tracking.npz").is_file()
+
+
+def test_rounds_go_on_where_they_stopped(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    words = ["train", folder, "--out", run, "--frame-offset", 1, "--refine", 1, *QUICK]
+
+    @contextmanager
+    def at_once():
+        yield lambda: True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(refine_module, "interruption", at_once)
+        assert "Interrupted" in avatar(*words, status=130)
+    stage = run / "rounds" / "1"
+    stamps = [path.stat().st_mtime_ns for path in list_checkpoints(stage / "run" / "checkpoints")]
+    assert stamps and not (run / "run.json").exists()
+    assert "add --resume" in avatar(*words, status=1)
+    assert "began with --refine 1, not 2" in avatar("train", "--resume", "--out", run, "--refine", 2, status=1)
+    changed = avatar("train", "--resume", "--out", run, "trainer.iterations=11", status=1)
+    assert "leave the overrides out" in changed
+    assert "began with --frame-offset 1" in avatar("train", "--resume", "--out", run, "--frame-offset", 2, status=1)
+    other = write_tracked_folder(tmp_path / "other", frames=4, size=24)
+    assert "began on" in avatar("train", other, "--resume", "--out", run, status=1)
+    output = avatar("train", "--resume", "--out", run)
+    assert "going on after 1 of 14 frames" in output and "10/10" in output
+    assert stamps == [path.stat().st_mtime_ns for path in list_checkpoints(stage / "run" / "checkpoints")]
+
+
+def test_a_plain_run_and_a_damaged_plan(run: Path, folder: Path, tmp_path: Path) -> None:
+    assert "began without --refine" in avatar("train", "--resume", "--out", run, "--refine", 1, status=1)
+    for number in (0, 11):
+        output = avatar("train", folder, "--out", tmp_path / "x", "--refine", number, *QUICK, status=1)
+        assert "from 1 to 10" in output and not (tmp_path / "x").exists()
+    plan = tmp_path / "y" / "rounds" / "plan.json"
+    plan.parent.mkdir(parents=True)
+    for text, said in (("{", "cannot be read"), ('{"format": 9}', "another version"), ('{"format": 1}', "damaged")):
+        plan.write_text(text)
+        assert said in avatar("train", "--resume", "--out", tmp_path / "y", status=1)

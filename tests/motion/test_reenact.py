@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import torch
+from heads import OPEN, grid_head, mouth_head, rest_params
+
+from avatar.head.model import HeadModel
+from avatar.motion.reenact import say_open_lips
+from avatar.motion.rest import RestPose, find_mean, frame_rest
+
+
+def neutral(opening: float) -> RestPose:
+    """Lips `opening` times 10 mm apart in the middle of the mouth."""
+    params = rest_params(3)
+    params.expression[OPEN] = opening
+    return frame_rest([params], 0)
+
+
+def test_a_neutral_face_with_open_lips_is_said_with_the_way_out() -> None:
+    said: list[str] = []
+    head = HeadModel(mouth_head(), torch.zeros(0))
+    for opening in (0.0, 0.3):
+        say_open_lips(neutral(opening), head, "anna", "--driver-neutral", said.append)
+    assert said == []
+    say_open_lips(neutral(0.5), head, "anna", "--driver-neutral", said.append)
+    (sentence,) = said
+    assert sentence.startswith("The lips of anna are 4.") and "--driver-neutral N takes frame N instead" in sentence
+
+
+def test_nothing_is_said_of_means_of_no_rest_and_of_heads_without_lips() -> None:
+    said: list[str] = []
+    head = HeadModel(mouth_head(), torch.zeros(0))
+    say_open_lips(None, head, "anna", "--neutral", said.append)
+    params = rest_params(3)
+    params.expression[OPEN] = 1.0
+    say_open_lips(find_mean([params]), head, "anna", "--neutral", said.append)
+    say_open_lips(frame_rest([rest_params()], 0), HeadModel(grid_head(), torch.zeros(0)), "a", "--neutral", said.append)
+    assert said == []

@@ -1,0 +1,132 @@
+"""The curvature that frames share, and the way down of one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from drawn_clip import BACKGROUND, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
+
+from avatar.data.recording import Recording
+from avatar.model import Avatar
+from avatar.refine.descent import Problem, curvature, descend
+from avatar.refine.freedom import find_freedom
+from avatar.refine.likeness import Likeness, targets
+from avatar.refine.motion import HeadPose, moved_tracks
+from avatar.refine.refine import frozen
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Avatar]:
+    avatar = patterned_avatar(tmp_path_factory.mktemp("head"))
+    with frozen(avatar):
+        yield avatar
+
+
+@pytest.fixture(scope="module")
+def clip(avatar: Avatar) -> Clip:
+    return drawn_clip(avatar, frames=10, train=8)
+
+
+def likeness_of(avatar: Avatar) -> Likeness:
+    return Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
+
+
+def problem(clip: Clip, likeness: Likeness, frame: int, levels: int = 1) -> Problem:
+    tracks = clip.recording.tracks
+    made = targets(clip.pictures[frame], BACKGROUND, levels)
+    assert made is not None
+    given = HeadPose(tracks["R"][frame], tracks["t"][frame])
+    return Problem(given, made, frame, find_freedom(tracks, clip.split.train, likeness.centre))
+
+
+def factors(clip: Clip, likeness: Likeness, levels: int = 1) -> list[torch.Tensor]:
+    made = problem(clip, likeness, 0, levels)
+    prior = torch.eye(len(made.freedom.index))
+    return [torch.linalg.cholesky(curvature(likeness, made, level) + prior) for level in range(levels)]
+
+
+def test_where_the_picture_fits_the_curvature_is_the_misfits_own(avatar: Avatar, clip: Clip) -> None:
+    likeness = likeness_of(avatar)
+    made = problem(clip, likeness, 2)
+    matrix = curvature(likeness, made, 0)
+    assert torch.allclose(matrix, matrix.T)
+    still = torch.zeros(len(made.freedom.index))
+
+    def misfit(moves: torch.Tensor) -> float:
+        return likeness.measure(made.freedom.values(2, moves), made.given, made.targets[0]).misfit
+
+    base = misfit(still)
+    for k in (2, 3, 4, 9, len(still) - 1):  # the other turns change which splat is in front of which, in jumps
+        step = still.clone()
+        step[k] = 0.3
+        second = (misfit(step) - 2 * base + misfit(-step)) / 0.3**2
+        assert float(matrix[k, k]) == pytest.approx(second, rel=0.2, abs=0.05), k
+    both = still.clone()
+    both[3], both[7] = 0.3, 0.3
+    one, other = still.clone(), still.clone()
+    one[3], other[7] = 0.3, 0.3
+    mixed = (misfit(both) - misfit(one) - misfit(other) + base) / 0.3**2
+    assert float(matrix[3, 7]) == pytest.approx(mixed, rel=0.3, abs=0.05 * float((matrix[3, 3] * matrix[7, 7]).sqrt()))
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_a_disturbed_frame_comes_back(avatar: Avatar, clip: Clip, levels: int) -> None:
+    wrong, likeness = wrongly_tracked(clip, degrees=1.0, mm=2.0), likeness_of(avatar)
+    common = factors(wrong, likeness, levels)
+    for frame in (1, 9):
+        made = problem(wrong, likeness, frame, levels)
+        found = descend(likeness, made, common, [6, 3][:levels])
+        assert found.picture.shape == made.targets[0].picture.shape
+        moves = torch.zeros(len(wrong), len(found.moves))
+        moves[frame] = found.moves
+        before, after = (
+            screen_errors(avatar, recording, clip.recording, [frame])
+            for recording in (wrong.recording, moved(wrong, made, moves, likeness))
+        )
+        assert before > 0.25 and after < 0.12 * before
+
+
+def moved(clip: Clip, made: Problem, moves: torch.Tensor, likeness: Likeness) -> Recording:
+    freedom = made.freedom
+    tracks = moved_tracks(clip.recording.tracks, freedom.all_values(moves), freedom.changed(), likeness.centre)
+    return replace(clip.recording, tracks=tracks)
+
+
+def test_the_last_picture_is_that_of_the_moves_and_no_worse_than_the_first(avatar: Avatar, clip: Clip) -> None:
+    wrong, likeness = wrongly_tracked(clip), likeness_of(avatar)
+    made = problem(wrong, likeness, 4)
+    found = descend(likeness, made, factors(wrong, likeness), [2])
+    values = made.freedom.values(4, found.moves)
+    assert torch.allclose(found.picture, likeness.picture(values, made.given, made.targets[0]), atol=1e-5)
+
+    def energy(moves: torch.Tensor) -> float:
+        misfit = likeness.measure(made.freedom.values(4, moves), made.given, made.targets[0]).misfit
+        return misfit + 0.5 * float(moves @ moves)
+
+    assert energy(found.moves) < 0.5 * energy(torch.zeros_like(found.moves))
+    stuck = descend(likeness, made, [1e-6 * factor for factor in factors(wrong, likeness)], [3])
+    assert energy(stuck.moves) <= energy(torch.zeros_like(found.moves)) * (
+        1 + 1e-6
+    )  # steps far too long: none is taken
+
+
+def test_moves_stay_within_their_bounds(avatar: Avatar, clip: Clip) -> None:
+    """A coefficient whose truth lies beyond what training showed goes to the edge of that and no farther."""
+    wrong, likeness = wrongly_tracked(clip), likeness_of(avatar)
+    tracks = dict(wrong.recording.tracks)
+    k = 0
+    tracks["expression"] = tracks["expression"].clone()
+    tracks["expression"][:, k] = tracks["expression"][:, k].clamp(max=-0.2)
+    narrow = replace(wrong, recording=replace(wrong.recording, tracks=tracks))
+    truth = clip.recording.tracks["expression"][:, k]
+    frame = int(truth.argmax())
+    assert float(truth[frame]) > 0.3
+    made = problem(narrow, likeness, frame)
+    found = descend(likeness, made, factors(narrow, likeness), [8])
+    low, high = made.freedom.bounds(frame)
+    assert bool((found.moves >= low).all()) and bool((found.moves <= high).all())
+    place = int((made.freedom.index == 20 + k).nonzero())
+    assert float(found.moves[place]) == float(high[place])

@@ -1,0 +1,115 @@
+"""What may move, how far, and how calmly: from the tracking of the training frames."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from drawn_clip import EXPRESSIONS, true_tracks
+
+from avatar.refine.freedom import (
+    DEPTH_UNIT,
+    FACE_CALM,
+    HEAD_CALM,
+    HEAD_REACH,
+    JITTER_SHARE,
+    LEAST_ACCELERATION,
+    SHIFT_UNIT,
+    SPREAD_SHARE,
+    TURN_UNIT,
+    find_freedom,
+)
+from avatar.refine.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, SHIFT, accelerations, values_of
+
+CENTRE = torch.zeros(3)
+TRAIN = tuple(range(20))
+
+
+def tracks() -> dict[str, torch.Tensor]:
+    made = true_tracks(30)
+    made["expression"] = made["expression"].clone()
+    made["expression"][:, 4] = 0.3  # never moves
+    made["expression"][25, 5] = 9.0  # farther than training has been
+    return made
+
+
+def test_what_never_moves_is_not_free() -> None:
+    freedom = find_freedom(tracks(), TRAIN, CENTRE)
+    free = freedom.changed()
+    assert free[:9].all()  # the head, and its neck although it is at rest
+    assert free[JAW].tolist() == [True, False, False]
+    assert free[EYES].tolist() == [True, True, False] * 2 and free[EYELIDS].all()
+    assert free[EXPRESSION].tolist() == [True] * 4 + [False, True]
+    assert torch.equal(freedom.index, free.nonzero()[:, 0])
+
+
+def test_units_are_what_trackers_err_by() -> None:
+    made = tracks()
+    freedom = find_freedom(made, TRAIN, CENTRE)
+    unit = torch.zeros(20 + EXPRESSIONS).index_put((freedom.index,), freedom.unit)
+    spread = values_of(made)[:20].std(dim=0, unbiased=False)
+    assert torch.allclose(unit[EXPRESSION.start], SPREAD_SHARE * spread[EXPRESSION.start])
+    assert unit[3:6].tolist() == pytest.approx([SHIFT_UNIT, SHIFT_UNIT, DEPTH_UNIT])
+    assert unit[0] == pytest.approx(TURN_UNIT) and unit[NECK].tolist() == pytest.approx([0.5 * math.pi / 180] * 3)
+
+
+def test_a_head_that_jitters_may_move_farther() -> None:
+    made = true_tracks(400)
+    generator = torch.Generator().manual_seed(0)
+    made["t"] = made["t"] + torch.tensor([0, 0, 0.002]) * torch.randn(400, 3, generator=generator)
+    freedom = find_freedom(made, tuple(range(400)), CENTRE)
+    assert float(freedom.unit[5]) == pytest.approx(0.002 / JITTER_SHARE, rel=0.15)
+    assert float(freedom.unit[3]) == pytest.approx(SHIFT_UNIT)
+
+
+def test_values_stay_where_training_has_been() -> None:
+    made = tracks()
+    freedom = find_freedom(made, TRAIN, CENTRE)
+    training = values_of(made)[list(TRAIN)]
+    for sign in (1.0, -1.0):
+        values = freedom.all_values(sign * torch.full((30, len(freedom.index)), 1e3))
+        bound = training.amax(dim=0) if sign > 0 else training.amin(dim=0)
+        assert torch.equal(values[3, EXPRESSION][:4], bound[EXPRESSION][:4])
+        assert float(values[3, JAW.start]) == float(bound[JAW.start])
+        assert float(values[3, SHIFT.start]) == pytest.approx(sign * HEAD_REACH * SHIFT_UNIT)
+        assert float(values[3, EXPRESSION][4]) == pytest.approx(0.3)
+    # What was outside already may stay, and go no farther.
+    outside = freedom.all_values(torch.full((30, len(freedom.index)), 1e3))[25, EXPRESSION][5]
+    assert float(outside) == 9.0
+
+
+def test_bounds_and_moves_speak_of_the_same() -> None:
+    freedom = find_freedom(tracks(), TRAIN, CENTRE)
+    low, high = freedom.bounds(7)
+    assert bool((low <= 0).all()) and bool((high >= 0).all())
+    # float32 has fewer digits for a move in units than for the value: all_values settles the rest
+    values = freedom.values(7, torch.where(torch.isfinite(high), high, 0.0))
+    at = freedom.index[torch.isfinite(high)]
+    assert torch.allclose(values[at], freedom.highest[7][at], atol=1e-6)
+    untouched = ~freedom.changed()
+    assert torch.equal(values[untouched], freedom.given[7][untouched])
+
+
+def test_the_head_is_calmer_than_the_face() -> None:
+    made = tracks()
+    freedom = find_freedom(made, TRAIN, CENTRE)
+    motion = accelerations(made, values_of(made), CENTRE)
+    assert torch.equal(freedom.acceleration, motion[:, freedom.index] / freedom.unit)
+    typical = (motion[1:20].square().mean(dim=0).sqrt()[freedom.index] / freedom.unit).tolist()
+    assert float(freedom.calm[0]) == pytest.approx(HEAD_CALM / typical[0] ** 2, rel=1e-5)
+    jaw = int((freedom.index == JAW.start).nonzero())
+    assert float(freedom.calm[jaw]) == pytest.approx(FACE_CALM / typical[jaw] ** 2, rel=1e-5)
+    # the neck is at rest here, and turns with the head
+    scale = motion[1:20, 1].square().mean().sqrt() / freedom.unit[7]
+    assert float(freedom.calm[7]) == pytest.approx(HEAD_CALM / float(scale) ** 2, rel=1e-5)
+
+
+def test_a_clip_that_stands_still_can_be_refined() -> None:
+    made = {name: value[:1].repeat(6, *[1] * (value.ndim - 1)) for name, value in true_tracks(1).items()}
+    made["shape"] = torch.zeros(2)
+    freedom = find_freedom(made, (0, 1, 2), CENTRE)
+    assert freedom.index.tolist() == list(range(9))
+    assert torch.isfinite(freedom.calm).all()
+    assert float(freedom.calm.max()) == pytest.approx(HEAD_CALM / LEAST_ACCELERATION**2)
+    assert find_freedom({n: v[:1] if n != "shape" else v for n, v in made.items()}, (0,), CENTRE).unit.all()

@@ -1,0 +1,179 @@
+"""How well a picture fits, and its gradient: against autograd through the reference, and against finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from drawn_clip import BACKGROUND, EXPRESSIONS, SIZE, Clip, drawn_clip, patterned_avatar, wrongly_tracked
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+
+from avatar.losses.metrics import psnr
+from avatar.model import Avatar
+from avatar.refine import likeness as likeness_module
+from avatar.refine.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness, camera_gradient, head_psnr, targets
+from avatar.refine.likeness import misfit as misfit_of
+from avatar.refine.motion import HeadPose, head_params, moved_pose, rotation, values_of
+from avatar.refine.refine import frozen
+from avatar.splat import splat
+from avatar.types import Camera, Gaussians
+
+VALUES = 20 + EXPRESSIONS
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Avatar]:
+    avatar = patterned_avatar(tmp_path_factory.mktemp("head"))
+    with frozen(avatar):
+        yield avatar
+
+
+@pytest.fixture(scope="module")
+def clip(avatar: Avatar) -> Clip:
+    return drawn_clip(avatar, frames=4, train=3)
+
+
+@pytest.fixture
+def likeness(avatar: Avatar) -> Likeness:
+    return Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
+
+
+def given(clip: Clip, index: int) -> HeadPose:
+    return HeadPose(clip.recording.tracks["R"][index], clip.recording.tracks["t"][index])
+
+
+def test_the_cameras_gradient_is_that_of_the_reference() -> None:
+    generator = torch.Generator().manual_seed(3)
+    count = 40
+    quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    gaussians = Gaussians(
+        means=0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),
+        quats=torch.nn.functional.normalize(quats, dim=1),
+        scales=0.004 + 0.03 * torch.rand(count, 3, generator=generator, dtype=torch.float64),
+        opacities=0.2 + 0.5 * torch.rand(count, generator=generator, dtype=torch.float64),
+        sh=torch.randn(count, 1, 3, generator=generator, dtype=torch.float64),
+    )
+    R = rotation(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)).requires_grad_()
+    t = torch.tensor([0.02, -0.01, 0.7], dtype=torch.float64, requires_grad=True)
+    camera = Camera(R, t, 60.0, 64.0, 16.0, 15.0, 32, 30)
+    means, quats = gaussians.means.requires_grad_(), gaussians.quats.requires_grad_()
+    image = splat(gaussians, camera, BACKGROUND.double(), backend="reference", alpha_min=0.0).image
+    weights = torch.randn(image.shape, generator=generator, dtype=torch.float64)
+    by_R, by_t, by_means, by_quats = torch.autograd.grad((image * weights).sum(), (R, t, means, quats))
+    found = camera_gradient(gaussians, HeadPose(R.detach(), t.detach()), by_means, by_quats)
+    assert torch.allclose(found.t, by_t, rtol=1e-6, atol=1e-9)
+    # Only what a turn of the camera changes is defined: the part of the gradient along the rotations.
+    for axis in torch.eye(3, dtype=torch.float64):
+        turn = torch.linalg.cross(axis.expand(3, 3), R.detach().T).T
+        assert float((found.R * turn).sum()) == pytest.approx(float((by_R * turn).sum()), rel=1e-6, abs=1e-9)
+
+
+def mistracked(clip: Clip) -> tuple[torch.Tensor, HeadPose]:
+    """Values away from zero in everything, and the given pose, of frame 2."""
+    wrong = wrongly_tracked(clip, degrees=1.5, mm=3.0, share=0.5)
+    values = values_of(wrong.recording.tracks)[2]
+    generator = torch.Generator().manual_seed(1)
+    values[:9] += torch.randn(9, generator=generator) * torch.tensor([0.01] * 3 + [0.002] * 3 + [0.02] * 3)
+    return values, given(wrong, 2)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_the_gradient_is_that_through_the_reference(likeness: Likeness, clip: Clip, level: int) -> None:
+    """The reference splatter is differentiable in its camera and computes the colours itself."""
+    target = targets(clip.pictures[2], BACKGROUND, 2)[level]
+    values, pose = mistracked(clip)
+    found = likeness.fit(values, pose, target)
+
+    moving = values.clone().requires_grad_()
+    moved = moved_pose(moving, pose, likeness.centre)
+    camera = replace(target.camera, R_cam_world=moved.R, t_cam_world=moved.t)
+    gaussians = likeness.avatar(head_params(moving))
+    options = {"backend": "reference", "region": target.box, "blur": target.blur}
+    image = splat(gaussians, camera, BACKGROUND, **options).image[target.box]
+    misfit = misfit_of(image, target)
+    (expected,) = torch.autograd.grad(misfit, moving)
+    assert found.misfit == pytest.approx(misfit.item(), rel=1e-4)
+    assert torch.allclose(found.picture, image, atol=1e-3)
+    assert torch.allclose(found.gradient, expected, rtol=5e-3, atol=1e-3 * float(expected[6:].abs().max()))
+    assert float(expected[:3].abs().min()) > 1.0
+
+
+def test_the_gradient_is_the_slope(likeness: Likeness, clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Where a splat ends makes finite differences jump; without the cut-off they do not.
+    monkeypatch.setattr(likeness_module, "splat", partial(splat, alpha_min=0.0, t_min=0.0))
+    target = targets(clip.pictures[2], BACKGROUND, 1)[0]
+    values, pose = mistracked(clip)
+    found = likeness.fit(values, pose, target)
+    assert found.misfit == pytest.approx(likeness.measure(values, pose, target).misfit, rel=1e-5)
+    # Turns out of the picture's plane also change which splat is in front of which, in jumps.
+    for k, length in ((2, 1e-3), (3, 2e-4), (4, 2e-4), (5, 2e-4), (9, 3e-4), (20, 1e-3), (21, 1e-3)):
+        step = torch.zeros(VALUES)
+        step[k] = length
+        high, low = (likeness.measure(values + sign * step, pose, target).misfit for sign in (1, -1))
+        assert float(found.gradient[k]) == pytest.approx((high - low) / (2 * length), rel=0.03, abs=0.1), k
+
+
+def test_the_misfit_counts_squares_in_observations(likeness: Likeness, clip: Clip) -> None:
+    target = targets(clip.pictures[0], BACKGROUND, 1)[0]
+    values = values_of(clip.recording.tracks)[0]
+    fits = likeness.measure(values, given(clip, 0), target).misfit
+    grey = replace_picture(target, likeness.picture(values, given(clip, 0), target) + 0.02)
+    expected = 0.5 * OBSERVATIONS * (0.02 / PIXEL_SIGMA) ** 2 * target.picture[..., 0].numel() / target.area
+    assert likeness.measure(values, given(clip, 0), grey).misfit == pytest.approx(expected, rel=1e-3)
+    assert fits < 0.1 * expected  # the clip is the avatar's own picture
+    far = replace_picture(target, likeness.picture(values, given(clip, 0), target) + 0.4)
+    assert (
+        likeness.measure(values, given(clip, 0), far).misfit < 400 * 0.5 * expected
+    )  # an outlier counts less than its square
+
+
+def replace_picture(target: likeness_module.Target, picture: torch.Tensor) -> likeness_module.Target:
+    return target._replace(picture=picture)
+
+
+def test_targets_are_the_head_with_a_margin_at_every_size(clip: Clip) -> None:
+    frame = clip.pictures[0]
+    full, half = targets(frame, BACKGROUND, 2)
+    rows = frame.head_mask.any(dim=1).nonzero()[:, 0]
+    assert full.box[0] == slice(max(int(rows[0]) - 8, 0), min(int(rows[-1]) + 9, SIZE))
+    assert torch.equal(full.picture, frame.composite(BACKGROUND)[full.box]) and full.blur == 0.3
+    assert (half.camera.width, half.camera.fx) == (SIZE // 2, frame.camera.fx / 2) and half.blur == 0.075
+    assert half.area == pytest.approx(full.area / 4, rel=1e-5)
+    assert targets(replace(frame, head_mask=torch.zeros(SIZE, SIZE)), BACKGROUND, 2) is None
+
+
+def test_a_half_size_picture_looks_like_the_full_one(likeness: Likeness, clip: Clip) -> None:
+    """The splatter's blur is in pixels: at half the size it would thicken every splat twice as much."""
+    full, half = targets(clip.pictures[1], BACKGROUND, 2)
+    values = values_of(clip.recording.tracks)[1]
+    sharp, thick = (
+        head_psnr(likeness.picture(values, given(clip, 1), half._replace(blur=blur)), half) for blur in (half.blur, 0.3)
+    )
+    assert sharp > thick + 3.0
+    assert head_psnr(likeness.picture(values, given(clip, 1), full), full) > 45.0
+
+
+def test_psnr_is_of_the_head_alone(clip: Clip) -> None:
+    target = targets(clip.pictures[0], BACKGROUND, 1)[0]
+    other = (target.picture + 0.1 * (1 - target.mask)[..., None]).clamp(0, 1)
+    assert head_psnr(other, target) == float("inf") or head_psnr(other, target) > 100
+    grey = target.picture * 0.9
+    assert head_psnr(grey, target) == pytest.approx(float(psnr(grey, target.picture, target.mask)))
+
+
+def test_the_pose_is_that_of_the_values(likeness: Likeness, clip: Clip) -> None:
+    """Moving by the difference of two trackings gives the other's picture."""
+    wrong = wrongly_tracked(clip)
+    target = targets(clip.pictures[1], BACKGROUND, 1)[0]
+    right, off = given(clip, 1), given(wrong, 1)
+    turn = right.R @ off.R.T
+    values = values_of(clip.recording.tracks)[1]
+    values[:3] = rotation_matrix_to_axis_angle(turn[None])[0]
+    centre = likeness.centre
+    values[3:6] = (right.R @ centre + right.t) - (off.R @ centre + off.t)
+    moved = moved_pose(values, off, centre)
+    assert torch.allclose(moved.R, right.R, atol=1e-5) and torch.allclose(moved.t, right.t, atol=1e-6)
+    assert head_psnr(likeness.picture(values, off, target), target) > 45.0

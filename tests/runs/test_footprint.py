@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from heads import grid_head
+from small_runs import small_config
+
+from avatar.errors import UserError
+from avatar.model import Avatar
+from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shapes, places, training_needs
+
+MIB = 2**20
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("preset=paper", "model.latent_dim=3", "model.sh_degree=1"),
+        ("model=flashavatar", "model.mlp_layers=1", "model.sh_degree=0", "model.frequencies=0"),
+        ("model.mlp_layers=5", "model.mlp_width=7", "model.uv_size=9"),
+    ],
+)
+def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, ...]) -> None:
+    config, assets = small_config(*overrides).model, grid_head()
+    avatar = Avatar(assets, torch.zeros(3), config)
+    gaussians = count_gaussians(config, assets)
+    assert gaussians == len(avatar)
+    assert parameter_shapes(config, assets, gaussians) == {k: tuple(v.shape) for k, v in avatar.state_dict().items()}
+    assert len(avatar.code) <= places(config, gaussians)
+
+
+def test_a_map_too_coarse_for_a_single_gaussian_gets_a_sentence() -> None:
+    with pytest.raises(UserError, match="model.uv_size=2 is too small: no texel of a 2 x 2 raster"):
+        grid = grid_head()
+        on_rim = dict(grid.regions, boundary=torch.arange(grid.num_vertices))
+        count_gaussians(small_config("model.uv_size=2").model, grid.__class__(**{**vars(grid), "regions": on_rim}))
+
+
+MEASURE = """
+import resource, sys
+sys.path[:0] = {path!r}
+from pathlib import Path
+from small_runs import *
+from avatar.runs.footprint import training_needs
+
+def bytes_of(field):
+    return 1024 * int(next(line for line in open("/proc/self/status") if line.startswith(field)).split()[1])
+
+folder, run = Path(sys.argv[1]), Path(sys.argv[2])
+train_small(folder, run / "warm", ["trainer.iterations=1"])
+config = small_config("trainer.iterations=2", "trainer.checkpoint_every=2", *sys.argv[3:])
+source, subject, assets = open_small(folder, config)
+before = bytes_of("VmRSS")
+avatar = new_avatar(assets, subject, config)
+train(avatar, subject, config, run / "run", choose_perceptual(config.trainer, lambda _: None))
+needs = training_needs(config, assets, frames=len(subject.split.train), size=subject.image_size(), perceptual="dssim")
+print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("preset=paper", "model.uv_size=256", "model.mlp_width=256", "model.mlp_layers=4"),  # activations
+        ("model.uv_size=256", "model.latent_dim=64"),  # HyperGaussians, which are largest while they are saved
+        ("model.mlp_width=2048", "model.mlp_layers=6"),  # the network, likewise
+    ],
+    ids=["activations", "heads", "network"],
+)
+def test_training_takes_what_is_foretold(overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path) -> None:
+    script = MEASURE.format(path=[str(p) for p in (Path(__file__).parents[1], Path(__file__).parents[1] / "data_prep")])
+    process = subprocess.run(
+        [sys.executable, "-c", script, str(tracked_folder), str(tmp_path), *overrides],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    taken, foretold = map(int, process.stdout.split())
+    assert foretold > 400 * MIB, "too small to tell from the libraries' own"
+    assert 0.75 < taken / foretold < 1.25, (taken / MIB, foretold / MIB)
+
+
+def test_the_largest_part_is_what_is_to_be_lowered() -> None:
+    assets, size = grid_head(), (512, 512)
+
+    def largest(*overrides: str) -> str:
+        needs = training_needs(small_config(*overrides), assets, frames=2000, size=size, perceptual="dssim")
+        return max(needs, key=lambda need: need.size).what
+
+    assert largest("model.mlp_width=65536", "model.mlp_layers=1000") == "the deformation network"
+    assert largest("model.uv_size=2048", "model.latent_dim=64") == "the HyperGaussians"
+    assert (
+        largest("preset=paper", "model.uv_size=2048", "model.mlp_width=1024") == "the network's layers at every place"
+    )
+    assert largest("data.cache_mb=100000") == "the cache of decoded frames"
+    assert largest("data.cache_mb=1", "data.workers=64") == "a frame and its losses"
+
+
+def test_drawing_takes_less_than_training_and_grows_with_what_it_holds() -> None:
+    assets = grid_head()
+    config = small_config("model.uv_size=512")
+    gaussians = count_gaussians(config.model, assets)
+
+    def total(*overrides: str) -> int:
+        return sum(need.size for need in drawing_needs(small_config(*overrides).model, assets, gaussians))
+
+    training = training_needs(config, assets, frames=10, size=(64, 64), perceptual="none")
+    assert total("model.uv_size=512") < sum(need.size for need in training)
+    assert total("model.latent_dim=64") > 3 * total("model.latent_dim=8")
+    assert total("model.mlp_width=4096") > total() + 4096**2 * 4
