@@ -104,7 +104,7 @@ def track(
             focal_is_assumed=focal.is_assumed,
             head_path=str(head_path.resolve()),
             head_fingerprint=head.fingerprint,
-            source={"video": video.name, "sha256": footage.content_hash(), "key": key, "crop": list(view.box)}
+            source={"video": video.name, "sha256": footage.content_hash(), "key": key, "box": list(view.box)}
             | options,
             left_out=_left_out(look),
             notes=(*footage.notes, *look.notes),
