@@ -24,10 +24,11 @@ RECIPE = ["experiment=demo"]
 def run_demo_data(arguments: Namespace) -> int:
     check_outputs([arguments.out], [])
     if arguments.video:
-        make_video(arguments.out, arguments.frames, arguments.size or 512, arguments.seed, arguments.motion)
+        size = 512 if arguments.size is None else arguments.size
+        make_video(arguments.out, arguments.frames, size, arguments.seed, arguments.motion)
         print(f"Next   avatar track {arguments.out} --out SUBJECT --head head_model/ of what avatar demo-data makes")
         return OK
-    arguments.size = arguments.size or 256
+    arguments.size = 256 if arguments.size is None else arguments.size
     make_subject(arguments.out, arguments.frames, arguments.size, arguments.seed, arguments.motion)
     print(f"Next   avatar train {arguments.out}")
     return OK

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,9 @@ from data_prep.track.camera import Pinhole
 from data_prep.track.detect import FaceDetector
 from data_prep.track.embedding import LandmarkEmbedding, iris_embedding, official_embedding
 from data_prep.track.fit_result import Clip, Fit
-from data_prep.track.landmark_fit import fit_landmarks
-from data_prep.track.motion import gaze_rotations, rotations
+from data_prep.track.landmark_fit import LandmarkFit, fit_landmarks
+from data_prep.track.motion import Motion, gaze_rotations, rotations
+from data_prep.track.photometric_fit import fit_pictures
 from data_prep.track.quality import landmark_figures
 from data_prep.track.rendered_embedding import rendered_embedding
 from data_prep.tracking import FrameTrack
@@ -31,13 +31,33 @@ def fit_tracks(
 ) -> Fit:
     embedding = official_embedding(head_path, head) or _rendered(head)
     names = load_expression_names(head_path, head.num_expressions)
-    found = fit_landmarks(head, names, embedding, clip.landmarks, Pinhole(*clip.intrinsics))
-    motion = found.motion
+    camera = Pinhole(*clip.intrinsics)
+    by_landmarks = fit_landmarks(head, names, embedding, clip.landmarks, camera)
+    by_pictures = fit_pictures(head, by_landmarks, camera, clip.images.__getitem__, clip.mattes.__getitem__, progress)
+    tracks = as_tracks(by_landmarks, by_pictures.motion, clip, head.num_expressions)
+
+    def figures(tracks: dict[int, FrameTrack]) -> dict[str, Any]:
+        with_irises = embedding.with_others(iris_embedding(head))
+        return landmark_figures(head, Fit(tracks, {}), clip.landmarks, with_irises)
+
+    own = figures(tracks)
+    own["photometric"] = [
+        ["face on its mean texture, by landmarks", by_pictures.before, "dB"],
+        ["  fitted to the pictures", by_pictures.after, "dB"],
+    ]
+    if by_pictures.is_taken:
+        before = figures(as_tracks(by_landmarks, by_landmarks.motion, clip, head.num_expressions))
+        own["photometric"].append(["  landmark error before that", before["errors"]["all"], "% eyes"])
+    return Fit(tracks, own)
+
+
+def as_tracks(fit: LandmarkFit, motion: Motion, clip: Clip, expressions: int) -> dict[int, FrameTrack]:
+    """By the frames' numbers; all `expressions` of the head model. Raises UserError where a value is not finite."""
     T = len(motion)
-    expression = np.zeros((T, head.num_expressions))
-    expression[:, found.expressions.numpy()] = motion.expression.numpy()
+    expression = np.zeros((T, expressions))
+    expression[:, fit.expressions.numpy()] = motion.expression.numpy()
     shape = np.zeros(IDENTITY_COEFFICIENTS)
-    shape[: len(found.identity)] = found.identity.numpy()
+    shape[: len(fit.identity)] = fit.identity.numpy()
     columns = {
         "R": motion.R.numpy(),
         "t": motion.t.numpy(),
@@ -49,19 +69,15 @@ def fit_tracks(
     }
     if not all(np.isfinite(values).all() for values in columns.values()):
         raise UserError("the fit did not come to finite values; try another part of the video with --start and --end")
-    tracks = {
+    return {
         int(number): FrameTrack(
             **{name: values[row] for name, values in columns.items()},
             shape=shape,
             intrinsics=np.array(clip.intrinsics),
             size=clip.landmarks.size,
         )
-        for row, number in enumerate(found.frames.tolist())
+        for row, number in enumerate(fit.frames.tolist())
     }
-    fit = Fit(tracks, {})
-    return replace(
-        fit, figures=landmark_figures(head, fit, clip.landmarks, embedding.with_others(iris_embedding(head)))
-    )
 
 
 def _rendered(head: HeadAssets) -> LandmarkEmbedding:

@@ -11,7 +11,7 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from avatar.head.rasterize import rasterize_mesh
 
-COUNT = 2500
+COUNT = 1250
 _DEPTH_TOLERANCE = 2e-3  # metres
 _FACING = (0.15, 0.5)  # cosine to the line of sight: not counted below, in full above
 _REACH = 1.35  # of the skin around the eyes' middle, in distances between the eyes; without a region "face"

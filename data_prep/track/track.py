@@ -3,7 +3,7 @@
 look     every picture's faces; one person, one shot, a regular grid of times
 frames   the crop of every picture with the face
 matte    the person against the background
-fit      identity, and pose and expression of every frame
+fit      identity, and pose and expression of every frame: by landmarks, then by pictures where that gains
 head     head and neck without clothes
 mouth    the lips and what is between them
 overlay  the tracked mesh over the frames, for the eye
@@ -40,7 +40,7 @@ from data_prep.track.quality import judge
 from data_prep.track.stages import growing, hash_of
 from data_prep.track.work import Choices, Progress, Work
 
-STAGES_VERSION = 1  # raised when what a stage makes changes
+STAGES_VERSION = 2  # raised when what a stage makes changes
 Item = TypeVar("Item")
 
 
@@ -104,8 +104,7 @@ def track(
             focal_is_assumed=focal.is_assumed,
             head_path=str(head_path.resolve()),
             head_fingerprint=head.fingerprint,
-            source={"video": video.name, "sha256": footage.content_hash(), "key": key, "crop": list(view.box)}
-            | options,
+            source={"video": video.name, "sha256": footage.content_hash(), "key": key, "box": list(view.box)} | options,
             left_out=_left_out(look),
             notes=(*footage.notes, *look.notes),
             quality=quality.to_json(),

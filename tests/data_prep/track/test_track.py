@@ -48,6 +48,7 @@ def test_the_folder_is_whole(tracked: Path) -> None:
     assert (info.fps, info.width, info.height, info.left_out) == (25.0, SIZE, SIZE, {})
     assert info.focal_is_assumed and info.intrinsics[2:] == (SIZE / 2, SIZE / 2)
     assert info.source["video"] == "me.mp4" and len(info.source["sha256"]) == 64
+    assert info.source["box"] == [0, 0, SIZE, SIZE] and info.source["crop"] == "auto"
     for kind, suffix in (("frames", "jpg"), ("matte", "png"), ("head", "png"), ("mouth", "png")):
         names = sorted(path.name for path in (tracked / kind).iterdir())
         assert names == [f"{n:05d}.{suffix}" for n in range(FRAMES)], kind
