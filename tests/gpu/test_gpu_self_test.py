@@ -11,6 +11,8 @@ import torch
 from interpreter import DEVICE, HAS_GPU, the_cpus_way
 from torch import Tensor
 
+pytest.importorskip("triton", reason="Triton is not installed")
+
 from avatar.compute import self_test as module
 from avatar.compute.self_test import TOLERANCE, WrongGpu, self_test
 from avatar.splat import gpu

@@ -11,6 +11,8 @@ from interpreter import DEVICE, the_cpus_way
 from small_runs import new_avatar, open_small, small_config
 from torch import Tensor
 
+pytest.importorskip("triton", reason="Triton is not installed")
+
 from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
