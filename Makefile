@@ -20,8 +20,9 @@ setup: $(VENV)/.installed ## make .venv with pinned packages and the compiled co
 demo: setup ## make a subject, train an avatar on it, evaluate it and let another subject drive it
 	$(BIN)/avatar demo $(DEMO)
 
+# A worker for each core, with one thread: most tests have work for one.
 test: setup ## run all tests
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from avatar.config_values import check_choice, check_range, checked_value, shown, typed_value
+from avatar.config_values import check_choice, check_device, check_range, checked_value, shown, typed_value
 from avatar.data.background import Colour
 from avatar.errors import UserError
 
@@ -110,8 +109,6 @@ MAX_OVERRIDE = 1000  # characters; a message quotes the override
 MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 
-LATER_KEYS = {"device": "auto"}  # which files of earlier versions do not have
-DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 CHOICES: dict[str, tuple[str, ...]] = {
     "model.name": ("hypergaussians", "flashavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
@@ -221,8 +218,6 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
     kinds = get_type_hints(schema)
     if unknown := [key for key in values if key not in kinds]:
         raise _no_such_key(f"{prefix}{unknown[0]}")
-    if schema is Config:
-        values = {**LATER_KEYS, **values}
     if missing := [key for key in kinds if key not in values]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(
@@ -233,11 +228,6 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
             for name, kind in kinds.items()
         }
     )
-
-
-def check_device(name: str) -> None:
-    if not DEVICE.fullmatch(name):
-        raise UserError(f"device={name} is not one of auto, cpu, cuda, cuda:N (such as cuda:0)")
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import types
 from typing import Any, Union, get_args, get_origin
 
 from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
 from avatar.errors import UserError
 
+DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 _CONSTANTS = {"null": None, "~": None, "true": True, "false": False}
 _KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word"}
 
@@ -64,6 +66,11 @@ def check_range(key: str, value: float | None, low: float, high: float) -> None:
     """Raise UserError where `value` is not from `low` to `high`; NaN never is."""
     if value is not None and not low <= value <= high:
         raise UserError(f"{key}={shown(value)} is out of range: it must be from {shown(low)} to {shown(high)}")
+
+
+def check_device(name: str) -> None:
+    if not DEVICE.fullmatch(name):
+        raise UserError(f"device={shown(name)} is not one of auto, cpu, cuda, cuda:N (such as cuda:0)")
 
 
 def shown(value: Any) -> str:

@@ -11,7 +11,7 @@ import torch
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import open_run
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.data.refinement import Refinement, Round
 from avatar.refine.record import frames_csv, sheet, summary
 from avatar.refine.refine import fingerprint, refine_subject
@@ -24,6 +24,7 @@ REFINED_FOLDER = "refined"
 def run_refine(arguments: Namespace) -> int:
     run = open_run(arguments.run, arguments.head, arguments.folder)
     target: Path = arguments.out or arguments.run / REFINED_FOLDER / run.subject.name
+    check_folder_output(target)
     check_outputs([target], [Path(run.subject.manifest.source)])
     status = refine_run(run, target)
     if status == OK:

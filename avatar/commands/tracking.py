@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from avatar.commands import OK
-from avatar.commands.outputs import check_outputs
+from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.avatar_track import read_info, recognise
@@ -25,6 +25,7 @@ from data_prep.track.track import STAGES_VERSION, Choices, track
 
 
 def run_track(arguments: Namespace) -> int:
+    check_folder_output(arguments.out)
     check_outputs([arguments.out], [arguments.video, arguments.matte, arguments.head])
     head = head_for_video(arguments.video, arguments.head)
     choices = Choices(

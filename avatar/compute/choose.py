@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from avatar.compute.device import CPU
-from avatar.config import check_device
+from avatar.config_values import check_device
 from avatar.errors import UserError
 
 LEAST_TRITON = (3, 7, 1)  # what the kernels are verified with

@@ -67,14 +67,32 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     "export {run}": [
         ("{run}/avatar.safetensors", IS_INPUT),
         ("{run}/eval/a.safetensors", OF_RUN),
-        ("{motion}", "an avatar file is written as .safetensors, not as {motion}"),
+        ("{motion}", "smile.distances.csv does not say what to write"),
         ("{tmp}/folder.safetensors", IS_FOLDER),
+        ("{run}/eval/a.html", OF_RUN),
+        ("{run}/previews/a.ply", OF_RUN),
     ],
+    "export {run} --format web": [("{motion}", "--format web is written as .html, not as {motion}")],
+    "export {run} --format video --motion {motion}": [("{run}/checkpoints/a.mp4", OF_RUN)],
     "export {file} --head {head}": [
         ("{file}", IS_INPUT),
         ("{run}/avatar.safetensors", OF_RUN),
         ("{head}/a.safetensors", IN_INPUT),
     ],
+    "refine {run}": [
+        ("{data}", IS_INPUT),
+        ("{data}/imgs/refined", IN_INPUT),
+        ("{run}/eval", OF_RUN),
+        ("{motion}", IS_FILE),
+    ],
+    "track {clip} --head {head}": [
+        ("{clip}", IS_INPUT),
+        ("{clip}/tracked", IN_INPUT),
+        ("{head}/tracked", IN_INPUT),
+        ("{run}/eval", OF_RUN),
+        ("{motion}", IS_FILE),
+    ],
+    "track {clip} --head {head} --matte {data}": [("{data}/tracked", IN_INPUT)],
     "compare {run} {run}": [("{run}/eval", OF_RUN), ("{run}/run.json", IS_FILE), ("{motion}", IS_FILE)],
     "bench splat --quick": [("{run}/checkpoints", OF_RUN), ("{motion}", IS_FILE)],
     "bench train {data} --quick": [("{data}", IS_INPUT), ("{data}/bench", IN_INPUT)],
@@ -97,7 +115,7 @@ REFUSED_PLACES = {
     ],
 }
 # These write only under names of their own in the run that they are given, or nothing.
-WITHOUT_A_CHOICE = {"eval", "report", "doctor"}
+WITHOUT_A_CHOICE = {"eval", "report", "doctor", "models", "view", "send"}
 CASES = [
     *((f"{words} --out {out}", sentence) for words, outputs in REFUSED.items() for out, sentence in outputs),
     *((f"{words} {out}", sentence) for words, outputs in REFUSED_PLACES.items() for out, sentence in outputs),
@@ -133,6 +151,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "motion": motion,
         "spec": spec,
         "tracking": tracking,
+        "clip": data / "imgs",
         "head": head,
     }
 

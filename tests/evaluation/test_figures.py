@@ -97,7 +97,9 @@ def test_an_avatar_without_error_has_no_worst_frame(
 ) -> None:
     """Infinite PSNR is no figure: results stay valid JSON, and there is nothing to look at."""
     monkeypatch.setattr(
-        draw_module, "drawn", lambda gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), None)
+        draw_module,
+        "drawn",
+        lambda gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE)),
     )
     monkeypatch.setattr(Frame, "composite", lambda self, colour: colour.expand(SIZE, SIZE, 3))
     run = make_run(tmp_path / "run", subject)

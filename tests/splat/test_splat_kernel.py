@@ -25,6 +25,7 @@ from splat.scenes import (
     use_simd,
 )
 
+from avatar import _core
 from avatar.bench.scenes import head_camera, head_shell
 from avatar.splat import counters
 from avatar.types import Gaussians
@@ -203,3 +204,34 @@ def test_strided_inputs_and_cotangents_are_read_as_what_they_show() -> None:
     expected = gradients(scene, "cpu", cotangent.contiguous(), None)
     found = gradients(replace(scene, gaussians=strided), "cpu", cotangent, None)
     assert all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+def test_no_output_memory_is_left_uninitialised() -> None:
+    g = random_gaussians(500, spread=2.0)  # many hidden, some tiles empty, some pixels never reached
+    view = camera(83, 57)
+    image, alpha = torch.full((57, 83, 3), torch.nan), torch.full((57, 83), torch.nan)
+    drawing = _core.splat_forward(
+        **g._asdict(),
+        background=torch.zeros(3),
+        rotation=view.R_cam_world.flatten().tolist(),
+        translation=view.t_cam_world.tolist(),
+        intrinsics=(view.fx, view.fy, view.cx, view.cy),
+        sh_degree=1,
+        cutoffs=(1 / 255, 0.999, 1e-4),
+        blur=0.3,
+        near=0.01,
+        antialiased=False,
+        region=(0, 0, 83, 57),
+        simd="",
+        threads=2,
+        image=image,
+        alpha=alpha,
+    )
+    assert drawing is not None
+    assert torch.isfinite(image).all() and torch.isfinite(alpha).all()
+    outputs = {f"grad_{name}": torch.full_like(field, torch.nan) for name, field in g._asdict().items()}
+    outputs["grad_background"] = torch.full((3,), torch.nan)
+    cotangents = {"grad_image": torch.randn(57, 83, 3), "grad_alpha": torch.randn(57, 83)}
+    _core.splat_backward(drawing=drawing, **g._asdict(), **cotangents, **outputs)
+    assert all(torch.isfinite(output).all() for output in outputs.values())
+    assert (outputs["grad_means"] == 0).all(-1).any() and (outputs["grad_means"] != 0).any()
