@@ -113,7 +113,7 @@ PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols
 LATER_KEYS = {"device": "auto"}  # which files of earlier versions do not have
 DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 CHOICES: dict[str, tuple[str, ...]] = {
-    "model.name": ("hypergaussians", "flashavatar"),
+    "model.name": ("hypergaussians", "flashavatar", "covariance", "ndgs"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
     "trainer.lpips_net": ("vgg", "alex", "squeeze"),
     "trainer.lpips_region": ("frame", "head"),

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from copy import deepcopy
 
 import torch
 from jaxtyping import Float
@@ -21,7 +22,7 @@ from torch.nn.functional import embedding_bag
 
 from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
-from avatar.gaussians.compose import compose, split_offsets
+from avatar.gaussians.compose import compose, compose_slice, split_offsets
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
@@ -43,9 +44,10 @@ class Renderer:
         self.background = brought(background.detach().clone(), avatar.code.device)
         self._avatar = avatar
         self._network = FoldedNetwork(avatar)
-        self._on_gpu = on_gpu(avatar.code)
+        self._on_gpu = on_gpu(avatar.code) and avatar.is_fused
         self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
-        self._packed = None if avatar.hyper is None else avatar.hyper.packed.detach().clone() if self._on_gpu else None
+        self._packed = avatar.packed.detach().clone() if self._on_gpu and avatar.packed is not None else None
+        self._ndgs = deepcopy(avatar.ndgs)
         self._base = {
             name: getattr(avatar, name).detach().clone() for name in ("quats", "log_scales", "opacity_logits")
         }
@@ -67,7 +69,10 @@ class Renderer:
                 embedding=avatar.embedding,
                 grid=None if grid is None else grid.interpolate,
             )
-        return self.place(self.points(self.vertices(params)), self.offsets(self.latents(params)))
+        points, latents = self.points(self.vertices(params)), self.latents(params)
+        if self._ndgs is not None:
+            return compose_slice(points, *self._base.values(), *self._ndgs(latents))
+        return self.place(points, self.offsets(latents))
 
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
