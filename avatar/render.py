@@ -23,6 +23,7 @@ from torch.nn.functional import embedding_bag
 from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose, compose_slice, split_offsets
+from avatar.gaussians.ndgs import Slice
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
@@ -69,10 +70,7 @@ class Renderer:
                 embedding=avatar.embedding,
                 grid=None if grid is None else grid.interpolate,
             )
-        points, latents = self.points(self.vertices(params)), self.latents(params)
-        if self._ndgs is not None:
-            return compose_slice(points, *self._base.values(), *self._ndgs(latents))
-        return self.place(points, self.offsets(latents))
+        return self.place(self.points(self.vertices(params)), self.offsets(self.latents(params)))
 
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
@@ -142,11 +140,16 @@ class Renderer:
             return latents
         return grid.interpolate(latents)
 
-    def offsets(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
-        """The ten values of each Gaussian before the tanh; the latents themselves where there is no HyperGaussian."""
+    def offsets(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"] | Slice:
+        """The ten values of each Gaussian before the tanh, or its slice of an N-dimensional one; the latents themselves
+        where there is neither."""
+        if self._ndgs is not None:
+            return self._ndgs(latents)
         return latents if self._heads is None else self._heads(latents)
 
-    def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
+    def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"] | Slice) -> Gaussians:
+        if isinstance(offsets, Slice):
+            return compose_slice(points, *self._base.values(), *offsets)
         return compose(points, offsets=split_offsets(offsets), **self._base)
 
 
