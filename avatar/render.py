@@ -149,7 +149,7 @@ class Renderer:
 
     def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"] | Slice) -> Gaussians:
         if isinstance(offsets, Slice):
-            return compose_slice(points, *self._base.values(), *offsets)
+            return compose_slice(points, **self._base, position=offsets.position, density=offsets.density)
         return compose(points, offsets=split_offsets(offsets), **self._base)
 
 
