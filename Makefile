@@ -11,7 +11,7 @@ DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup demo test stress fuzz sanitize wasm arm64 gpu-check check format smoke wheel clean
+.PHONY: help setup demo test stress fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
@@ -41,6 +41,9 @@ arm64: ## compile the core for 64-bit ARM with a cross compiler (Debian: g++-aar
 
 gpu-check: setup ## verify the GPU's kernels without a GPU (installs Triton, 700 MB)
 	PIP_FLAGS="$(PIP_FLAGS)" scripts/check_gpu_kernels.sh
+
+paper-smoke: setup ## run scripts/paper, which makes the paper's tables, tiny
+	scripts/paper/smoke.sh
 
 check: setup ## lint, formatting and types
 	$(BIN)/ruff check .

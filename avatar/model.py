@@ -10,12 +10,14 @@ from torch import Tensor, nn
 
 from avatar.compute.device import brought, on_gpu
 from avatar.config import ModelConfig
-from avatar.gaussians.compose import compose_raw
+from avatar.gaussians.compose import compose_raw, compose_slice
+from avatar.gaussians.covariance import CovarianceHeads
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size, positional_encoding
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
+from avatar.gaussians.ndgs import NdGaussians
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, PoseTensors
@@ -29,6 +31,7 @@ class Avatar(nn.Module):
 
     `name = "hypergaussians"`: the network gives each Gaussian a latent, its HyperGaussians turn that into offsets. With
     `latent_grid` the network is evaluated on that grid over the UV map and its latents are interpolated to the Gaussians.
+    `name = "covariance"`: the same through the covariance; `name = "ndgs"`: the latent slices N-dimensional Gaussians.
     `name = "flashavatar"`: the network gives the offsets itself; they are not smooth over the map, so no grid is used.
 
     `to(device)` moves all that drawing needs. `head` stays on the CPU, for those who look at the mesh; cameras and head
@@ -44,9 +47,9 @@ class Avatar(nn.Module):
         self.embedding = Embedding(assets, uv_texels(assets, config.uv_size))
         N = len(self.embedding)
         neutral = self.embedding.points(self.head.neutral_vertices())
-        is_hyper = config.name == "hypergaussians"
+        has_latents = config.name != "flashavatar"
         self.grid: LatentGrid | None = None
-        if is_hyper and config.latent_grid is not None:
+        if has_latents and config.latent_grid is not None:
             self.grid = latent_grid(assets, self.embedding.texels, config.uv_size, neutral, config.latent_grid)
         places = neutral if self.grid is None else self.grid.places
         self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
@@ -54,11 +57,14 @@ class Avatar(nn.Module):
         self.deformation = DeformationMLP(
             code_size=encoded_size(config.frequencies),
             condition_size=assets.num_expressions + CONDITION_EXTRAS,
-            out_size=config.latent_dim if is_hyper else 10,
+            out_size=config.latent_dim if has_latents else 10,
             width=config.mlp_width,
             layers=config.mlp_layers,
         )
-        self.hyper = HyperHeads(N, config.latent_dim) if is_hyper else None
+        self.hyper: HyperHeads | CovarianceHeads | None = None
+        if config.name in ("hypergaussians", "covariance"):
+            self.hyper = (HyperHeads if config.name == "hypergaussians" else CovarianceHeads)(N, config.latent_dim)
+        self.ndgs = NdGaussians(N, config.latent_dim) if config.name == "ndgs" else None
 
         initial_scale = torch.log(knn_scales(neutral))
         self.log_scales = nn.Parameter(initial_scale[:, None].repeat(1, 3))
@@ -80,17 +86,29 @@ class Avatar(nn.Module):
         values = self.deformation(self.code, self.condition(params))
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
         base = self.quats, self.log_scales, self.opacity_logits, sh
-        if on_gpu(values) and values.dtype == torch.float32:
+        if on_gpu(values) and values.dtype == torch.float32 and self.is_fused:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
             grid = None if self.grid is None else self.grid.interpolate
-            packed = None if self.hyper is None else self.hyper.packed
-            return place_gpu(vertices, values, packed, *base, self.embedding, grid)
+            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid)
         if self.grid is not None:
             values = self.grid.interpolate(values)
+        points = self.embedding.points(vertices)
+        if self.ndgs is not None:
+            return compose_slice(points, *base, *self.ndgs(values))
         if self.hyper is not None:
             values = self.hyper(values)
-        return compose_raw(self.embedding.points(vertices), *base, values)
+        return compose_raw(points, *base, values)
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether a GPU has kernels for all that follows the network; else torch's own operations do it there."""
+        return self.ndgs is None and not isinstance(self.hyper, CovarianceHeads)
+
+    @property
+    def packed(self) -> Float[Tensor, "blocks rows 16"] | None:
+        """The parameters of the HyperGaussian heads where they are held as `avatar.gaussians.hyper.pack` has them."""
+        return self.hyper.packed if isinstance(self.hyper, HyperHeads) else None
 
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
         """The posed head where the avatar is, metres; on a GPU without gradients."""

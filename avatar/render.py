@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from copy import deepcopy
 
 import torch
 from jaxtyping import Float
@@ -21,7 +22,8 @@ from torch.nn.functional import embedding_bag
 
 from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
-from avatar.gaussians.compose import compose, split_offsets
+from avatar.gaussians.compose import compose, compose_slice, split_offsets
+from avatar.gaussians.ndgs import Slice
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
@@ -43,9 +45,10 @@ class Renderer:
         self.background = brought(background.detach().clone(), avatar.code.device)
         self._avatar = avatar
         self._network = FoldedNetwork(avatar)
-        self._on_gpu = on_gpu(avatar.code)
+        self._on_gpu = on_gpu(avatar.code) and avatar.is_fused
         self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
-        self._packed = None if avatar.hyper is None else avatar.hyper.packed.detach().clone() if self._on_gpu else None
+        self._packed = avatar.packed.detach().clone() if self._on_gpu and avatar.packed is not None else None
+        self._ndgs = deepcopy(avatar.ndgs)
         self._base = {
             name: getattr(avatar, name).detach().clone() for name in ("quats", "log_scales", "opacity_logits")
         }
@@ -137,11 +140,16 @@ class Renderer:
             return latents
         return grid.interpolate(latents)
 
-    def offsets(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
-        """The ten values of each Gaussian before the tanh; the latents themselves where there is no HyperGaussian."""
+    def offsets(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"] | Slice:
+        """The ten values of each Gaussian before the tanh, or its slice of an N-dimensional one; the latents themselves
+        where there is neither."""
+        if self._ndgs is not None:
+            return self._ndgs(latents)
         return latents if self._heads is None else self._heads(latents)
 
-    def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
+    def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"] | Slice) -> Gaussians:
+        if isinstance(offsets, Slice):
+            return compose_slice(points, **self._base, position=offsets.position, density=offsets.density)
         return compose(points, offsets=split_offsets(offsets), **self._base)
 
 

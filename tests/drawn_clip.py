@@ -51,13 +51,12 @@ class Clip:
         return self.pictures[index]
 
 
-def patterned_avatar(folder: Path) -> Avatar:
+def patterned_avatar(folder: Path, *overrides: str) -> Avatar:
     """An avatar that is opaque and has a pattern all over, whose colours depend on where they are seen from."""
     assets = write_head_model(folder, EXPRESSIONS)
     torch.manual_seed(0)
-    avatar = Avatar(
-        assets, torch.tensor([0.5, -0.3]), small_config("model.uv_size=48", "model.initial_opacity=0.8").model
-    )
+    config = small_config("model.uv_size=48", "model.initial_opacity=0.8", *overrides)
+    avatar = Avatar(assets, torch.tensor([0.5, -0.3]), config.model)
     places = avatar.embedding.points(avatar.head.neutral_vertices())
     pattern = 0.5 + 0.35 * torch.sin(150.0 * places + torch.tensor([0.0, 1.0, 2.0]))
     with torch.no_grad():

@@ -28,6 +28,7 @@ def lively_avatar(folder: Path, run: Path, *overrides: str, seed: int = 3) -> Tr
         "sh_rest": 0.05,
         "deformation": 0.02,
         "hyper": 0.02,
+        "ndgs": 0.02,
     }
     with torch.no_grad():
         for name, parameter in trained.avatar.named_parameters():

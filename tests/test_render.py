@@ -27,13 +27,21 @@ def trained_looking(*overrides: str) -> Avatar:
         for parameter in avatar.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
         avatar.opacity_logits += 2.0
+        if avatar.ndgs is not None:  # latents near the mean, so that not all is faded away
+            avatar.deformation.output.weight *= 0.1
     return avatar
 
 
 @pytest.mark.parametrize(
     "overrides",
-    [("model.latent_grid=4",), ("model.latent_grid=null",), ("model=flashavatar",)],
-    ids=["hypergaussians on a grid", "hypergaussians", "flashavatar"],
+    [
+        ("model.latent_grid=4",),
+        ("model.latent_grid=null",),
+        ("model=flashavatar",),
+        ("model=covariance",),
+        ("model=ndgs",),
+    ],
+    ids=["hypergaussians on a grid", "hypergaussians", "flashavatar", "covariance", "ndgs"],
 )
 def test_the_renderer_gives_what_the_avatar_gives(overrides: tuple[str, ...]) -> None:
     avatar = trained_looking(*overrides)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.model import Avatar
 from avatar.runs.trained import TrainedAvatar
@@ -57,8 +58,16 @@ class Drawing:
 
 @torch.no_grad()
 def reduce_avatar(trained: TrainedAvatar) -> Drawing:
-    """Fold what can be folded, and leave out expression directions and vertices that nothing uses."""
+    """Fold what can be folded, and leave out expression directions and vertices that nothing uses.
+
+    Raises UserError for an avatar that does not fold.
+    """
     model, assets = trained.avatar, trained.assets
+    if model.ndgs is not None:
+        raise UserError(
+            "an avatar of model=ndgs cannot be exported for browsers, which do not know its opacities; train one with "
+            "model=hypergaussians"
+        )
     moved = (trained.recording.tracks["expression"] != 0).any(dim=0).nonzero().flatten()
     used, corners = torch.unique(model.embedding.corners, return_inverse=True)
     arrays: dict[str, Tensor] = {

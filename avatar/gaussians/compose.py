@@ -56,6 +56,29 @@ def compose(
     )
 
 
+def compose_slice(
+    points: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    log_scales: Float[Tensor, "N 3"],
+    opacity_logits: Float[Tensor, " N"],
+    sh: Float[Tensor, "N K 3"],
+    position: Float[Tensor, "N 3"],
+    density: Float[Tensor, " N"],
+) -> Gaussians:
+    """Gaussians that move and fade, and do not turn or grow: a slice of N-dimensional ones (`avatar.gaussians.ndgs`).
+
+    position  offsets, metres, through tanh as FlashAvatar's are
+    density   the opacity's factor, in [0, 1]
+    """
+    return Gaussians(
+        means=points + torch.tanh(position),
+        quats=torch.nn.functional.normalize(quats, dim=-1),
+        scales=torch.exp(log_scales),
+        opacities=torch.sigmoid(opacity_logits) * density,
+        sh=sh,
+    )
+
+
 def compose_raw(
     points: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],

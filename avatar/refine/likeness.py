@@ -126,7 +126,8 @@ class Likeness:
         eye = -(pose.R.T @ pose.t)  # where the camera is, in the head's space
         gaussians = self.avatar(head_params(values))
         # Leaves and nodes of their own, so that the ways to the picture stay apart: through the drawing and the colours.
-        drawn = gaussians._replace(means=gaussians.means.view_as(gaussians.means))
+        quats = gaussians.quats if gaussians.quats.requires_grad else gaussians.quats.clone().requires_grad_()  # ndgs
+        drawn = gaussians._replace(means=gaussians.means.view_as(gaussians.means), quats=quats)
         camera = HeadPose(*(part.detach() for part in pose))
         seen_from = eye.detach().requires_grad_()
         colours = sh_colours(gaussians.sh, normalize(gaussians.means - seen_from, dim=-1), self.avatar.config.sh_degree)

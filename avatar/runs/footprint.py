@@ -11,6 +11,7 @@ from avatar.compute.memory import Need
 from avatar.config import Config, ModelConfig
 from avatar.data.loader import BYTES_PER_PIXEL, FRAMES_AHEAD
 from avatar.errors import UserError
+from avatar.gaussians.covariance import triangle_size
 from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
 from avatar.gaussians.uv import uv_texels
@@ -48,7 +49,6 @@ def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
 def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) -> Shapes:
     """The shape of every tensor in the state dict of the `Avatar` that this makes."""
     N, n, width = gaussians, config.latent_dim, config.mlp_width
-    is_hyper = config.name == "hypergaussians"
     inputs = encoded_size(config.frequencies) + assets.num_expressions + CONDITION_EXTRAS
     shapes: Shapes = {
         "log_scales": (N, 3),
@@ -58,10 +58,14 @@ def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) ->
         "sh_rest": (N, (config.sh_degree + 1) ** 2 - 1, 3),
     }
     layers = [("input", inputs, width), *((f"hidden.{i}", width, width) for i in range(config.mlp_layers - 1))]
-    for name, given, made in (*layers, ("output", width, n if is_hyper else OFFSETS)):
+    for name, given, made in (*layers, ("output", width, OFFSETS if config.name == "flashavatar" else n)):
         shapes |= {f"deformation.{name}.weight": (made, given), f"deformation.{name}.bias": (made,)}
-    if is_hyper:
-        for name, m in HEADS.items():
+    if config.name == "ndgs":
+        shapes |= {"ndgs.mean": (3 + n, N), "ndgs.root": (triangle_size(n), N), "ndgs.cross": (3, n, N)}
+    for name, m in HEADS.items():
+        if config.name == "covariance":
+            shapes |= {f"hyper.{name}.mean": (m + n, N), f"hyper.{name}.factor": (triangle_size(m + n), N)}
+        elif config.name == "hypergaussians":
             shapes |= {f"hyper.{name}.mean": (N, m + n), f"hyper.{name}.lower": (N, m, m)}
             shapes |= {f"hyper.{name}.cross": (N, n, m)}
     return shapes
@@ -94,6 +98,9 @@ def training_needs(
         ),
         Need("drawing", FLOAT * gaussians * (STEP_FLOATS + 3 * model.latent_dim), "model.uv_size"),
     ]
+    if model.name == "covariance":  # of each head: the factor as a square, and that of the latent's block
+        squares = sum((m + model.latent_dim) ** 2 + model.latent_dim**2 for m in HEADS.values())
+        step.append(Need("the covariances", FLOAT * gaussians * squares, "model.uv_size or model.latent_dim"))
     saving = parameter_needs(shapes, SAVING_COPIES, UNPACKING_COPIES)
     return [*lasting, *max(step, saving, key=lambda needs: sum(need.size for need in needs))]
 
@@ -114,13 +121,15 @@ def parameter_needs(shapes: Shapes, copies: int, more_of_heads: int = 0) -> list
     """What the parameters take, `copies` times; `more_of_heads`: and the HyperGaussians so many times more."""
     sizes = dict.fromkeys((_NETWORK, _HEADS, _OTHERS), 0)
     for name, shape in shapes.items():
-        part = _NETWORK if name.startswith("deformation.") else _HEADS if name.startswith("hyper.") else _OTHERS
+        part = (
+            _NETWORK if name.startswith("deformation.") else _HEADS if name.startswith(("hyper.", "ndgs.")) else _OTHERS
+        )
         sizes[part] += FLOAT * math.prod(shape) * (copies + more_of_heads * (part is _HEADS))
     return [Need(what, size, lower) for (what, lower), size in sizes.items()]
 
 
 def places(config: ModelConfig, gaussians: int) -> int:
     """Where the network is evaluated: at every Gaussian, or at the nodes of a grid, of which each needs four at most."""
-    if config.name != "hypergaussians" or config.latent_grid is None:
+    if config.name == "flashavatar" or config.latent_grid is None:
         return gaussians
     return min(4 * gaussians, (config.latent_grid + 2) ** 2)

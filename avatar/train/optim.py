@@ -25,8 +25,9 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
         {"params": [avatar.quats], "lr": rates.rotation},
         {"params": list(avatar.deformation.parameters()), "lr": rates.mlp},
     ]
-    if avatar.hyper is not None:
-        groups.append({"params": list(avatar.hyper.parameters()), "lr": rates.hyper})
+    for distributions in (avatar.hyper, avatar.ndgs):
+        if distributions is not None:
+            groups.append({"params": list(distributions.parameters()), "lr": rates.hyper})
     for group in groups:
         group["full_lr"] = group["lr"]
     # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.

@@ -13,6 +13,7 @@ import torch
 from browsers import WEB, node
 from lively import lively_avatar, psnr
 
+from avatar.errors import UserError
 from avatar.export.web_page import write_web_avatar
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
@@ -25,6 +26,7 @@ MODELS = {
     "no grid": ("model=hypergaussians", "model.latent_grid=null"),
     "no HyperGaussians": ("model=flashavatar",),
     "no view dependence": ("model.sh_degree=0",),
+    "covariance": ("model=covariance",),
 }
 
 
@@ -76,6 +78,13 @@ def test_webassembly_draws_the_same_pictures(model: str, tracked_folder: Path, t
     assert psnr(truth[0], truth[1]) < 30, "frames differ"
     picture = drawn_by_node(trained, "float", tmp_path)
     assert min(psnr(a, b) for a, b in zip(picture, truth, strict=True)) > 60
+
+
+def test_opacities_that_change_are_refused_in_a_sentence(tracked_folder: Path, tmp_path: Path) -> None:
+    trained = lively_avatar(tracked_folder, tmp_path / "run", "model=ndgs")
+    with pytest.raises(UserError, match="model=ndgs cannot be exported for browsers"):
+        write_web_avatar(trained, tmp_path / "a.avatar")
+    assert not (tmp_path / "a.avatar").exists()
 
 
 def test_quantised_parameters_lose_little_and_save_much(tracked_folder: Path, tmp_path: Path) -> None:

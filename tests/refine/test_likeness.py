@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -83,6 +84,21 @@ def mistracked(clip: Clip) -> tuple[torch.Tensor, HeadPose]:
 @pytest.mark.parametrize("level", [0, 1])
 def test_the_gradient_is_that_through_the_reference(likeness: Likeness, clip: Clip, level: int) -> None:
     """The reference splatter is differentiable in its camera and computes the colours itself."""
+    check_gradient(likeness, clip, level)
+
+
+def test_the_gradient_of_gaussians_that_never_turn_is_that_through_the_reference(tmp_path: Path) -> None:
+    avatar = patterned_avatar(tmp_path, "model=ndgs")
+    with torch.no_grad():
+        for parameter in (avatar.ndgs or avatar).parameters():
+            parameter += 0.02 * torch.randn_like(parameter)
+    with frozen(avatar):
+        check_gradient(
+            Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0)), drawn_clip(avatar, 4, 3)
+        )
+
+
+def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
     target = targets(clip.pictures[2], BACKGROUND, 2)[level]
     values, pose = mistracked(clip)
     found = likeness.fit(values, pose, target)

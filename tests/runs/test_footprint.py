@@ -23,6 +23,9 @@ MIB = 2**20
         ("preset=paper", "model.latent_dim=3", "model.sh_degree=1"),
         ("model=flashavatar", "model.mlp_layers=1", "model.sh_degree=0", "model.frequencies=0"),
         ("model.mlp_layers=5", "model.mlp_width=7", "model.uv_size=9"),
+        ("model=covariance", "model.latent_dim=3"),
+        ("preset=paper", "model=covariance"),
+        ("model=ndgs", "model.latent_dim=5"),
     ],
 )
 def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, ...]) -> None:
@@ -70,8 +73,10 @@ print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
         ("preset=paper", "model.uv_size=256", "model.mlp_width=256", "model.mlp_layers=4"),  # activations
         ("model.uv_size=256", "model.latent_dim=64"),  # HyperGaussians, which are largest while they are saved
         ("model.mlp_width=2048", "model.mlp_layers=6"),  # the network, likewise
+        ("model=covariance", "model.uv_size=256", "model.latent_dim=12"),
+        ("model=ndgs", "model.uv_size=256", "model.latent_dim=40"),
     ],
-    ids=["activations", "heads", "network"],
+    ids=["activations", "heads", "network", "covariances", "n-dimensional"],
 )
 def test_training_takes_what_is_foretold(overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path) -> None:
     script = MEASURE.format(path=[str(p) for p in (Path(__file__).parents[1], Path(__file__).parents[1] / "data_prep")])

@@ -14,6 +14,7 @@ from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
 from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
+from avatar.splat import splat
 from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import PerceptualTerm, Weighted, choose_perceptual
@@ -44,7 +45,7 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
     assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 3
 
 
-@pytest.mark.parametrize("model", ["hypergaussians", "flashavatar"])
+@pytest.mark.parametrize("model", ["hypergaussians", "flashavatar", "covariance", "ndgs"])
 def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(tracked_folder: Path, tmp_path: Path, model: str) -> None:
     """Across the boundaries where a spherical-harmonics degree and the perceptual term come in."""
     train_small(tracked_folder, tmp_path / "whole", [f"model={model}"])
@@ -71,6 +72,30 @@ def test_a_resumed_run_of_the_papers_recipe_has_the_bits_too(tracked_folder: Pat
     train_small(tracked_folder, tmp_path / "broken", ["preset=paper"], resume=halfway)
     whole, broken = newest_checkpoint(tmp_path / "whole"), newest_checkpoint(tmp_path / "broken")
     assert not [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])]
+
+
+@pytest.mark.parametrize("model", ["covariance", "ndgs"])
+def test_the_papers_other_systems_learn(tracked_folder: Path, tmp_path: Path, model: str) -> None:
+    """The pictures get nearer, and every parameter that the latent is weighed by leaves its start."""
+    config = small_config("preset=paper", f"model={model}", "model.mlp_width=24", "trainer.iterations=150")
+    _, subject, assets = open_small(tracked_folder, config)
+    untrained = new_avatar(assets, subject, config)
+    trained, _ = train_small(
+        tracked_folder, tmp_path / "run", ["preset=paper", f"model={model}", "trainer.iterations=150"]
+    )
+    frame = subject.frame(subject.split.train[0])
+    background = torch.ones(3)
+
+    def score(avatar: Avatar) -> float:
+        with torch.no_grad():
+            image = splat(avatar(frame.params), frame.camera, background).image
+        return float(psnr(image, frame.composite(background)))
+
+    assert score(trained) > score(untrained) + 2.0
+    part = trained.ndgs if model == "ndgs" else trained.hyper
+    assert part is not None
+    for name, parameter in part.named_parameters():
+        assert bool((parameter != 0).any(dim=0).all()), f"{name} did not move"
 
 
 def test_a_sparse_perceptual_term_keeps_its_weight_on_average_and_has_a_stand_in() -> None:

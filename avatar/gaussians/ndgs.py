@@ -1,0 +1,72 @@
+"""N-dimensional Gaussians (NDGS) in the place of FlashAvatar's offsets: what HyperGaussians are compared with.
+
+Each Gaussian is one normal distribution over (position a, latent b) of 3 + n values, of which a splat is a slice:
+
+    position   E[a | b] = mu_a + Sigma_ab Sigma_bb^-1 (b - mu_b)
+    shape      Cov[a | b] = Sigma_aa - Sigma_ab Sigma_bb^-1 Sigma_ba, the same for every b
+    opacity    times the joint density at (E[a | b], b) over its peak, exp(-(b - mu_b)^T Sigma_bb^-1 (b - mu_b) / 2)
+
+Source: Diolatzis et al., N-Dimensional Gaussians (2024), as HyperGaussians (CVPR 2026, section 3, "Bayesian
+Interpretation", and supplement, "Comparison with NDGS") describes it inside FlashAvatar.
+
+Sigma is stored by its block Cholesky factor with the latent first. Every covariance has one:
+
+    Sigma_bb = B B^T      Sigma_ab = A B^T      Sigma_aa = A A^T + (R S)(R S)^T
+
+with B lower triangular (n x n, diagonal through exp), A any 3 x n matrix and R S the Gaussian's own rotation and scales.
+So the conditional covariance is R S^2 R^T: it keeps FlashAvatar's parameters, start and learning rates, needs no
+eigenvectors, whose gradients have no value for a sphere, and with w = B^-1 (b - mu_b) all else is one substitution:
+position mu_a + A w, density exp(-|w|^2 / 2).
+
+Gaussians lie last, so that each step of the substitution is one operation on contiguous rows of all of them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from avatar.gaussians.covariance import range_of_rows, triangle_size
+
+
+class Slice(NamedTuple):
+    """What the latent decides of a splat."""
+
+    position: Float[Tensor, "N 3"]  # metres, relative to the point on the mesh
+    density: Float[Tensor, " N"]  # in (0, 1]: the opacity's factor
+
+
+class NdGaussians(nn.Module):
+    """N Gaussians over (position, latent of n values); all parameters 0 at the start.
+
+    Raises ValueError for less than one latent dimension.
+    """
+
+    def __init__(self, num_gaussians: int, latent_size: int) -> None:
+        super().__init__()
+        if latent_size < 1:
+            raise ValueError(f"an N-dimensional Gaussian needs at least one latent dimension, got {latent_size}")
+        self.latent_size = latent_size
+        self.mean = nn.Parameter(torch.zeros(3 + latent_size, num_gaussians))  # of the position, then of the latent
+        self.root = nn.Parameter(torch.zeros(triangle_size(latent_size), num_gaussians))  # B, row by row
+        self.cross = nn.Parameter(torch.zeros(3, latent_size, num_gaussians))  # A
+
+    def forward(self, latents: Float[Tensor, "N n"]) -> Slice:
+        mean_a, mean_b = self.mean.split((3, self.latent_size))
+        whitened = substitute(self.root, latents.T - mean_b)
+        position = mean_a + (self.cross * whitened).sum(dim=1)
+        return Slice(position.T, torch.exp(-0.5 * whitened.square().sum(dim=0)))
+
+
+def substitute(triangle: Float[Tensor, "T N"], right: Float[Tensor, "n N"]) -> Float[Tensor, "n N"]:
+    """w with B w = right. `triangle` holds B row by row: the strictly lower part as it is, the diagonal through exp."""
+    n = len(right)
+    solved: list[Tensor] = []
+    for row, value in zip(triangle.split(range_of_rows(n)), right.unbind(), strict=True):
+        if solved:
+            value = value - (row[:-1] * torch.stack(solved)).sum(dim=0)
+        solved.append(value * torch.exp(-row[-1]))
+    return torch.stack(solved)
