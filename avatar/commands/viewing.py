@@ -51,9 +51,10 @@ def run_view(arguments: Namespace) -> int:
     stage = Stage(trained, None if run is None else truth_of(run))
     live = open_live(arguments, trained)
     try:
-        player = Player(trained, motions, time.monotonic, *(() if live is None else (live.newest, live.name)))
-        status = () if live is None else (live.status, live.calibrate)
-        viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, *status)
+        newest, name = (None, "") if live is None else (live.newest, live.name)
+        player = Player(trained, motions, time.monotonic, newest, name)
+        about = (None, None) if live is None else (live.status, live.calibrate)
+        viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, *about)
         try:
             shown = "localhost" if arguments.host in LOCAL else arguments.host
             print(f"Open     http://{shown}:{viewer.port}/" + (f"?token={token}" if token else ""), flush=True)

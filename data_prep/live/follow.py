@@ -59,6 +59,7 @@ class FaceFollower:
         self.milliseconds: dict[str, float] = {}  # of the last picture, by part
 
     def close(self) -> None:
+        """Calls that wait end with UserError."""
         self.pictures.close()
 
     def dropped(self) -> tuple[int, int]:

@@ -25,14 +25,15 @@ from data_prep.track.landmarks import Landmarks
 from data_prep.track.levenberg import Term, concatenated, minimise
 from data_prep.track.motion import Motion, at_rest
 from data_prep.track.normal_equations import NormalEquations
-from data_prep.track.priors import make_priors
+from data_prep.track.priors import expected, score_targets
 from data_prep.track.smoothness import NOMINAL_FPS, Smoothness, make_smoothness
 from data_prep.track.start import start_poses
 
-STEPS = 3  # of Levenberg-Marquardt
+STEPS = 2  # of Levenberg-Marquardt; more do not bring it nearer to the fit of the whole clip
 LOST_AFTER = 0.5  # seconds after which a face is looked for anew
+POSE_LOOSER = 0.5  # times the stiffness of a clip's fit: without later frames what is stiff lags behind
 FASTEST, SLOWEST = 60.0, 5.0  # frames a second that the smoothness is scaled to
-_BEHIND = 1e-3  # metres
+_BEHIND = 1e-3  # metres; a head nearer than this is not in front of the camera
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,12 @@ class FrameFit:
         camera: Pinhole,
         size: tuple[int, int],
     ) -> None:
-        self._assets, self._names, self._fit, self._camera, self._size = assets, names, fit, camera, size
-        self._statistical = is_statistical(assets)
+        self._assets, self._fit, self._camera, self._size = assets, fit, camera, size
+        self._targets = score_targets(names, fit.expressions)
         _, self._weights = weighted_landmarks(assets, embedding)
         self._rigid = is_rigid(fit.term.landmarks)
         self._smoothness = make_smoothness(
-            assets, torch.arange(3), NOMINAL_FPS, len(fit.expressions), self._statistical
+            assets, torch.arange(3), NOMINAL_FPS, len(fit.expressions), is_statistical(assets)
         )
         self._before: list[_Fitted] = []  # at most two
 
@@ -80,7 +81,7 @@ class FrameFit:
             unit=point_units(self._assets, self._camera, start.t),
             pair_weights=self._fit.term.pair_weights[:1],
         )
-        priors = make_priors(seen, self._names, self._fit.expressions, self._statistical)
+        priors = replace(self._fit.priors, mean=expected(seen, self._targets, len(self._fit.expressions)))
         terms: list[Term] = [term, priors]
         if self._before:
             terms.append(_follows(self._smoothness, self._before, taken))
@@ -150,7 +151,7 @@ def _follows(nominal: Smoothness, before: list[_Fitted], taken: float) -> _Follo
     faster = min(max(rate, SLOWEST), FASTEST) / NOMINAL_FPS
     scaled = replace(
         nominal.take(slice(0, len(before) + 1)),
-        pose=nominal.pose * faster**1.5,
+        pose=POSE_LOOSER * nominal.pose * faster**1.5,
         first=nominal.first * faster,
         second=nominal.second * faster**3,
     )
