@@ -30,6 +30,9 @@ from data_prep.track.smoothness import NOMINAL_FPS, Smoothness, make_smoothness
 from data_prep.track.start import start_poses
 
 STEPS = 2  # of Levenberg-Marquardt; more do not bring it nearer to the fit of the whole clip
+FIRST_STEPS = 8  # of a face that nothing is known of
+QUICKEST = 10.0  # m/s^2 across the picture: what is quicker is a cut, or is torn in half by the smoothness
+LEAST_QUICK = 0.01  # metres, that are not called quick in any time
 LOST_AFTER = 0.5  # seconds after which a face is looked for anew
 POSE_LOOSER = 0.5  # times the stiffness of a clip's fit: without later frames what is stiff lags behind
 FASTEST, SLOWEST = 60.0, 5.0  # frames a second that the smoothness is scaled to
@@ -73,7 +76,11 @@ class FrameFit:
         if self._before and not 0 < taken - self._before[-1].taken < LOST_AFTER:
             self._before = []
         seen = Landmarks(face.points[None], face.scores[None], np.ones(1, bool), self._size, NOMINAL_FPS)
-        start = self._start(seen)
+        try:
+            start = self._start(seen)
+        except cv2.error:  # points that no camera sees so
+            self._before = []
+            return None
         term = replace(
             self._fit.term,
             observed=torch.from_numpy(seen.points[:, self._fit.term.landmarks, :2].astype(np.float64)),
@@ -83,11 +90,12 @@ class FrameFit:
         )
         priors = replace(self._fit.priors, mean=expected(seen, self._targets, len(self._fit.expressions)))
         terms: list[Term] = [term, priors]
+        steps = STEPS if self._before else FIRST_STEPS
+        if _is_quick(self._before, start, taken):
+            self._before = []
         if self._before:
             terms.append(_follows(self._smoothness, self._before, taken))
-        done = minimise(
-            terms, self._fit.identity, start, self._fit.columns, STEPS, with_identity=False, coupled=False
-        )  # fmt: skip
+        done = minimise(terms, self._fit.identity, start, self._fit.columns, steps, with_identity=False, coupled=False)
         if not (torch.isfinite(done.motion.coefficients()).all() and done.motion.t[0, 2] > _BEHIND):
             self._before = []
             return None
@@ -123,6 +131,17 @@ def _moved_pose(
     if not (np.isfinite(turn).all() and np.isfinite(shift).all() and shift[2, 0] > _BEHIND):
         return last.R, last.t
     return torch.from_numpy(cv2.Rodrigues(turn)[0])[None], torch.from_numpy(shift[:, 0].copy())[None]
+
+
+def _is_quick(before: list[_Fitted], start: Motion, taken: float) -> bool:
+    """Whether the head has left the place where it would be with the speed that it had."""
+    if not before:
+        return False
+    last, wait = before[-1], taken - before[-1].taken
+    expected = last.motion.t[0, :2]
+    if len(before) == 2:
+        expected = expected + (expected - before[0].motion.t[0, :2]) * wait / (last.taken - before[0].taken)
+    return float((start.t[0, :2] - expected).norm()) > max(QUICKEST * wait**2, LEAST_QUICK)
 
 
 @dataclass(frozen=True)
