@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,20 +48,25 @@ class Calibration:
 
 
 class FaceFollower:
-    """A face in the newest pictures of a source. Use from one thread."""
+    """A face in the newest pictures of a source. Use from one thread, but for `close`."""
 
     def __init__(self, source: Source, assets: HeadAssets, head_path: Path, say: Callable[[str], object]) -> None:
         """Raises UserError where MediaPipe or its model is missing. The head model's landmarks may take 30 s, once."""
         self._assets, self._detector = assets, FaceDetector()
         self._embedding = find_embedding(head_path, assets, say)
         self.pictures = Newest(source)
+        self._looking, self._is_closed = threading.Lock(), False
         self._last: Face | None = None
         self._fit: FrameFit | None = None
         self.milliseconds: dict[str, float] = {}  # of the last picture, by part
 
     def close(self) -> None:
-        """Calls that wait end with UserError."""
+        """From any thread; calls that wait end with UserError."""
         self.pictures.close()
+        with self._looking:
+            if not self._is_closed:
+                self._is_closed = True
+                self._detector.__exit__(None, None, None)
 
     def dropped(self) -> tuple[int, int]:
         """Pictures that a newer one overtook before they were looked at, and all."""
@@ -118,7 +124,10 @@ class FaceFollower:
 
     def _find(self, picture: LivePicture) -> Face | None:
         """The same person's face as before where there are several, else the largest."""
-        faces = self._detector.find(picture.image)
+        with self._looking:
+            if self._is_closed:
+                raise UserError(f"{self.pictures.source.name} is closed")
+            faces = self._detector.find(picture.image)
         if not faces:
             return None
         last = self._last

@@ -1,7 +1,8 @@
 """The tracker's fit one frame at a time: the identity is known, the frames before are done, the ones after are not there.
 
 What is minimised is what `landmark_fit` minimises, without what lies ahead: landmarks, priors, and smoothness towards the
-two frames before. A few steps from the last frame do, because it is near.
+two frames before. A few steps from the last frame do, because it is near. `scripts/measure_webcam.py` says how far from the
+fit of a whole clip it stays.
 """
 
 from __future__ import annotations
