@@ -136,6 +136,10 @@ class FaceFollower:
         return self._last
 
     def _calibrated(self, found: list[tuple[Face, float]]) -> Calibration:
+        # A frame's matrices are small: threads wait for each other, on a busy machine ten times as long as they work.
+        # Drawing keeps its own number, which it has had since before.
+        torch.get_num_threads()
+        torch.set_num_threads(1)
         times = [taken for _, taken in found]
         points = np.stack([face.points for face, _ in found])
         size = self.pictures.source.size
