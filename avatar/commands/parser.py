@@ -263,6 +263,14 @@ def add_view(view: argparse.ArgumentParser) -> None:
     )
     view.add_argument("--port", type=int, default=8080, help="default: 8080; 0 takes a free one")
     view.add_argument("--token", metavar="TEXT", help="what a browser must know (default: made up where it is needed)")
-    view.add_argument(
+    live = view.add_mutually_exclusive_group()
+    live.add_argument(
         "--stream", type=int, metavar="PORT", help="take frames there: JSON lines, OSC, Live Link Face; 0: a free port"
+    )
+    live.add_argument(
+        "--webcam",
+        nargs="?",
+        const="0",
+        metavar="N|VIDEO",
+        help="follow your face: a camera's number (default: 0), or a video",
     )

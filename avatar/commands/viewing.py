@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.commands import OK
+from avatar.commands.driving import head_of
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_run, open_trained
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
@@ -27,6 +28,9 @@ from avatar.view.receiver import Receiver
 from avatar.view.sender import send
 from avatar.view.server import Viewer
 from avatar.view.stage import Stage
+from avatar.view.webcam import Webcam
+from data_prep.live.follow import FaceFollower
+from data_prep.live.pictures import open_source
 
 WIDTHS = (64, 2048)
 CACHED_PICTURES = 64
@@ -44,24 +48,49 @@ def run_view(arguments: Namespace) -> int:
     if arguments.host not in LOCAL:
         token = token or secrets.token_urlsafe(16)
     motions = clips(trained, arguments.drive)
-    receiver = None if arguments.stream is None else Receiver(trained, arguments.stream)
-    player = Player(trained, motions, time.monotonic, None if receiver is None else receiver.newest)
     stage = Stage(trained, None if run is None else truth_of(run))
-    live = (None, None) if receiver is None else (receiver.status, receiver.calibrate)
-    viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, *live)
+    live = open_live(arguments, trained)
     try:
-        shown = "localhost" if arguments.host in LOCAL else arguments.host
-        print(f"Open     http://{shown}:{viewer.port}/" + (f"?token={token}" if token else ""), flush=True)
-        if receiver is not None:
-            print(f"Stream   127.0.0.1:{receiver.port}: lines of JSON (TCP), OSC and Live Link Face (UDP)", flush=True)
-        print("Ctrl-C ends it.", flush=True)
-        while True:
-            time.sleep(3600)
+        newest, name = (None, "") if live is None else (live.newest, live.name)
+        player = Player(trained, motions, time.monotonic, newest, name)
+        about = (None, None) if live is None else (live.status, live.calibrate)
+        viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, *about)
+        try:
+            shown = "localhost" if arguments.host in LOCAL else arguments.host
+            print(f"Open     http://{shown}:{viewer.port}/" + (f"?token={token}" if token else ""), flush=True)
+            if isinstance(live, Receiver):
+                print(f"Stream   127.0.0.1:{live.port}: lines of JSON (TCP), OSC and Live Link Face (UDP)", flush=True)
+            elif live is not None:
+                live.start(viewer.wake.set)
+            print("Ctrl-C ends it.", flush=True)
+            while True:
+                time.sleep(3600)
+        finally:
+            viewer.close()
     finally:
-        viewer.close()
-        if receiver is not None:
-            receiver.close()
+        if live is not None:
+            live.close()
     return OK
+
+
+def open_live(arguments: Namespace, trained: TrainedAvatar) -> Receiver | Webcam | None:
+    """What drives the avatar live: nothing, a stream or a face in front of a camera."""
+    if arguments.stream is not None:
+        return Receiver(trained, arguments.stream)
+    if arguments.webcam is None:
+        return None
+
+    def say(words: str) -> None:
+        print(f"Webcam   {words}", flush=True)
+
+    source = open_source(arguments.webcam)
+    say(f"{source.name}, {source.size[0]} x {source.size[1]} pixels")
+    try:
+        follower = FaceFollower(source, trained.assets, head_of(arguments, trained), say)
+    except BaseException:
+        source.close()
+        raise
+    return Webcam(trained, follower, say)
 
 
 def open_with_video(arguments: Namespace) -> Run | None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from avatar.runs.clips import Clip
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
+from avatar.view.live import Live
 
-NEUTRAL, STREAM = "neutral face", "stream"
+NEUTRAL, STREAM, WEBCAM = "neutral face", "stream", "webcam"
 
 
 @dataclass(frozen=True)
@@ -18,27 +19,30 @@ class Shown:
     camera: Camera
     recorded: int | None  # of the avatar's own video
     key: object  # another one for another frame
+    taken: float | None = None  # seconds of `time.monotonic`, of a live frame
 
 
 class Player:
-    """`clock` gives seconds; `live` the newest frame of a stream, or None before the first."""
+    """`clock` gives seconds; `live` the newest frame of what is called `live_name`, or None before the first."""
 
     def __init__(
         self,
         trained: TrainedAvatar,
         clips: Mapping[str, Clip],
         clock: Callable[[], float],
-        live: Callable[[], tuple[int, HeadParams] | None] | None = None,
+        live: Callable[[], Live | None] | None = None,
+        live_name: str = STREAM,
     ) -> None:
         self._clips, self._clock, self._live = dict(clips), clock, live
         self._rest = Shown(trained.rest_params(), trained.rest_camera(), None, NEUTRAL)
-        self.name = NEUTRAL if live is None else STREAM
+        self._live_name = live_name
+        self.name = NEUTRAL if live is None else live_name
         self.is_playing = False
         self._since, self._first = 0.0, 0
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (NEUTRAL, *self._clips, *([STREAM] if self._live else []))
+        return (NEUTRAL, *self._clips, *([self._live_name] if self._live else []))
 
     @property
     def clip(self) -> Clip | None:
@@ -82,7 +86,7 @@ class Player:
             index = self.index
             params, camera = clip.frames[index]
             return Shown(params, camera, clip.recorded[index] if clip.recorded else None, (self.name, index))
-        if self.name == STREAM and self._live is not None and (newest := self._live()) is not None:
-            number, params = newest
-            return replace(self._rest, params=params, key=(STREAM, number))
+        if self.name == self._live_name and self._live is not None and (newest := self._live()) is not None:
+            camera = newest.camera or self._rest.camera
+            return Shown(newest.params, camera, None, (self.name, newest.number), newest.taken)
         return self._rest

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -17,7 +18,9 @@ from avatar.motion.rest import RestPose
 from avatar.motion.transfer import departed
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
+from avatar.view.live import Live
 from avatar.view.packets import MAX_LINE, FrameReader, PacketError
+from avatar.view.player import STREAM
 
 MAX_SENDERS = 8
 MAX_DATAGRAM = 1 << 16
@@ -33,13 +36,15 @@ class Counts:
 class Receiver:
     """Listens until `close`. Expressions that come as coefficients are shown as they are until `calibrate`."""
 
+    name = STREAM
+
     def __init__(self, trained: TrainedAvatar, port: int, host: str = "127.0.0.1") -> None:
         """Port 0 takes a free one, then in `port`. Raises UserError when it is taken."""
         self._assets = trained.assets
         self._goal = RestPose(trained.neutral.expression, trained.neutral.jaw, None)
         self._source: RestPose | None = None
         self._newest: tuple[HeadParams, bool] | None = None
-        self._number, self._is_shown = 0, True
+        self._number, self._taken, self._is_shown = 0, 0.0, True
         self._received = self._dropped = self._malformed = 0
         self._complaint = ""
         self._lock = threading.Lock()
@@ -66,17 +71,18 @@ class Receiver:
         said = f"Stream on port {self.port}: {counts.received} frames, {counts.dropped} dropped"
         return said + (f", {counts.malformed} malformed (last: {complaint})" if counts.malformed else "")
 
-    def newest(self) -> tuple[int, HeadParams] | None:
-        """The newest frame as the avatar's, and its number; None before the first."""
+    def newest(self) -> Live | None:
+        """The newest frame as the avatar's; None before the first."""
         with self._lock:
             if self._newest is None:
                 return None
             (params, is_departure), source, self._is_shown = self._newest, self._source, True
-            number = self._number
+            number, taken = self._number, self._taken
         if is_departure and source is None:
             identity = matrix_from_6d(params.neck)  # no rotation
             source = RestPose(params.expression * 0, identity, None)
-        return number, params if source is None else departed([params], source, self._goal, 1.0)[0]
+        own = params if source is None else departed([params], source, self._goal, 1.0)[0]
+        return Live(number, own, taken=taken)
 
     def calibrate(self) -> None:
         """Take the newest frame for the driver's neutral face: departures from it are shown from the avatar's own."""
@@ -99,6 +105,7 @@ class Receiver:
             self._newest, self._is_shown = (params, is_departure), False
             self._received += 1
             self._number += 1
+            self._taken = time.monotonic()
 
     def _refuse(self, error: PacketError) -> None:
         with self._lock:

@@ -21,6 +21,7 @@ from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
 from avatar.view.gate import Gate
+from avatar.view.live import Pace
 from avatar.view.player import Player
 from avatar.view.stage import Look, Setting, Stage
 
@@ -33,7 +34,7 @@ LABELS = {"jaw": "jaw open", "look_left": "look to its left", "turn": "turn to i
 
 
 class Viewer:
-    """Runs until `close`; everything that a browser may set can be set here too."""
+    """Runs until `close`; everything that a browser may set can be set here too. `wake` hurries the next picture."""
 
     def __init__(
         self,
@@ -50,12 +51,12 @@ class Viewer:
         self.stage, self.player, self._width = stage, player, width
         self._setting, self._changed = Setting(), 0.0
         self._moving_width = width
-        self._lock, self._wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
+        self._lock, self.wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
         self._aspects: dict[int, float] = {}
         self._last: tuple[object, ...] = ()
         self._stream_status = stream_status
         self.picture: np.ndarray | None = None
-        self.milliseconds = 0.0
+        self.milliseconds, self.pace = 0.0, Pace()
         inner = _free_port()
         with redirect_stdout(io.StringIO()):  # it prints its own address, which is not the one to open
             self._server = viser.ViserServer(host="127.0.0.1", port=inner, label=stage.trained.name, verbose=False)
@@ -83,7 +84,7 @@ class Viewer:
 
     def close(self) -> None:
         self._stop.set()
-        self._wake.set()
+        self.wake.set()
         self._thread.join(10)
         self._gate.close()
         with redirect_stdout(io.StringIO()):
@@ -97,7 +98,7 @@ class Viewer:
 
     def _touch(self) -> None:
         self._changed = time.monotonic()
-        self._wake.set()
+        self.wake.set()
 
     def look_from(self, offset: np.ndarray) -> Look:
         """What a camera at this offset from the head means for `orbited`."""
@@ -191,7 +192,8 @@ class Viewer:
         while not self._stop.is_set():
             with self._lock:
                 shown, setting, now = self.player.now(), self._setting, time.monotonic()
-                is_moving = self.player.is_playing or now - self._changed < STILL_AFTER
+                newest = max(self._changed, shown.taken or 0.0)
+                is_moving = self.player.is_playing or now - newest < STILL_AFTER
             width = self._moving_width if is_moving else self._width
             key = (shown.key, setting, width)
             if key != self._last:
@@ -201,11 +203,13 @@ class Viewer:
                 self.milliseconds = 1000 * (time.perf_counter() - begin)
                 self.picture = picture
                 self._send(picture)
+                if shown.taken is not None:
+                    self.pace.add(shown.taken, time.monotonic())
                 if is_moving:
                     self._fit(self.milliseconds)
             else:
-                self._wake.wait(0.01)
-                self._wake.clear()
+                self.wake.wait(0.01)
+                self.wake.clear()
             if now - told > STATUS_EVERY:
                 told = now
                 self._tell(self.stage.distance(self.stage.params(shown.params, setting)), setting)
@@ -231,6 +235,8 @@ class Viewer:
             lines.append("**The camera is where the training video never was: the avatar guesses.**")
         if self._stream_status is not None:
             lines.append(self._stream_status())
+            if (pace := self.pace.now(time.monotonic())) is not None:
+                lines.append(f"Latency {pace[0]:.0f} ms at {pace[1]:.0f} pictures a second")
         self._status.content = "\n\n".join(lines)
         self._play.label = "Pause" if self.player.is_playing else "Play"
         if self.player.is_playing:

@@ -29,7 +29,7 @@ def fit_tracks(
     head_path: Path,
     progress: Callable[[Iterable[Any], int | None, str], Iterable[Any]],
 ) -> Fit:
-    embedding = official_embedding(head_path, head) or _rendered(head)
+    embedding = find_embedding(head_path, head)
     names = load_expression_names(head_path, head.num_expressions)
     camera = Pinhole(*clip.intrinsics)
     by_landmarks = fit_landmarks(head, names, embedding, clip.landmarks, camera)
@@ -80,11 +80,17 @@ def as_tracks(fit: LandmarkFit, motion: Motion, clip: Clip, expressions: int) ->
     }
 
 
-def _rendered(head: HeadAssets) -> LandmarkEmbedding:
+def find_embedding(
+    head_path: Path, head: HeadAssets, say: Callable[[str], object] = lambda _: None
+) -> LandmarkEmbedding:
+    """The landmarks' places on the head model: those that lie beside it, else found once by pictures of it."""
+    official = official_embedding(head_path, head)
+    if official is not None:
+        return official
     with FaceDetector() as detector:
 
         def landmarker(image: np.ndarray) -> np.ndarray | None:
             face = detector.largest(image)
             return None if face is None else face.points
 
-        return rendered_embedding(head, landmarker)
+        return rendered_embedding(head, landmarker, say)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
@@ -102,14 +102,7 @@ def make_landmark_term(
     expressions: Int[Tensor, " E"],
 ) -> LandmarkTerm:
     """The term of the frames of `seen`; its unit is one pixel as yet."""
-    embedding = embedding.with_others(iris_embedding(assets))
-    weight = _landmark_weights(assets, embedding)
-    kept = weight > 0
-    embedding = LandmarkEmbedding(embedding.landmarks[kept], embedding.corners[kept], embedding.barycentric[kept])
-    weights = torch.from_numpy(weight[kept]).expand(len(seen), -1).clone()
-    for iris, blink in ((groups.LEFT_IRIS, "eyeBlinkLeft"), (groups.RIGHT_IRIS, "eyeBlinkRight")):
-        open_share = (1.0 - seen.score(blink).astype(np.float64)).clip(0, 1)
-        weights[:, embedding.landmarks == iris] *= torch.from_numpy(open_share[:, None] ** 2)
+    embedding, weights = weighted_landmarks(assets, embedding)
     row = {int(landmark): k for k, landmark in enumerate(embedding.landmarks)}
     pairs = [
         (row[a], row[b])
@@ -122,13 +115,33 @@ def make_landmark_term(
         points=SurfacePoints(assets, *as_points(embedding), identities, expressions),
         camera=camera,
         observed=torch.from_numpy(seen.points[:, embedding.landmarks, :2].astype(np.float64)),
-        weights=weights,
+        weights=faded(weights, embedding.landmarks, seen),
         unit=torch.ones(T, dtype=torch.float64),
         pairs=torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2),
         pair_weights=torch.full((T, len(pairs)), PAIR_WEIGHT, dtype=torch.float64),
         scale=ROBUST,
         pair_scale=ROBUST_PAIRS,
     )
+
+
+def weighted_landmarks(
+    assets: HeadAssets, embedding: LandmarkEmbedding
+) -> tuple[LandmarkEmbedding, Float[Tensor, " L"]]:
+    """The landmarks that are fitted to, those of the irises among them, and how much each counts."""
+    embedding = embedding.with_others(iris_embedding(assets))
+    weight = _landmark_weights(assets, embedding)
+    kept = weight > 0
+    embedding = LandmarkEmbedding(embedding.landmarks[kept], embedding.corners[kept], embedding.barycentric[kept])
+    return embedding, torch.from_numpy(weight[kept])
+
+
+def faded(weights: Float[Tensor, " L"], landmarks: Int[np.ndarray, " L"], seen: Landmarks) -> Float[Tensor, "T L"]:
+    """The weights in each frame of `seen`: an iris counts as far as its eye is open."""
+    by_frame = weights.expand(len(seen), -1).clone()
+    for iris, blink in ((groups.LEFT_IRIS, "eyeBlinkLeft"), (groups.RIGHT_IRIS, "eyeBlinkRight")):
+        open_share = (1.0 - seen.score(blink).astype(np.float64)).clip(0, 1)
+        by_frame[:, landmarks == iris] *= torch.from_numpy(open_share[:, None] ** 2)
+    return by_frame
 
 
 def _landmark_weights(assets: HeadAssets, embedding: LandmarkEmbedding) -> np.ndarray:
@@ -152,14 +165,23 @@ def eye_distance(assets: HeadAssets) -> float:
 
 def _start(assets: HeadAssets, embedding: LandmarkEmbedding, seen: Landmarks, camera: Pinhole) -> tuple[Tensor, Tensor]:
     """Poses by the landmarks of the generic head that the mouth does not move."""
-    rigid = np.isin(embedding.landmarks, groups.FEATURES) & ~np.isin(embedding.landmarks, groups.LIPS)
+    rigid = is_rigid(embedding.landmarks)
     at = (assets.template.double().numpy()[embedding.corners[rigid]] * embedding.barycentric[rigid, :, None]).sum(1)
     return start_poses(at, seen.points[:, embedding.landmarks[rigid], :2], camera)
 
 
+def is_rigid(landmarks: Int[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:
+    """Which landmarks tell the head's pose: contours that the mouth does not move."""
+    return np.isin(landmarks, groups.FEATURES) & ~np.isin(landmarks, groups.LIPS)
+
+
 def _with_unit(term: LandmarkTerm, assets: HeadAssets, camera: Pinhole, t: Tensor) -> LandmarkTerm:
-    unit = POINT_SHARE * eye_distance(assets) * camera.fx / t[:, 2]
-    return replace(term, unit=unit)
+    return replace(term, unit=point_units(assets, camera, t))
+
+
+def point_units(assets: HeadAssets, camera: Pinhole, t: Float[Tensor, "T 3"]) -> Float[Tensor, " T"]:
+    """The landmarks' standard deviation in pixels, of heads at these places."""
+    return POINT_SHARE * eye_distance(assets) * camera.fx / t[:, 2]
 
 
 def _plausible(priors: Priors) -> Float[Tensor, "T C"]:

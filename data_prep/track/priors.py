@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -81,44 +84,63 @@ def _between_eyes(motion: Motion) -> Float[Tensor, "T 2"]:
     return motion.gaze[:, :2] - motion.gaze[:, 2:]
 
 
-def make_priors(
-    landmarks: Landmarks, names: ExpressionNames, expressions: Int[Tensor, " E"], statistical: bool
-) -> Priors:
-    """Priors of the frames of `landmarks` for the coefficients that the fit uses, numbered as in the head model."""
-    T, E = len(landmarks), len(expressions)
-    C = Columns.EXPRESSION.start - Columns.HEAD.start + E
-    mean = torch.zeros(T, C, dtype=torch.float64)
-    deviation = torch.empty(C, dtype=torch.float64)
-    low, high = torch.full((C,), -torch.inf, dtype=torch.float64), torch.full((C,), torch.inf, dtype=torch.float64)
+class ScoreTarget(NamedTuple):
+    """A blendshape's score that is expected in a column of the coefficients, times a weight."""
 
-    def part(columns: slice) -> slice:
-        first = Columns.HEAD.start
-        return slice(columns.start - first, None if columns.stop is None else columns.stop - first)
+    score: str
+    column: int  # from `Columns.HEAD` on
+    weight: float
 
-    def score(name: str) -> Tensor:
-        return torch.from_numpy(landmarks.score(name)).double()
 
-    jaw, lids, expression = part(Columns.JAW), part(Columns.EYELIDS), part(Columns.EXPRESSION)
-    deviation[jaw] = torch.tensor(JAW_DEVIATION, dtype=torch.float64)
-    deviation[part(Columns.GAZE)] = GAZE_DEVIATION
-    deviation[lids] = EYELID_DEVIATION
-    deviation[part(Columns.NECK)] = NECK_DEVIATION
-    deviation[expression] = STATISTICAL_DEVIATION if statistical else EXPRESSION_DEVIATION
-    mean[:, lids] = torch.stack((score("eyeBlinkLeft"), score("eyeBlinkRight")), dim=1)
-    low[lids], high[lids] = BOX
-    if not statistical:
-        low[expression], high[expression] = BOX
+def _part(columns: slice) -> slice:
+    """Where columns of a step lie in the coefficients."""
+    first = Columns.HEAD.start
+    return slice(columns.start - first, None if columns.stop is None else columns.stop - first)
+
+
+def score_targets(names: ExpressionNames, expressions: Int[Tensor, " E"]) -> tuple[ScoreTarget, ...]:
+    """What the scores say about the coefficients that the fit uses, numbered as in the head model."""
+    jaw, lids, expression = _part(Columns.JAW), _part(Columns.EYELIDS), _part(Columns.EXPRESSION)
+    found = [ScoreTarget("eyeBlinkLeft", lids.start, 1.0), ScoreTarget("eyeBlinkRight", lids.start + 1, 1.0)]
     column_of = {int(coefficient): expression.start + k for k, coefficient in enumerate(expressions)}
     jaw_is_named = False
     for blendshape in BLENDSHAPES:
         for target, weight in names.targets(blendshape).items():
             if isinstance(target, str):  # an axis of the jaw
                 jaw_is_named = True
-                mean[:, jaw.start + "xyz".index(target[-1])] += weight * score(blendshape)
+                found.append(ScoreTarget(blendshape, jaw.start + "xyz".index(target[-1]), weight))
             elif target in column_of:
-                mean[:, column_of[target]] += SCORE_SHARE * weight * score(blendshape)
+                found.append(ScoreTarget(blendshape, column_of[target], SCORE_SHARE * weight))
     if not jaw_is_named:
-        mean[:, jaw.start] = JAW_PER_SCORE * score("jawOpen")
+        found.append(ScoreTarget("jawOpen", jaw.start, JAW_PER_SCORE))
+    return tuple(found)
+
+
+def expected(landmarks: Landmarks, targets: Sequence[ScoreTarget], expressions: int) -> Float[Tensor, "T C"]:
+    """The coefficients that the scores of every frame speak for."""
+    mean = np.zeros((len(landmarks), _part(Columns.EXPRESSION).start + expressions))
+    for name, column, weight in targets:
+        mean[:, column] += weight * landmarks.score(name).astype(np.float64)
+    return torch.from_numpy(mean)
+
+
+def make_priors(
+    landmarks: Landmarks, names: ExpressionNames, expressions: Int[Tensor, " E"], statistical: bool
+) -> Priors:
+    """Priors of the frames of `landmarks` for the coefficients that the fit uses, numbered as in the head model."""
+    mean = expected(landmarks, score_targets(names, expressions), len(expressions))
+    C = mean.shape[1]
+    deviation = torch.empty(C, dtype=torch.float64)
+    low, high = torch.full((C,), -torch.inf, dtype=torch.float64), torch.full((C,), torch.inf, dtype=torch.float64)
+    lids, expression = _part(Columns.EYELIDS), _part(Columns.EXPRESSION)
+    deviation[_part(Columns.JAW)] = torch.tensor(JAW_DEVIATION, dtype=torch.float64)
+    deviation[_part(Columns.GAZE)] = GAZE_DEVIATION
+    deviation[lids] = EYELID_DEVIATION
+    deviation[_part(Columns.NECK)] = NECK_DEVIATION
+    deviation[expression] = STATISTICAL_DEVIATION if statistical else EXPRESSION_DEVIATION
+    low[lids], high[lids] = BOX
+    if not statistical:
+        low[expression], high[expression] = BOX
     named_negative = (mean[:, expression] < 0).any(0)  # mapped to with a negative weight: goes both ways
     low[expression] = torch.where(named_negative, -BOX[1], low[expression])
     return Priors(mean, deviation.pow(-2), low, high)

@@ -160,7 +160,7 @@ def test_a_slow_reader_sees_the_newest_frame(receiver: Receiver) -> None:
         for i in range(50):
             sender.sendall(json.dumps({"expression": [i / 100]}).encode() + b"\n")
         until(lambda: receiver.counts.received == 50)
-        number, params = receiver.newest()  # type: ignore[misc]
+        number, params, *_ = receiver.newest()  # type: ignore[misc]
         assert params.expression[0] == pytest.approx(0.49) and receiver.counts.dropped == 49
         assert receiver.newest()[0] == number  # type: ignore[index]
         sender.sendall(b'{"expression": [1]}\n')
@@ -192,14 +192,14 @@ def test_departures_begin_at_the_avatars_own_neutral_face(receiver: Receiver, tr
         until(lambda: receiver.counts.received == 2)
         assert receiver.newest()[1].expression[0] == pytest.approx(0.3), "as it is"  # type: ignore[index]
         receiver.calibrate()
-        number, params = receiver.newest()  # type: ignore[misc]
+        number, params, *_ = receiver.newest()  # type: ignore[misc]
         torch.testing.assert_close(params.expression, trained.neutral.expression)
         torch.testing.assert_close(params.jaw, trained.rest_params().jaw, atol=1e-6, rtol=0)
         sender.sendall(b'{"expression": [0.8, 0.1], "jaw": [0.1, 0, 0]}\n')
         until(lambda: receiver.counts.received == 3)
         expected = trained.neutral.expression.clone()
         expected[0] += 0.5
-        later, params = receiver.newest()  # type: ignore[misc]
+        later, params, *_ = receiver.newest()  # type: ignore[misc]
         torch.testing.assert_close(params.expression, expected)
         assert later > number
 

@@ -1,0 +1,166 @@
+"""`--webcam`: a person's face in pictures that come now, as the avatar's.
+
+The tracker is given: it says what face is in the newest picture. Here its motion becomes the avatar's, relative to both
+neutral faces, and so does the movement of its head.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.errors import UserError
+from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.motion.rest import RestPose, find_neutral
+from avatar.motion.transfer import departed
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import Camera, HeadParams
+from avatar.view.live import Live
+from avatar.view.player import WEBCAM
+
+NO_FACE = "There is no face in the picture."
+
+
+class Face(Protocol):
+    """A face in one picture."""
+
+    @property
+    def params(self) -> HeadParams: ...
+    @property
+    def R_cam_head(self) -> Float[Tensor, "3 3"]: ...
+    @property
+    def t_cam_head(self) -> Float[Tensor, 3]: ...
+    @property
+    def taken(self) -> float:
+        """Seconds of `time.monotonic`."""
+        ...
+
+
+class Calibration(Protocol):
+    @property
+    def identity(self) -> Float[Tensor, " S"]: ...
+    @property
+    def faces(self) -> Sequence[Face]: ...
+
+
+class Tracker(Protocol):
+    """Every call may wait for pictures, and raises UserError when no more will come."""
+
+    @property
+    def milliseconds(self) -> Mapping[str, float]:
+        """What the last picture took, by part."""
+        ...
+
+    def calibrate(self, say: Callable[[str], object]) -> Calibration:
+        """Who it is; `say` hears what the person should do."""
+        ...
+
+    def follow(self) -> Face | None:
+        """The face in the newest picture; None where there is none."""
+        ...
+
+    def dropped(self) -> tuple[int, int]:
+        """How many pictures a newer one overtook, and how many there were."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Webcam:
+    """Follows from `start` until `close`, in a thread of its own; the face stays as it was when pictures end."""
+
+    name = WEBCAM
+
+    def __init__(self, trained: TrainedAvatar, tracker: Tracker, say: Callable[[str], object] = print) -> None:
+        """`say` hears, once each, what happens; `status` says it too."""
+        self._trained, self._tracker, self._say = trained, tracker, say
+        self._goal = RestPose(trained.neutral.expression, trained.neutral.jaw, None)
+        self._own = trained.rest_camera()
+        self._lock = threading.Lock()
+        self._newest: Live | None = None
+        self._face: Face | None = None
+        self._rest: RestPose | None = None
+        self._rest_face: Face | None = None
+        self._words, self._is_open = "Waiting for the first picture.", True
+        self._on_frame: Callable[[], object] = lambda: None
+        self._thread = threading.Thread(target=self._run, daemon=True, name="webcam")
+
+    def start(self, on_frame: Callable[[], object]) -> None:
+        """`on_frame` is called, from another thread, when there is a new one."""
+        self._on_frame = on_frame
+        self._thread.start()
+
+    def close(self) -> None:
+        self._is_open = False
+        self._tracker.close()
+        if self._thread.is_alive():
+            self._thread.join(5)
+
+    def newest(self) -> Live | None:
+        """The newest frame as the avatar's; None until calibration is done."""
+        return self._newest
+
+    def status(self) -> str:
+        """A sentence or two for the page."""
+        if self._words:
+            return self._words
+        parts = ", ".join(f"{name} {value:.0f} ms" for name, value in self._tracker.milliseconds.items())
+        dropped, count = self._tracker.dropped()
+        return f"Webcam: {parts}; {dropped} of {count} pictures dropped"
+
+    def calibrate(self) -> None:
+        """Take the newest face for the person's neutral one, and where it is for its place."""
+        with self._lock:
+            if (face := self._face) is not None:
+                self._rest = RestPose(face.params.expression, matrix_from_6d(face.params.jaw[None])[0], None)
+                self._rest_face = face
+
+    def _run(self) -> None:
+        try:
+            calibration = self._tracker.calibrate(self._tell)
+            self._learn(calibration)
+            self._say("Calibrated: the avatar follows.")
+            while self._is_open:
+                self._take(self._tracker.follow())
+        except UserError as error:
+            if self._is_open:
+                self._tell(str(error))
+        except Exception as error:
+            if self._is_open:
+                self._tell(f"Following the face has failed ({type(error).__name__}: {error}); start anew.")
+                raise
+
+    def _tell(self, words: str) -> None:
+        self._words = words
+        self._say(words)
+
+    def _learn(self, calibration: Calibration) -> None:
+        head = HeadModel(self._trained.assets, calibration.identity)
+        rest = find_neutral([face.params for face in calibration.faces], head)
+        self._rest, self._rest_face = rest, calibration.faces[rest.frame or 0]
+
+    def _take(self, face: Face | None) -> None:
+        if face is None:
+            self._words = NO_FACE
+            return
+        self._words = ""
+        with self._lock:
+            self._face, rest, rest_face = face, self._rest, self._rest_face
+        assert rest is not None and rest_face is not None
+        params = departed([face.params], rest, self._goal, 1.0)[0]
+        number = 0 if self._newest is None else self._newest.number + 1
+        self._newest = Live(number, params, moved_camera(self._own, rest_face, face), face.taken)
+        self._on_frame()
+
+
+def moved_camera(own: Camera, rest: Face, face: Face) -> Camera:
+    """`own` with the head turned and moved as from `rest` to `face`; its depth scales the movement, not the lens."""
+    turn = face.R_cam_head @ rest.R_cam_head.T
+    scale = own.t_cam_world[2] / rest.t_cam_head[2]
+    shift = scale * (face.t_cam_head - rest.t_cam_head)
+    return replace(own, R_cam_world=turn @ own.R_cam_world, t_cam_world=own.t_cam_world + shift)
