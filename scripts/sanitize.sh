@@ -20,5 +20,5 @@ export ASAN_OPTIONS=detect_leaks=0:abort_on_error=1 UBSAN_OPTIONS=print_stacktra
 packages=$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 export PYTHONPATH=$site:$packages
 (cd / && "$python" -S -c 'import avatar._core, sys; sys.exit(not avatar._core.__file__.startswith(sys.argv[1]))' "$site/")
-[ $# -gt 0 ] || set -- tests/stress tests/splat tests/gaussians tests/head tests/test_dssim_cpu.py tests/fuzz/test_bindings.py
+[ $# -gt 0 ] || set -- tests/stress tests/splat tests/gaussians tests/head tests/losses/test_dssim_cpu.py tests/fuzz/test_bindings.py
 "$python" -S "$(dirname "$python")/pytest" --timeout=0 "$@"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,3 +71,9 @@ def test_files_stay_small() -> None:
     paths = [*modules("avatar"), *modules("data_prep"), *modules("tests")]
     long = [str(path) for path in paths if len(path.read_text(encoding="utf-8").splitlines()) > 300]
     assert not long
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scripts").rglob("*.sh")), ids=lambda p: p.name)
+def test_scripts_name_tests_that_are_there(path: Path) -> None:
+    for name in re.findall(r"\btests/[\w/.]*\w", path.read_text(encoding="utf-8")):
+        assert (ROOT / name).exists(), f"{path.name} names {name}"
