@@ -29,7 +29,11 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
     ):
         points = [(row, row.accuracy) for row in here if row.accuracy and kind_of(row) == kind]
         by_error.scatter(
-            [a.gradient for _, a in points], [total(row) for row, _ in points], s=30, marker=mark, label=kind
+            [a.gradient for _, a in points],
+            [total(row) for row, _ in points],
+            s=30,
+            marker=mark,
+            label=kind if points else None,
         )
         for row, accuracy in points:
             # The names of neighbours lean away from each other.
