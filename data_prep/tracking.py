@@ -106,7 +106,8 @@ def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
         raise BadFrame(f"{name} is not numbers") from None
     if array.dtype.kind not in "iuf":
         raise BadFrame(f"{name} is not numbers")
-    values = array.astype(np.float64).ravel()
+    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below, and needs no warning before that
+        values = array.astype(np.float64).ravel()
     if count is not None and len(values) != count:
         raise BadFrame(f"{name} has {len(values)} values, not {count}")
     if not np.isfinite(values).all():

@@ -1,21 +1,21 @@
-"""Every reader of files that come from elsewhere, with valid files to start from."""
+"""Every reader of files, with valid files to start from; here those of other programs and a run's."""
 
 from __future__ import annotations
 
 import io
 import pickle
-import shutil
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from exports import write_imavatar, write_insta, write_vhap
+from own_targets import make_own_targets
 from scipy import sparse
 from small_runs import run_info
+from target import Reader, Target, member, of_copy, on_disk, with_member
 from tracked_folder import write_tracked_folder
 
 from avatar.config import load_config
@@ -50,18 +50,6 @@ LIVE_LINK_FACE = b"""\xef\xbb\xbfTimecode,BlendShapeCount,EyeBlinkLeft,EyeLookDo
 10:31:11:00.156,61,0.1,0.2,0.3,0.4,0.5
 """
 
-Reader = tuple[Path | None, Callable[[bytes], object]]  # the file to put the bytes into, if any; what reads them
-
-
-@dataclass(frozen=True)
-class Target:
-    """Valid files and what reads them; `weight` is the share of the cases."""
-
-    seeds: list[bytes]
-    reader: Reader
-    weight: float = 1.0
-    wrap: Callable[[bytes], bytes] = bytes  # makes a file of mutated contents, with checksums that fit
-
 
 def make_targets(place: Path) -> dict[str, Target]:
     """`place` is an empty folder for the files that readers open."""
@@ -80,15 +68,6 @@ def make_targets(place: Path) -> dict[str, Target]:
     write_run_info(place / "run", run_info("dssim"))
     picture = cv2.imread(str(tracked / "imgs" / "00002.jpg"))
     assert picture is not None
-
-    def on_disk(path: Path, read: Callable[[Path], object]) -> Reader:
-        return path, lambda _: read(path)
-
-    def of_copy(file: Path, folder: Path, read: Callable[[Path], object]) -> Reader:
-        """Reads a copy of `folder` in which `file` is another one."""
-        copy = place / f"copy of {folder.name} for {file.name}"
-        shutil.copytree(folder, copy)
-        return copy / file.relative_to(folder), lambda _: read(copy)
 
     def listed(folder: Path) -> object:
         source = open_tracked_folder(folder)
@@ -111,7 +90,8 @@ def make_targets(place: Path) -> dict[str, Target]:
     }
     model = tracked / "head_model"
     parts = {
-        file.name: Target([file.read_bytes()], of_copy(file, model, load_head_assets), 0.25) for file in model.iterdir()
+        file.name: Target([file.read_bytes()], of_copy(place, file, model, load_head_assets), 0.25)
+        for file in model.iterdir()
     }
     images = [
         _encoded(picture, ".jpg"),
@@ -119,14 +99,14 @@ def make_targets(place: Path) -> dict[str, Target]:
         _encoded(np.dstack((picture, picture[..., 0])), ".png"),
     ]
     in_torch: Reader = None, lambda data: load_torch_pickle(data, "x")
-    content, npz = _member(frame, "data.pkl"), parameters.read_bytes()
+    content, npz = member(frame, "data.pkl"), parameters.read_bytes()
     run, manifest, tracks = place / "run" / "run.json", prepared / "manifest.json", prepared / "tracks.safetensors"
 
     def listing(name: str, weight: float) -> Target:
-        return Target([folders[name].read_bytes()], of_copy(folders[name], folders[name].parent, listed), weight)
+        return Target([folders[name].read_bytes()], of_copy(place, folders[name], folders[name].parent, listed), weight)
 
     def in_frame(data: bytes) -> bytes:
-        return _with_member(frame, "data.pkl", data)
+        return with_member(frame, "data.pkl", data)
 
     named = replace(head, names=ExpressionNames(("smile_left", "smile_right")))
     write_drive(place / "drive.npz", subject_drive(Subject.open(prepared), None), head.fingerprint)
@@ -136,8 +116,10 @@ def make_targets(place: Path) -> dict[str, Target]:
         return on_disk(place / name, lambda path: read_drive(path, named, 24, say=lambda _: None))
 
     def in_drive(data: bytes) -> bytes:
-        return _with_member(drive, "R.npy", data)
+        return with_member(drive, "R.npy", data)
 
+    own = place / "own"
+    own.mkdir()
     return {
         "pickle": Target(
             [pickle.dumps(objects, protocol=p) for p in range(6)], (None, lambda d: load_pickle(d, "x")), 3
@@ -147,13 +129,13 @@ def make_targets(place: Path) -> dict[str, Target]:
         ".frame": Target([content], on_disk(place / "0.frame", lambda p: read_tracking({0: p})), 2, in_frame),
         "npz": Target([npz], on_disk(place / "x.npz", load_npz)),
         "npz, checksums right": Target(
-            [arrays["expr.npy"]], on_disk(place / "y.npz", load_npz), 2, lambda d: _with_member(npz, "expr.npy", d)
+            [arrays["expr.npy"]], on_disk(place / "y.npz", load_npz), 2, lambda d: with_member(npz, "expr.npy", d)
         ),
         "VHAP listing": listing("vhap", 2),
         "INSTA listing": listing("insta", 1),
         "IMavatar listing": listing("imavatar", 2),
-        "manifest": Target([manifest.read_bytes()], of_copy(manifest, prepared, first_frame), 2),
-        "tracks": Target([tracks.read_bytes()], of_copy(tracks, prepared, first_frame)),
+        "manifest": Target([manifest.read_bytes()], of_copy(place, manifest, prepared, first_frame), 2),
+        "tracks": Target([tracks.read_bytes()], of_copy(place, tracks, prepared, first_frame)),
         "checkpoint": Target([checkpoint.read_bytes()], on_disk(place / "x.safetensors", load_checkpoint)),
         "run.json": Target([run.read_bytes()], on_disk(run, lambda p: read_run_info(p.parent))),
         "UV obj": Target(
@@ -169,7 +151,7 @@ def make_targets(place: Path) -> dict[str, Target]:
             [p.read_bytes() for p in PROTOCOLS.glob("*.yaml")], on_disk(place / "x.yaml", read_protocol)
         ),
         "drive .npz": Target([drive], driven("a.npz")),
-        "drive .npz, checksums right": Target([_member(drive, "R.npy")], driven("b.npz"), 1, in_drive),
+        "drive .npz, checksums right": Target([member(drive, "R.npy")], driven("b.npz"), 1, in_drive),
         "drive .csv": Target([DRIVE_CSV], driven("a.csv")),
         "Live Link Face": Target([LIVE_LINK_FACE], driven("b.csv")),
         "override": Target(
@@ -177,6 +159,7 @@ def make_targets(place: Path) -> dict[str, Target]:
             (None, lambda d: load_config([d.decode("utf-8", "replace")])),
             0.25,
         ),
+        **make_own_targets(own),
     }
 
 
@@ -187,17 +170,4 @@ def _encoded(image: np.ndarray, suffix: str) -> bytes:
 def _legacy(frame: bytes) -> bytes:
     buffer = io.BytesIO()
     torch.save(torch.load(io.BytesIO(frame), weights_only=False), buffer, _use_new_zipfile_serialization=False)
-    return buffer.getvalue()
-
-
-def _member(archive: bytes, ending: str) -> bytes:
-    with zipfile.ZipFile(io.BytesIO(archive)) as members:
-        return members.read(next(name for name in members.namelist() if name.endswith(ending)))
-
-
-def _with_member(archive: bytes, ending: str, content: bytes) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(archive)) as old, zipfile.ZipFile(buffer, "w") as new:
-        for name in old.namelist():
-            new.writestr(name, content if name.endswith(ending) else old.read(name))
     return buffer.getvalue()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from as_tracked import write_as_tracked
 from tracked_folder import write_tracked_folder
 
 from avatar.data.source import Source
@@ -17,9 +17,8 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep import avatar_track
-from data_prep.avatar_track import TrackingInfo, read_info, write_tracking
+from data_prep.avatar_track import read_info, write_tracking
 from data_prep.check.folder import check_tracked_folder
-from data_prep.metrical_tracker import read_tracking
 from data_prep.open import find_head
 from data_prep.prepare import prepare
 
@@ -35,36 +34,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(original: Path, tmp_path: Path) -> Path:
     """The original's content in this format, without frames 5 and 6."""
     return write_as_tracked(original, tmp_path / "someone")
-
-
-def write_as_tracked(original: Path, out: Path) -> Path:
-    head = load_head_assets(original / "head_model")
-    files = {int(path.stem): path for path in sorted((original / "checkpoint").iterdir())}
-    tracks = read_tracking(files).frames
-    first = tracks[0]
-    lost = {5: "no face was found", 6: "no face was found"}
-    for kind in (avatar_track.FRAMES, avatar_track.MATTE, avatar_track.HEAD, avatar_track.MOUTH):
-        (out / kind).mkdir(parents=True)
-    for number in tracks.keys() - lost.keys():
-        name = f"{number + 1:05d}"  # its pictures are numbered from 1
-        shutil.copy(original / "imgs" / f"{name}.png", out / avatar_track.FRAMES / f"{number:05d}.png")
-        shutil.copy(original / "alpha" / f"{name}.png", out / avatar_track.MATTE / f"{number:05d}.png")
-        for kind, tag in ((avatar_track.HEAD, "neckhead"), (avatar_track.MOUTH, "mouth")):
-            shutil.copy(original / "parsing" / f"{name}_{tag}.png", out / kind / f"{number:05d}.png")
-    info = TrackingInfo(
-        fps=29.97,
-        width=SIZE,
-        height=SIZE,
-        intrinsics=tuple(first.intrinsics.tolist()),
-        focal="assumed: a lens of 28 mm equivalent",
-        focal_is_assumed=True,
-        head_path=str(original / "head_model"),
-        head_fingerprint=head.fingerprint,
-        source={"video": "me.mp4"},
-        left_out=lost,
-    )
-    write_tracking(out, info, {n: track for n, track in tracks.items() if n not in lost})
-    return out
 
 
 def open_prepared(folder: Path, head: Path, out: Path, **options) -> tuple[Subject, list[str]]:

@@ -57,3 +57,13 @@ def test_another_archive_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", detected=np.zeros((2, 2)))
     with pytest.raises(UserError, match="size is missing"):
         load_landmarks(tmp_path / "other.npz")
+
+
+def test_a_coordinate_too_large_for_float32_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "landmarks.npz"
+    points = np.zeros((1, NUM_POINTS, 3))
+    points[0, 5, 1] = 1e300
+    scores = np.zeros((1, len(BLENDSHAPES)), np.float32)
+    np.savez(path, points=points, scores=scores, detected=np.ones(1, bool), size=np.array([8, 8]), fps=np.float64(25))
+    with pytest.raises(UserError, match="points holds values that are not finite"):
+        load_landmarks(path)
