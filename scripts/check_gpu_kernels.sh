@@ -25,7 +25,7 @@ wait "$splat" && splat=0 || splat=$?
 cat "$work/splat"
 [ "$gpu" = 0 ] && [ "$splat" = 0 ]
 part "mistakes in the kernels"
-TRITON_INTERPRET=1 "$python" scripts/mutate_kernels.py --jobs "$jobs"
+TRITON_INTERPRET=1 "$python" scripts/mutate_kernels.py --jobs "$jobs" --changed-only
 part "launches"
 "$python" scripts/count_launches.py | grep launches
 part "compiling"

@@ -10,29 +10,54 @@ class Mutation(NamedTuple):
     what: str  # it does wrong
     old: str  # occurs once in the module
     new: str
+    first: str = ""  # part of the name of the test that sees it soonest
 
 
 MUTATIONS = [
     # Which splats a tile is given.
     Mutation(
-        "project", "a splat whose opacity is the cut-off is left out", "opacity < alpha_min\n", "opacity <= alpha_min\n"
+        "project",
+        "a splat whose opacity is the cut-off is left out",
+        "opacity < alpha_min\n",
+        "opacity <= alpha_min\n",
+        first="just_under_the_cut_off",
     ),
     Mutation(
         "project",
         "a splat just behind the near plane is drawn",
         "p_z >= tl.load(view + NEAR)",
         "p_z >= 0.5 * tl.load(view + NEAR)",
+        first="other cut-offs",
     ),
-    Mutation("project", "pixel centres lie at whole numbers", "tl.ceil(low - 0.5)", "tl.ceil(low + 0.5)"),
+    Mutation(
+        "project",
+        "pixel centres lie at whole numbers",
+        "tl.ceil(low - 0.5)",
+        "tl.ceil(low + 0.5)",
+        first="loops[opaque",
+    ),
     Mutation(
         "project",
         "the ellipse's box is as high as it is wide",
         "tl.sqrt(tl.where(drawn, yy, 0.0))",
         "tl.sqrt(tl.where(drawn, xx, 0.0))",
+        first="clamp-gpu",
     ),
-    Mutation("project", "a splat without the blur keeps its opacity", "opacity * area / root_det", "opacity"),
+    Mutation(
+        "project",
+        "a splat without the blur keeps its opacity",
+        "opacity * area / root_det",
+        "opacity",
+        first="loops[antialiased",
+    ),
     Mutation("project", "a colour may be negative", "tl.maximum(green, 0.0)", "green"),
-    Mutation("project", "a scale that is not finite goes unseen", "load(scales + 3 * i + k", "load(scales + 3 * i"),
+    Mutation(
+        "project",
+        "a scale that is not finite goes unseen",
+        "load(scales + 3 * i + k",
+        "load(scales + 3 * i",
+        first="nobody_waits",
+    ),
     Mutation("geometry", "the slope is not clamped", "return clamped, (slope", "return slope, (slope"),
     Mutation(
         "geometry",
@@ -46,7 +71,7 @@ MUTATIONS = [
         "-x * (4 * z * z - x * x - y * y) * C31 * on, sh, 13",
         "x * (4 * z * z - x * x - y * y) * C31 * on, sh, 13",
     ),
-    Mutation("bin", "a slot without a record claims one", "tl.where(live, place, -1)", "place"),
+    Mutation("bin", "a slot without a record claims one", "tl.where(live, place, -1)", "place", first="wide field"),
     Mutation(
         "bin",
         "the search for a slot's splat ends a step too early",
@@ -59,8 +84,15 @@ MUTATIONS = [
         "the colours of a chunk's end are not cleared",
         "tl.static_range(6, FIELDS)",
         "tl.static_range(7, FIELDS)",
+        first="reference[17x33",
     ),
-    Mutation("bin", "the lists of two tiles overlap", "// CHUNK + tile) * CHUNK", "// CHUNK + tile // 2) * CHUNK"),
+    Mutation(
+        "bin",
+        "the lists of two tiles overlap",
+        "// CHUNK + tile) * CHUNK",
+        "// CHUNK + tile // 2) * CHUNK",
+        first="reference[17x33",
+    ),
     # Forward.
     Mutation(
         "composite",
@@ -68,20 +100,30 @@ MUTATIONS = [
         "& (done + k < pairs)[:, None]\n        alpha",
         "\n        alpha",
     ),
-    Mutation("composite", "alpha is not clamped", "alpha = tl.minimum(unclamped, alpha_max)", "alpha = unclamped"),
+    Mutation(
+        "composite",
+        "alpha is not clamped",
+        "alpha = tl.minimum(unclamped, alpha_max)",
+        "alpha = unclamped",
+        first="loops[cut-offs",
+    ),
     Mutation(
         "composite",
         "a splat whose alpha is the cut-off is skipped",
         "hit = (alpha >= alpha_min)",
         "hit = (alpha > alpha_min)",
+        first="just_under_the_cut_off",
     ),
     Mutation(
         "composite",
         "the splat that closes a pixel is drawn",
         "enough = (after >= t_min)",
         "enough = (after / (1.0 - alpha) >= t_min)",
+        first="other cut-offs",
     ),
-    Mutation("composite", "a pixel's stop is one splat late", "reached, stop)", "reached + 1, stop)"),
+    Mutation(
+        "composite", "a pixel's stop is one splat late", "reached, stop)", "reached + 1, stop)", first="other cut-offs"
+    ),
     Mutation(
         "composite", "the transmittance is that behind the splat", "after * (alpha / (1.0 - alpha))", "after * alpha"
     ),
@@ -89,37 +131,90 @@ MUTATIONS = [
         "composite", "green shows blue's background", "tl.load(background + 1), mask", "tl.load(background + 2), mask"
     ),
     Mutation(
-        "composite", "too little room is silent", 'tl.where(spoilt, float("nan"), transmittance)', "transmittance"
+        "composite",
+        "too little room is silent",
+        'tl.where(spoilt, float("nan"), transmittance)',
+        "transmittance",
+        first="exactly_the_pairs",
     ),
     # Backward.
-    Mutation("composite_backward", "a splat hides itself", "k[None, :] > k[:, None]", "k[None, :] >= k[:, None]"),
-    Mutation("composite_backward", "alpha's cotangent has the wrong sign", "behind -= tl.load", "behind += tl.load"),
-    Mutation("composite_backward", "a clamped alpha has a gradient", "drawn & (unclamped <= alpha_max)", "drawn"),
+    Mutation(
+        "composite_backward",
+        "a splat hides itself",
+        "k[None, :] > k[:, None]",
+        "k[None, :] >= k[:, None]",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "composite_backward",
+        "alpha's cotangent has the wrong sign",
+        "behind -= tl.load",
+        "behind += tl.load",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "composite_backward",
+        "a clamped alpha has a gradient",
+        "drawn & (unclamped <= alpha_max)",
+        "drawn",
+        first="other cut-offs",
+    ),
     Mutation(
         "composite_backward",
         "moments that nobody looked at are not cleared",
         "range(seen, pairs, STEP)",
         "range(pairs, pairs, STEP)",
+        first="bands[walls]",
     ),
-    Mutation("composite_backward", "a mixed moment is not mixed", "tl.sum(weight_u * v, 1)", "tl.sum(weight_u * u, 1)"),
+    Mutation(
+        "composite_backward",
+        "a mixed moment is not mixed",
+        "tl.sum(weight_u * v, 1)",
+        "tl.sum(weight_u * u, 1)",
+        first="reference[17x33",
+    ),
     Mutation(
         "composite_backward",
         "what lies behind is forgotten between chunks",
         "behind += tl.sum(adds, 0)",
         "behind += 0.0",
+        first="wide field",
     ),
     Mutation(
-        "project_backward", "a splat's first slot is left out", "range(tl.max(count, 0))", "range(1, tl.max(count, 0))"
+        "project_backward",
+        "a splat's first slot is left out",
+        "range(tl.max(count, 0))",
+        "range(1, tl.max(count, 0))",
+        first="reference[17x33",
     ),
-    Mutation("project_backward", "a colour below 0 has a gradient", "tl.where(red > 0.0, m_red, 0.0)", "m_red"),
+    Mutation(
+        "project_backward",
+        "a colour below 0 has a gradient",
+        "tl.where(red > 0.0, m_red, 0.0)",
+        "m_red",
+        first="reference[17x33",
+    ),
     Mutation(
         "project_backward",
         "a clamped slope has a gradient",
         "tl.where(free_x, -fx * inv_z * along_z, 0.0)",
         "-fx * inv_z * along_z",
+        first="reference[17x33",
     ),
-    Mutation("project_backward", "the direction's length has a gradient", "(by_dx - along * d_x)", "by_dx"),
-    Mutation("harmonics", "a basis function's derivative is halved", "dz += 2 * z * g", "dz += z * g"),
+    Mutation(
+        "project_backward",
+        "the direction's length has a gradient",
+        "(by_dx - along * d_x)",
+        "by_dx",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "harmonics",
+        "a basis function's derivative is halved",
+        "dz += 2 * z * g",
+        "dz += z * g",
+        first="reference[17x33",
+    ),
     # From the network's values to Gaussians.
     Mutation("hyper", "a latent is mixed from three nodes of four", "tl.static_range(4)", "tl.static_range(3)"),
     Mutation(
@@ -145,6 +240,7 @@ MUTATIONS = [
         "lanes without a Gaussian are not written",
         "_put(grads, at + 12, q9 * from_mean, all_lanes)",
         "_put(grads, at + 12, q9 * from_mean, mask)",
+        first="lanes_that_stand",
     ),
     Mutation("place_backward", "a node's list ends an entry early", "begins + node + 1)", "begins + node + 1) - 1"),
     Mutation("activations", "tanh is wrong where it saturates", "tl.where(x < 0.0, -far, far)", "far"),
@@ -161,6 +257,7 @@ MUTATIONS = [
         "coefficients that are not given hold what was there",
         "mask=e < given, other=0.0",
         "mask=e < stride, other=0.0",
+        first="bands[posed]",
     ),
     Mutation(
         "ssim",

@@ -1,10 +1,11 @@
 """Put one mistake after another into the GPU's kernels, and see that the tests catch each of them.
 
-    TRITON_INTERPRET=1 python scripts/mutate_kernels.py [--jobs 2] [--only WORD]
+    TRITON_INTERPRET=1 python scripts/mutate_kernels.py [--jobs 2] [--only WORD] [--changed-only]
 
 Every mistake of `kernel_mutations.py` gets a process, in which its module is loaded from a changed copy; the checkout is
 not touched. It counts as caught where an assertion of a test fails, not where the program merely falls over. The same
-tests pass without a mistake, which is the first thing tried. Ends with status 1 when a mistake goes unseen.
+tests pass without a mistake, which is the first thing tried unless --changed-only says that it has been. Ends with status
+1 when a mistake goes unseen.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ import pytest
 import torch
 from kernel_mutations import MUTATIONS, Mutation
 
+# Without what takes longer than most of these tests do: other plugins, rewritten assertions, a collection of all garbage.
+QUIET = ["-x", "-q", "--no-header", "--assert=plain", "-p", "pytest_timeout", "-p", "no:cacheprovider"]
+QUIET += ["-p", "no:unraisableexception", "-p", "no:threadexception"]
+os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
 KERNELS = Path(__file__).resolve().parents[1] / "avatar" / "kernels"
 BACKENDS, CAPACITY, HOSTILE, PLACE = (
     f"tests/{name}.py::"
@@ -112,7 +117,7 @@ def run_tests(tests: list[str], mutation: Mutation | None) -> Outcome:
             path = Path(folder) / f"{mutation.module}.py"
             path.write_text(mutated(mutation), encoding="utf-8")
             sys.meta_path.insert(0, Changed(f"avatar.kernels.{mutation.module}", path))
-        status = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", *tests], plugins=[listener])
+        status = pytest.main([*QUIET, *tests], plugins=[listener])
     if listener.caught_by is None and not listener.otherwise and status != pytest.ExitCode.OK:
         listener.otherwise = said.getvalue().strip().splitlines()[-1]
     return Outcome(listener.caught_by, listener.passed, listener.otherwise, time.monotonic() - begin)
@@ -129,23 +134,33 @@ def tests_of(module: str) -> list[str]:
     return TESTS.get(module, SPLATTER)
 
 
+def soonest_first(mutation: Mutation) -> list[str]:
+    """All tests of its module, beginning with the one that is known to see it."""
+    tests = tests_of(mutation.module)
+    chosen = [test for test in tests if mutation.first and mutation.first in test]
+    if mutation.first and not chosen:
+        raise SystemExit(f"no test of {mutation.module} is called {mutation.first!r}")
+    return [*chosen, *(test for test in tests if test not in chosen)]
+
+
 def attempt(task: tuple[str, Mutation | None]) -> Outcome:
     module, mutation = task
-    return run_tests(tests_of(module), mutation)
+    return run_tests(tests_of(module) if mutation is None else soonest_first(mutation), mutation)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--changed-only", action="store_true", help="the tests are known to pass without a mistake")
     parser.add_argument("--only", default="", metavar="WORD", help="mistakes in a module or a description with it")
     arguments = parser.parse_args()
     if os.environ.get("TRITON_INTERPRET") != "1":
         raise SystemExit("the kernels are interpreted: set TRITON_INTERPRET=1")
     chosen = [m for m in MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
     for mutation in chosen:
-        mutated(mutation)
+        mutated(mutation), soonest_first(mutation)
     areas = {id(tests_of(m.module)): m.module for m in reversed(chosen)}.values()  # the first module of each
-    tasks: list[tuple[str, Mutation | None]] = [(module, None) for module in areas]
+    tasks: list[tuple[str, Mutation | None]] = [] if arguments.changed_only else [(module, None) for module in areas]
     tasks += [(mutation.module, mutation) for mutation in chosen]
     import_all()
     wrong = 0

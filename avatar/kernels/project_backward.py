@@ -28,35 +28,48 @@ HALF_LOG2E = tl.constexpr(0.72134752044448170368)
 
 
 @triton.jit
-def _sums(moments, places, begin, count, capacity, BLOCK: tl.constexpr):
-    """The nine moments of each splat, summed over its slots in their order."""
+def _sums(moments, places, begin, count, capacity, COLOURS: tl.constexpr, BLOCK: tl.constexpr):
+    """Moments of each splat, summed over its slots in their order: the six of its place, or the three of its colour."""
     m0, m1, m2 = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
     m3, m4, m5 = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
-    m6, m7, m8 = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
     for j in range(tl.max(count, 0)):
         slot = begin + j
         live = (j < count) & (slot < capacity)
         place = tl.load(places + slot, mask=live, other=-1)
         live &= place >= 0
         at = moments + MOMENTS * place
-        m0 += tl.load(at, mask=live, other=0.0).to(tl.float64)
-        m1 += tl.load(at + 1, mask=live, other=0.0).to(tl.float64)
-        m2 += tl.load(at + 2, mask=live, other=0.0).to(tl.float64)
-        m3 += tl.load(at + 3, mask=live, other=0.0).to(tl.float64)
-        m4 += tl.load(at + 4, mask=live, other=0.0).to(tl.float64)
-        m5 += tl.load(at + 5, mask=live, other=0.0).to(tl.float64)
-        m6 += tl.load(at + 6, mask=live, other=0.0).to(tl.float64)
-        m7 += tl.load(at + 7, mask=live, other=0.0).to(tl.float64)
-        m8 += tl.load(at + 8, mask=live, other=0.0).to(tl.float64)
-    return m0, m1, m2, m3, m4, m5, m6, m7, m8
+        if COLOURS:
+            m0 += tl.load(at + 6, mask=live, other=0.0).to(tl.float64)
+            m1 += tl.load(at + 7, mask=live, other=0.0).to(tl.float64)
+            m2 += tl.load(at + 8, mask=live, other=0.0).to(tl.float64)
+        else:
+            m0 += tl.load(at, mask=live, other=0.0).to(tl.float64)
+            m1 += tl.load(at + 1, mask=live, other=0.0).to(tl.float64)
+            m2 += tl.load(at + 2, mask=live, other=0.0).to(tl.float64)
+            m3 += tl.load(at + 3, mask=live, other=0.0).to(tl.float64)
+            m4 += tl.load(at + 4, mask=live, other=0.0).to(tl.float64)
+            m5 += tl.load(at + 5, mask=live, other=0.0).to(tl.float64)
+    return m0, m1, m2, m3, m4, m5
+
+
+@triton.jit
+def _slots(order, ends, boxes, count, capacity, BLOCK: tl.constexpr):
+    """The Gaussian of each lane, front to back, whether there is one, its first slot and how many it has."""
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = rank < count
+    i = tl.load(order + rank, mask=here, other=0).to(tl.int32)
+    spoilt = tl.load(ends + count - 1) > capacity
+    tiles = tl.where(spoilt, 0, tl.load(boxes + 3 * count + i, mask=here, other=0))
+    begin = tl.where(spoilt, 0, tl.load(ends + rank, mask=here, other=0)).to(tl.int32) - tiles
+    return i, here, begin, tiles
+
+
+# Two kernels, because Triton's compilers take time by the cube of a kernel's length: together they took five times as long.
 
 
 @triton.jit(do_not_specialize=["degree", "count", "capacity"])
-def project_backward(
+def colour_of_backward(
     means,
-    quats,
-    scales,
-    opacities,
     sh,
     view,
     order,
@@ -68,25 +81,59 @@ def project_backward(
     count,
     capacity,
     grad_means,
+    grad_sh,
+    STORED: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Write the gradients of the coefficients, and that of the means by way of the direction they are seen from."""
+    i, here, begin, tiles = _slots(order, ends, boxes, count, capacity, BLOCK)
+    m_red, m_green, m_blue, _, _, _ = _sums(moments, places, begin, tiles, capacity, True, BLOCK)
+    # Where all moments are zero, so must be all that follows: values that cannot overflow stand in there.
+    shown = here & ((m_red != 0.0) | (m_green != 0.0) | (m_blue != 0.0))
+    mean_x, mean_y, mean_z = load3(means, i, shown)
+    d_x, d_y, d_z, inv_distance = view_direction(view, mean_x, mean_y, mean_z)
+    coefficients = sh + 3 * STORED * i
+    red, green, blue = colour(coefficients, d_x, d_y, d_z, degree, STORED, shown)
+    by_red = tl.where(red > 0.0, m_red, 0.0).to(tl.float32)
+    by_green = tl.where(green > 0.0, m_green, 0.0).to(tl.float32)
+    by_blue = tl.where(blue > 0.0, m_blue, 0.0).to(tl.float32)
+    by_dx, by_dy, by_dz = colour_backward(
+        coefficients, grad_sh + 3 * STORED * i, d_x, d_y, d_z, by_red, by_green, by_blue, degree, STORED, here
+    )
+    by_dx, by_dy, by_dz = by_dx.to(tl.float64), by_dy.to(tl.float64), by_dz.to(tl.float64)
+    along = by_dx * d_x + by_dy * d_y + by_dz * d_z
+    m_x, m_y = (by_dx - along * d_x) * inv_distance, (by_dy - along * d_y) * inv_distance
+    m_z = (by_dz - along * d_z) * inv_distance
+    store3(grad_means, i, m_x.to(tl.float32), m_y.to(tl.float32), m_z.to(tl.float32), here)
+
+
+@triton.jit(do_not_specialize=["count", "capacity"])
+def project_backward(
+    means,
+    quats,
+    scales,
+    opacities,
+    view,
+    order,
+    ends,
+    boxes,
+    places,
+    moments,
+    count,
+    capacity,
+    grad_means,
     grad_quats,
     grad_scales,
     grad_opacities,
-    grad_sh,
-    STORED: tl.constexpr,
     ANTIALIASED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Write all gradients of all Gaussians; one lane for each, front to back. See `project` and `bin` for the buffers."""
-    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = rank < count
-    i = tl.load(order + rank, mask=here, other=0).to(tl.int32)
-    spoilt = tl.load(ends + count - 1) > capacity
-    tiles = tl.where(spoilt, 0, tl.load(boxes + 3 * count + i, mask=here, other=0))
-    begin = tl.where(spoilt, 0, tl.load(ends + rank, mask=here, other=0)).to(tl.int32) - tiles
-    weight, m_u, m_uu, m_v, m_uv, m_vv, m_red, m_green, m_blue = _sums(moments, places, begin, tiles, capacity, BLOCK)
-    # Where all moments are zero, so must be all that follows: values that cannot overflow stand in there.
+    """Write the other gradients of all Gaussians; one lane for each, front to back. `grad_means` is added to what
+    `colour_of_backward` wrote there; see `project` and `bin` for the other buffers."""
+    i, here, begin, tiles = _slots(order, ends, boxes, count, capacity, BLOCK)
+    weight, m_u, m_uu, m_v, m_uv, m_vv = _sums(moments, places, begin, tiles, capacity, False, BLOCK)
     shown = (weight != 0.0) | (m_u != 0.0) | (m_uu != 0.0) | (m_v != 0.0) | (m_uv != 0.0) | (m_vv != 0.0)
-    shown = here & (shown | (m_red != 0.0) | (m_green != 0.0) | (m_blue != 0.0))
+    shown = here & shown
 
     mean_x, mean_y, mean_z = load3(means, i, shown)
     p_x, p_y, p_z = in_camera(view, mean_x, mean_y, mean_z)
@@ -201,18 +248,8 @@ def project_backward(
     by_py += by_slope * inv_z
     by_pz -= by_slope * slope_y * inv_z
 
-    d_x, d_y, d_z, inv_distance = view_direction(view, mean_x, mean_y, mean_z)
-    coefficients = sh + 3 * STORED * i
-    red, green, blue = colour(coefficients, d_x, d_y, d_z, degree, STORED, shown)
-    by_red = tl.where(red > 0.0, m_red, 0.0).to(tl.float32)
-    by_green = tl.where(green > 0.0, m_green, 0.0).to(tl.float32)
-    by_blue = tl.where(blue > 0.0, m_blue, 0.0).to(tl.float32)
-    by_dx, by_dy, by_dz = colour_backward(
-        coefficients, grad_sh + 3 * STORED * i, d_x, d_y, d_z, by_red, by_green, by_blue, degree, STORED, here
-    )
-    by_dx, by_dy, by_dz = by_dx.to(tl.float64), by_dy.to(tl.float64), by_dz.to(tl.float64)
-    along = by_dx * d_x + by_dy * d_y + by_dz * d_z
-    m_x = dot3(v0, v3, v6, by_px, by_py, by_pz) + (by_dx - along * d_x) * inv_distance
-    m_y = dot3(v1, v4, v7, by_px, by_py, by_pz) + (by_dy - along * d_y) * inv_distance
-    m_z = dot3(v2, v5, v8, by_px, by_py, by_pz) + (by_dz - along * d_z) * inv_distance
+    by_x, by_y, by_z = load3(grad_means, i, here)
+    m_x = dot3(v0, v3, v6, by_px, by_py, by_pz) + by_x
+    m_y = dot3(v1, v4, v7, by_px, by_py, by_pz) + by_y
+    m_z = dot3(v2, v5, v8, by_px, by_py, by_pz) + by_z
     store3(grad_means, i, m_x.to(tl.float32), m_y.to(tl.float32), m_z.to(tl.float32), here)

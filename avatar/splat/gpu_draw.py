@@ -14,7 +14,7 @@ from avatar.kernels.bin import FIELDS, expand, gather
 from avatar.kernels.composite import composite
 from avatar.kernels.composite_backward import MOMENTS, composite_backward
 from avatar.kernels.project import POISON, project
-from avatar.kernels.project_backward import project_backward
+from avatar.kernels.project_backward import colour_of_backward, project_backward
 from avatar.kernels.start import start
 from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Kind
 from avatar.splat.cpu import CannotDraw
@@ -202,7 +202,7 @@ def backward(
     grad_image: Float[Tensor, "H W 3"] | None,
     grad_alpha: Float[Tensor, "H W"] | None,
 ) -> Gaussians:
-    """The gradients of all fields; two launches."""
+    """The gradients of all fields; three launches."""
     s, d, N, tuning = settings, drawing, len(gaussians.means), drawing.tuning
     stride = d.records.shape[1]
     moments = torch.empty((stride, MOMENTS.value), dtype=torch.float32, device=background.device)
@@ -222,12 +222,21 @@ def backward(
         FORWARD_STEP=tuning.step,
     )
     gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
+    lists = d.order, d.ends, d.boxes, d.places, moments
+    warps = max(tuning.backward_lanes // 32, 1)
+    start(
+        colour_of_backward,
+        programs(N, tuning.backward_lanes),
+        *(gaussians.means, gaussians.sh, s.view, *lists, s.sh_degree, N, d.capacity, gradients.means, gradients.sh),
+        warps=warps,
+        STORED=gaussians.sh.shape[1],
+        BLOCK=tuning.backward_lanes,
+    )
     start(
         project_backward,
         programs(N, tuning.backward_lanes),
-        *(*gaussians, s.view, d.order, d.ends, d.boxes, d.places, moments, s.sh_degree, N, d.capacity, *gradients),
-        warps=max(tuning.backward_lanes // 32, 1),
-        STORED=gaussians.sh.shape[1],
+        *(*gaussians[:4], s.view, *lists, N, d.capacity, *gradients[:4]),
+        warps=warps,
         ANTIALIASED=s.antialiased,
         BLOCK=tuning.backward_lanes,
     )
