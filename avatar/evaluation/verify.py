@@ -1,7 +1,7 @@
 """PSNR, SSIM and jitter computed a second time, by scikit-image, from the PNG files that an evaluation has written.
 
 Nothing of the first computation is used: other code reads the files, weighs the masks and runs the windows of SSIM. What
-agrees can be recomputed by anybody who has the pictures.
+agrees can be recomputed by anybody who has the pictures. LPIPS is left out: it needs the weights of its network.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[
             "largest_difference": worst.size,
         }
         say(
-            f"{name}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; LPIPS needs its network; largest "
+            f"{name}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; largest "
             f"difference {worst.size:.1e} ({worst.figure} of {worst.where})"
         )
     write_atomically(results, json.dumps(summary, indent=2, allow_nan=False).encode())

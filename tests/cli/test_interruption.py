@@ -28,9 +28,11 @@ avatar.cli.run()
 
 
 # A library that reports by itself whatever comes out of the middle of its import, and goes on.
-SWALLOWING = """
+BEGUN = '    print("begun", flush=True)\n'
+SWALLOWING = f"""\
     import time, traceback
     try:
+    {BEGUN}\
         time.sleep(60)
     except BaseException:
         traceback.print_exc()
@@ -72,7 +74,7 @@ def test_ctrl_c_while_libraries_are_imported_is_the_conventional_status() -> Non
 
 
 def test_ctrl_c_does_not_come_out_of_the_middle_of_an_import() -> None:
-    process = start("doctor", script=SCRIPT.replace("    return", f"{SWALLOWING}    return"))
+    process = start("doctor", script=SCRIPT.replace(BEGUN, SWALLOWING))
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output, errors) == (130, "", "avatar: interrupted\n")
