@@ -61,11 +61,12 @@ PLACING = [
 ]
 POSING = ["tests/gpu/test_gpu_pose.py", HOSTILE + "test_the_same_bits_and_whole_bands[posed]"]
 LOSSES = ["tests/gpu/test_gpu_losses.py", HOSTILE + "test_the_same_bits_and_whole_bands[compared]"]
+# Of a module; of the others SPLATTER.
 TESTS = {
     **dict.fromkeys(("activations", "hyper", "place", "place_backward"), PLACING),
     **dict.fromkeys(("huber", "reduce", "ssim"), LOSSES),
     "pose": POSING,
-}  # of a module; of the others SPLATTER
+}
 
 
 class Outcome(NamedTuple):

@@ -16,11 +16,8 @@ from avatar.splat import Counters, counters
 # raster_backward.h): distances 2, falloff 17, then alpha, transmittance and colour, or their gradients and nine sums.
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 32, 54
 FLOATS_PER_SPLAT = 3 + 4 + 3 + 1 + 48  # of the five inputs with colours of degree 3
-PAIR_BYTES, SPLAT_BYTES, MOMENT_BYTES = (
-    8,
-    64,
-    36,
-)  # what the kernels keep of a pair, a projected splat, a pair's gradient
+# What the kernels keep of a pair, a projected splat, a pair's gradient.
+PAIR_BYTES, SPLAT_BYTES, MOMENT_BYTES = 8, 64, 36
 PIXEL_BYTES = 16  # image and alpha
 
 # Peak memory is measured in a process of its own, by Linux's high-water mark, set back before the drawing.

@@ -110,7 +110,7 @@ def build_parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--verify",
         action="store_true",
-        help="write them, and compute PSNR and SSIM again from the files, with scikit-image",
+        help="write them, and compute all but LPIPS again from the files, with scikit-image",
     )
     add_device(evaluate)
 

@@ -206,7 +206,6 @@ def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None
     ):
         was, now = getattr(source, field), getattr(given, field)
         if was != now:
-            raise UserError(
-                f"{run} began {f'with {option} {was}' if was not in (None, False) else f'without {option}'}, not with "
-                f"{option} {now}: leave it out to resume, or start a new run"
-            )
+            began = f"without {option}" if was in (None, False) else f"with {option} {was}"
+            given_now = option if now is True else f"{option} {now}"
+            raise UserError(f"{run} began {began}, not with {given_now}: leave it out to resume, or start a new run")

@@ -24,9 +24,8 @@ class SkinTextures(NamedTuple):
     """Float32 maps [T, T, C] whose row 0 is v = 1 (the top of the chart)."""
 
     colour: np.ndarray  # [T, T, 4] linear RGB and gloss
-    relief: (
-        np.ndarray
-    )  # [T, T, 8] slopes dh/du, dh/dv in metres per chart unit: at rest, and of the three wrinkle groups
+    # [T, T, 8] slopes dh/du, dh/dv in metres per chart unit: at rest, and of the three wrinkle groups
+    relief: np.ndarray
 
 
 def hair_cover(points: np.ndarray, identity: Identity) -> np.ndarray:

@@ -87,12 +87,13 @@ def as_csv(comparison: Comparison) -> str:
     return file.getvalue()
 
 
+# Name on the command line -> suffix of the file, function.
 FORMATS: dict[str, tuple[str, Callable[[Comparison], str]]] = {
     "text": ("txt", text),
     "markdown": ("md", markdown),
     "latex": ("tex", latex),
     "csv": ("csv", as_csv),
-}  # name on the command line -> suffix of the file, function
+}
 
 
 def write_tables(folder: Path, comparison: Comparison) -> None:

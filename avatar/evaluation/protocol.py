@@ -71,10 +71,9 @@ class Protocol:
     source: str  # where the choices come from; what is known of it and what is a reading
     frames: Literal["held-out"] | int  # held out in training; or of the last so many those not trained on
     background: Colour  # under render and truth
-    mask: (
-        Mask  # main figures: of images x head mask ("multiply") or as they are ("none"), both over the whole frame; or
-    )
-    # of the head mask alone ("only")
+    # Main figures: of images x head mask ("multiply") or as they are ("none"), both over the whole frame; or of the head
+    # mask alone ("only").
+    mask: Mask
     clamp: bool  # to [0, 1] before anything is measured
     levels: Levels  # 8 bits by rounding or by truncation, or floats as they are
     regions: tuple[Region, ...]  # measured each by itself, beside the main figures

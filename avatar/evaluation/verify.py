@@ -1,7 +1,7 @@
-"""PSNR and SSIM computed a second time, by scikit-image, from the PNG files that an evaluation has written.
+"""PSNR, SSIM and jitter computed a second time, by scikit-image, from the PNG files that an evaluation has written.
 
 Nothing of the first computation is used: other code reads the files, weighs the masks and runs the windows of SSIM. What
-agrees can be recomputed by anybody who has the pictures.
+agrees can be recomputed by anybody who has the pictures. LPIPS is left out: it needs the weights of its network.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from avatar.evaluation.protocol import column
 from avatar.files.atomic import write_atomically
 
 TOLERANCE = 2e-6  # frames.csv is rounded to 5e-7; both sides compute in float64
-MEASURES = ("psnr", "ssim")  # LPIPS needs its network, jitter its neighbours
 _LEVELS = 255
 _RADIUS = 5  # of SSIM's window of 11 x 11: a window whose centre is nearer to the border does not count
 
@@ -63,7 +62,7 @@ def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[
             "largest_difference": worst.size,
         }
         say(
-            f"{name}: {' and '.join(m.upper() for m in MEASURES)} of {frames} frames verified from their pictures; largest "
+            f"{name}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; largest "
             f"difference {worst.size:.1e} ({worst.figure} of {worst.where})"
         )
     write_atomically(results, json.dumps(summary, indent=2, allow_nan=False).encode())
@@ -83,6 +82,9 @@ def verify_protocol(folder: Path, entry: Mapping[str, Any]) -> tuple[Difference,
     worst = Difference(0.0, "psnr", f"frame {rows[0]['name']}")
     for row in tqdm(rows, desc=f"verify {folder.name}", unit="frame", leave=False, disable=None):
         figures = recompute(folder, int(row["frame"]), entry["choices"])
+        # Which frames follow each other in time is not in the pictures, so the table says which have a jitter.
+        has_jitter = not math.isnan(float(row["jitter"]))
+        figures["jitter"] = recompute_jitter(folder, int(row["frame"])) if has_jitter else math.nan
         seen.append(figures)
         for found in differences({name: float(row[name]) for name in figures}, figures, f"frame {row['name']}", table):
             worst = max(worst, found)
@@ -126,6 +128,16 @@ def recompute(folder: Path, index: int, choices: Mapping[str, Any]) -> Figures:
     for region, mask in masks.items():
         figures |= _of_region(error, similarity, mask, region)
     return figures
+
+
+def recompute_jitter(folder: Path, index: int) -> float:
+    """Jitter of a frame with pictures before and after it, levels of 8 bits; NaN where no pixel is in all three masks."""
+    errors, masks = [], []
+    for number in (index - 1, index, index + 1):
+        render, truth, head = (_read(folder / kind / f"{number:05d}.png") for kind in ("renders", "gt", "masks"))
+        errors.append(render - truth)
+        masks.append(head)
+    return _weighted(np.abs(np.diff(errors, n=2, axis=0)[0]).mean(axis=2), np.min(masks, axis=0))
 
 
 def _of_frame(render: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]) -> Figures:

@@ -20,10 +20,9 @@ from avatar.tensors import check_shapes
 HEADS = {"position": 3, "rotation": 4, "scale": 3}  # and the number of values of each
 OFFSETS = sum(HEADS.values())
 BLOCK = 16  # Gaussians side by side in the parameters
-CONSTANTS = sum(
-    m + m * (m + 1) // 2 for m in HEADS.values()
-)  # rows of a block that there are once: means and triangles
-DIMENSION = sum(1 + m for m in HEADS.values())  # and rows for every latent dimension
+# Rows of a block that there are once, means and triangles, and rows for every latent dimension.
+CONSTANTS = sum(m + m * (m + 1) // 2 for m in HEADS.values())
+DIMENSION = sum(1 + m for m in HEADS.values())
 
 
 def packed_shape(num_gaussians: int, latent_size: int) -> tuple[int, int, int]:

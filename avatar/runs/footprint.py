@@ -22,9 +22,8 @@ Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
 
 FLOAT = 4  # bytes
 STEP_COPIES = 4  # of a parameter during a step: itself, its gradient, Adam's two moments
-SAVING_COPIES = (
-    4 + 2 * 3
-)  # while a checkpoint is written: all but the gradient once more as a file, which is copied once
+# While a checkpoint is written: all but the gradient once more as a file, which is copied once.
+SAVING_COPIES = 4 + 2 * 3
 UNPACKING_COPIES = 2  # of the HyperGaussians more, because a file holds them in another order
 DRAWING_COPIES = 3  # while an avatar is opened: what the file holds, the model, what the renderer makes of it
 # Floats for a Gaussian in a step, beside its parameters and latents: colours and their gradients (3 times 48), what is
@@ -108,9 +107,8 @@ def training_needs(
 def drawing_needs(config: ModelConfig, assets: HeadAssets, gaussians: int) -> list[Need]:
     """What opening a trained avatar and drawing it takes."""
     shapes = parameter_shapes(config, assets, gaussians)
-    layers = (
-        encoded_size(config.frequencies) + 3 * config.mlp_width
-    )  # the first layer's, and two that are filled in turn
+    # The first layer's, and two that are filled in turn.
+    layers = encoded_size(config.frequencies) + 3 * config.mlp_width
     return [
         *parameter_needs(shapes, DRAWING_COPIES, UNPACKING_COPIES),
         Need("the network's layers at every place", FLOAT * places(config, gaussians) * layers, "model.mlp_width"),

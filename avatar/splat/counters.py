@@ -17,9 +17,8 @@ class Counters(NamedTuple):
     hidden_flat: int  # seen edge-on, without blur
     hidden_outside: int  # of the image, or of the region
     visible: int  # all other splats
-    visible_without_effect: (
-        int  # they reach alpha_min in no pixel before it is stopped; not looked at in the backward pass
-    )
+    # Of them: those that reach alpha_min in no pixel before it is stopped; not looked at in the backward pass.
+    visible_without_effect: int
     tiles: int
     tiles_stopped: int
     blocks: int

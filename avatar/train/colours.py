@@ -61,9 +61,8 @@ def sample(image: Float[Tensor, "H W C"], screen: Float[Tensor, "N 3"], mode: st
     """The image's values at points (x pixel, y pixel, depth); zero outside the image."""
     height, width = image.shape[:2]
     grid = screen[:, :2] * torch.tensor([2 / width, 2 / height]) - 1
-    grid = grid.nan_to_num(nan=-9.0, posinf=9.0, neginf=-9.0).clamp(
-        -9, 9
-    )  # a point in the camera's plane is not in the image
+    # A point in the camera's plane is not in the image.
+    grid = grid.nan_to_num(nan=-9.0, posinf=9.0, neginf=-9.0).clamp(-9, 9)
     picked = torch.nn.functional.grid_sample(
         image.permute(2, 0, 1)[None], grid[None, :, None], mode=mode, padding_mode="zeros", align_corners=False
     )

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -8,10 +9,11 @@ import pytest
 from small_runs import train_small
 from tracked_folder import write_tracked_folder
 
-from avatar.bench import Request
+from avatar.bench import Request, quality
 from avatar.bench.clock import Time
 from avatar.bench.quality import Curve, Point, measure, pareto
 from avatar.bench.quality_report import run, table
+from avatar.bench.train import Trainee
 from avatar.commands.opening import open_run
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
@@ -76,3 +78,28 @@ def test_runs_of_two_subjects_are_refused(tracked_folder: Path, tmp_path: Path) 
     train_small(other, tmp_path / "b")
     with pytest.raises(UserError, match="other data"):
         measure([tmp_path / "a", tmp_path / "b"], None, frames=1, repeats=1, say=lambda _: None)
+
+
+def test_a_run_is_timed_with_its_own_perceptual_term_and_not_with_this_machines(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights that came after the training are no part of its steps; those that it had have to be there."""
+    timed: list[str] = []
+    time_steps = quality.time_steps
+
+    def noted(learners: Sequence[Trainee], repeats: int) -> list[tuple[Time, Time]]:
+        timed.extend(learner.objective.perceptual.name for learner in learners)
+        return time_steps(learners, repeats)
+
+    monkeypatch.setattr(quality, "time_steps", noted)
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    save_lpips(Lpips("squeeze"), weights / "lpips_squeeze.safetensors")
+    train_small(tracked_folder, tmp_path / "without")
+    monkeypatch.setenv("AVATAR_LPIPS", str(weights))
+    train_small(tracked_folder, tmp_path / "with")
+    measure([tmp_path / "without", tmp_path / "with"], None, frames=1, repeats=1, say=lambda _: None)
+    assert timed == ["dssim", "lpips-squeeze"]
+    monkeypatch.setenv("AVATAR_LPIPS", str(tmp_path / "nothing"))
+    with pytest.raises(UserError, match="the run began with LPIPS and cannot go on without it"):
+        measure([tmp_path / "with"], None, frames=1, repeats=1, say=lambda _: None)

@@ -43,9 +43,14 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     output = capsys.readouterr().out
     figures = json.loads((tmp_path / "bench_train.json").read_text())
     assert [row["preset"] for row in figures["rows"]] == ["paper", "balanced", "fast"]
+    sums: list[str] = []
     for row in figures["rows"]:
         assert f"{row['late']['median']:.1f} ({row['late']['p95']:.1f})" in output
         assert set(row["floors"]) == {"network", "heads", "optimizer", "check"} and min(row["floors"].values()) > 0
+        whole = sum(time["median"] for name, time in row["stages"].items() if name != "skinning")  # once a frame
+        sums.append(f"{whole:.1f}")
         assert row["early"]["median"] > 0 and {"network", "network, backward", "splat", "loss"} <= row["stages"].keys()
+    (line,) = (line for line in output.splitlines() if line.lstrip().startswith("sum without skinning"))
+    assert line.split()[3:] == sums, "the stages of the table add up to what it says"
     assert {"interpolation"} <= figures["rows"][2]["stages"].keys() - figures["rows"][0]["stages"].keys()
     assert iio.imread(tmp_path / "bench_train.png").shape[1] > 500

@@ -91,7 +91,7 @@ def test_the_frame_rate_of_a_driver_is_that_of_its_video_and_its_drive_file(
 def test_eval_verifies_what_it_has_written(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", str(run), "--verify", "--protocol", "strict", "--protocol", "hypergaussians"]) == 0
     said = capsys.readouterr().out
-    assert said.count("PSNR and SSIM of 6 frames verified from their pictures") == 2
+    assert said.count("PSNR, SSIM and jitter of 6 frames verified from their pictures") == 2
     entries = json.loads((run / "eval" / "results.json").read_text())["protocols"]
     assert all(entry["verified"]["frames"] == 6 for entry in entries.values())
     assert len(list((run / "eval" / "strict" / "renders").glob("*.png"))) == 6

@@ -27,10 +27,22 @@ avatar.cli.run()
 """
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
+# A library that reports by itself whatever comes out of the middle of its import, and goes on.
+BEGUN = '    print("begun", flush=True)\n'
+SWALLOWING = f"""\
+    import time, traceback
+    try:
+    {BEGUN}\
+        time.sleep(60)
+    except BaseException:
+        traceback.print_exc()
+"""
+
+
+def start(*arguments: str, script: str = SCRIPT) -> subprocess.Popen[str]:
     """`avatar ...` as a process of its own that has just begun to import what it needs."""
     process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, *arguments],
+        [sys.executable, "-c", script, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -56,6 +68,13 @@ def test_ctrl_c_at_any_moment_gives_no_stack_trace(command: tuple[str, ...], del
 
 def test_ctrl_c_while_libraries_are_imported_is_the_conventional_status() -> None:
     process = start("compare", "a", "b")
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, output, errors) == (130, "", "avatar: interrupted\n")
+
+
+def test_ctrl_c_does_not_come_out_of_the_middle_of_an_import() -> None:
+    process = start("doctor", script=SCRIPT.replace(BEGUN, SWALLOWING))
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output, errors) == (130, "", "avatar: interrupted\n")

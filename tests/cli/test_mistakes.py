@@ -39,6 +39,10 @@ MISTAKES = {
         ["train", "{twin}", "--out", "{run}", "--resume"],
         "the data of twin is not what {run} was trained on",
     ),
+    "resume with another head": (
+        ["train", "{data}", "--out", "{run}", "--resume", "--head", "{other}/head_model"],
+        "trained with another head model",
+    ),
     "eval of no run": (["eval", "{tmp}"], "is not a run folder: it has no run.json"),
     "reenactment of no avatar": (["reenact", "{tmp}", "--driver", "{data}"], "is neither a run nor an avatar file"),
     "reenactment of a missing avatar": (["reenact", "{tmp}/x", "--driver", "{data}"], "there is no avatar file"),

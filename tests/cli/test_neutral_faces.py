@@ -13,6 +13,8 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
+from avatar.motion import reenact as reenact_module
+
 
 @pytest.fixture(scope="module")
 def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -81,6 +83,22 @@ def test_a_neutral_frame_that_cannot_be_is_refused_before_anything_is_drawn(
     video = tmp_path / "out.mp4"
     output = avatar("reenact", trained, "--driver", driver, "--frame-offset", 1, "--out", video, *options, status=1)
     assert sentence in output and not list(tmp_path.iterdir())
+
+
+def test_open_lips_are_said_of_a_neutral_face_that_was_found_and_not_of_one_that_was_chosen(
+    trained: Path, driver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reenact_module, "lips_apart", lambda *_: 0.0125)
+    command = ("reenact", trained, "--driver", driver, "--frame-offset", 1, "--out", tmp_path / "out.mp4")
+    sides = {"driver": ("--driver-neutral", 2), "someone": ("--neutral", 3)}
+    found = avatar(*command)
+    for name, (option, _) in sides.items():
+        assert f"The lips of {name} are 12.5 mm apart in the neutral face" in found
+        assert f"{option} N takes frame N instead" in found
+    for name, choice in sides.items():
+        (other,) = sides.keys() - {name}
+        said = avatar(*command, *choice)
+        assert f"The lips of {other} are" in said and f"The lips of {name} are" not in said
 
 
 def test_the_help_says_what_a_frame_is_called_by() -> None:

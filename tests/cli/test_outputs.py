@@ -59,6 +59,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("{run}/checkpoints/a.mp4", OF_RUN),
         ("{tmp}/folder.mp4", IS_FOLDER),
     ],
+    "reenact {run} --driver {video}": [("{video}", IS_INPUT), ("{tmp}/same.mp4", IS_INPUT)],
     "reenact {run}/avatar.safetensors --head {head} --driver {motion}": [
         ("{head}/a.mp4", IN_INPUT),
         ("{run}/previews/a.mp4", OF_RUN),
@@ -136,6 +137,9 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     motion = tmp / "smile.distances.csv"
     motion.write_text("time,expression_0\n0,0.5\n0.04,0.7\n")
     (tmp / "linked.distances.csv").symlink_to(motion)
+    video = tmp / "me.mp4"
+    video.write_bytes(b"never opened")
+    (tmp / "same.mp4").hardlink_to(video)
     for suffix in ("mp4", "npz", "safetensors"):
         (tmp / f"folder.{suffix}").mkdir()
     spec = tmp / "sweep.json"
@@ -149,6 +153,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "home": home,
         "file": file,
         "motion": motion,
+        "video": video,
         "spec": spec,
         "tracking": tracking,
         "clip": data / "imgs",

@@ -80,7 +80,7 @@ CHANGES = {
     "a format": (["--format", "VHAP"], "began without --format, not with --format VHAP"),
     "a frame rate": (["--fps", "30"], "began without --fps, not with --fps 30"),
     "more left out": (["--max-left-out", "0.5"], "began with --max-left-out 0.05, not with --max-left-out 0.5"),
-    "a wrong head": (["--ignore-misfit"], "began without --ignore-misfit, not with --ignore-misfit True"),
+    "a wrong head": (["--ignore-misfit"], "began without --ignore-misfit, not with --ignore-misfit: leave"),
 }
 
 

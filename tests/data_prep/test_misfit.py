@@ -71,15 +71,7 @@ def roll(folder: Path, pattern: str, rows: int, columns: int) -> None:
 @pytest.mark.parametrize(
     ("head", "inside", "lips", "away", "size", "by_matte", "found"),
     [
-        (
-            0.31,
-            0.3,
-            0.2,
-            0.024,
-            100,
-            False,
-            None,
-        ),  # a little overlap of the head, and lips that are where they are seen
+        (0.31, 0.3, 0.2, 0.024, 100, False, None),  # a little overlap of the head, and lips where they are seen
         (0.29, 1.0, 0.9, 0.0, 100, False, "head"),
         (0.10, 0.51, 0.9, 0.0, 100, True, None),  # a matte has clothes in it
         (0.90, 0.49, 0.9, 0.0, 100, True, "head"),

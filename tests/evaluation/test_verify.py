@@ -18,6 +18,7 @@ from disc import SIZE, make_run, read_png
 
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.evaluation import jitter as jitter_module
 from avatar.evaluation import measure as measure_module
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.verify import recompute, verify
@@ -74,7 +75,7 @@ def test_every_protocol_is_verified_and_that_is_recorded(results: Path) -> None:
     protocols = json.loads(results.read_text())["protocols"]
     assert [line.partition(":")[0] for line in said] == list(protocols)
     for line, entry in zip(said, protocols.values(), strict=True):
-        assert "PSNR and SSIM of 3 frames verified" in line
+        assert "PSNR, SSIM and jitter of 3 frames verified" in line
         verified = entry["verified"]
         assert verified["by"].startswith("scikit-image ") and verified["frames"] == 3 and verified["tolerance"] == 2e-6
         assert 0 < verified["largest_difference"] < 1e-6  # frames.csv is rounded to six decimals
@@ -134,6 +135,10 @@ DISAGREEMENTS: dict[str, tuple[Callable[[Path], None], str]] = {
         edit_table("ssim_rest", -3e-6),
         r"ssim_rest of frame 00009 is .* \([23]\.\de-06 apart, 2e-06 allowed",
     ),
+    "the jitter between frames": (
+        edit_table("jitter", 3e-6),
+        r"jitter of frame 00009 is .* \([23]\.\de-06 apart, 2e-06 allowed",
+    ),
     "a mean": (better_mean, r"ssim_head of the mean is .*results\.json"),
     "a table that was exchanged": (
         lambda f: (f / "frames.csv").write_text((f / "frames.csv").read_text() + " "),
@@ -169,6 +174,16 @@ def test_a_figure_that_the_program_gets_wrong_is_found(
     monkeypatch.setattr(measure_module, "weighted_mean", lambda values, mask: real(values, mask) * 1.0001)
     results = evaluate(make_run(tmp_path / "run", subject), ["strict"], write_frames=True, say=lambda _: None)
     with pytest.raises(UserError, match="psnr of frame 00008 is"):
+        verify(results, say=lambda _: None)
+
+
+def test_a_flicker_that_the_program_does_not_see_is_found(
+    tmp_path: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = jitter_module.weighted_mean
+    monkeypatch.setattr(jitter_module, "weighted_mean", lambda values, mask: real(values, mask) * 0.999)
+    results = evaluate(make_run(tmp_path / "run", subject), ["strict"], write_frames=True, say=lambda _: None)
+    with pytest.raises(UserError, match="jitter of frame 00009 is"):
         verify(results, say=lambda _: None)
 
 

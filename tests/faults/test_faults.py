@@ -40,14 +40,8 @@ from avatar.runs.run import read_run_info, write_run_info
 from data_prep.prepare import prepare
 
 DONE, REFUSED, KILLED, BROKEN = 0, 3, 9, 4
-STEPS = (
-    "open",
-    "os.rename",
-    "os.mkdir",
-    "os.remove",
-    "os.rmdir",
-    "os.chmod",
-)  # audit events of calls that change files
+# Audit events of calls that change files.
+STEPS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.chmod")
 FREES = ("os.remove", "os.rmdir")  # goes on a full disk
 FULL, READ_ONLY = errno.ENOSPC, errno.EROFS
 

@@ -106,6 +106,5 @@ def test_where_triton_interprets_every_drawing_waits() -> None:
 def test_there_is_room_where_nothing_is_needed_and_never_too_much() -> None:
     assert roomy(0) > 0
     assert roomy(MAX_PAIRS) == MAX_PAIRS
-    assert (
-        9 * (MAX_PAIRS + 32 * 2**20) < 2**31
-    )  # int32 finds every value of a record, with room for the tiles' rounding
+    # int32 finds every value of a record, with room for the tiles' rounding.
+    assert 9 * (MAX_PAIRS + 32 * 2**20) < 2**31

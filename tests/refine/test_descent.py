@@ -108,9 +108,8 @@ def test_the_last_picture_is_that_of_the_moves_and_no_worse_than_the_first(avata
 
     assert energy(found.moves) < 0.5 * energy(torch.zeros_like(found.moves))
     stuck = descend(likeness, made, [1e-6 * factor for factor in factors(wrong, likeness)], [3])
-    assert energy(stuck.moves) <= energy(torch.zeros_like(found.moves)) * (
-        1 + 1e-6
-    )  # steps far too long: none is taken
+    # Steps far too long: none is taken.
+    assert energy(stuck.moves) <= energy(torch.zeros_like(found.moves)) * (1 + 1e-6)
 
 
 def test_moves_stay_within_their_bounds(avatar: Avatar, clip: Clip) -> None:

@@ -141,9 +141,8 @@ def test_the_misfit_counts_squares_in_observations(likeness: Likeness, clip: Cli
     assert likeness.measure(values, given(clip, 0), grey).misfit == pytest.approx(expected, rel=1e-3)
     assert fits < 0.1 * expected  # the clip is the avatar's own picture
     far = replace_picture(target, likeness.picture(values, given(clip, 0), target) + 0.4)
-    assert (
-        likeness.measure(values, given(clip, 0), far).misfit < 400 * 0.5 * expected
-    )  # an outlier counts less than its square
+    # An outlier counts less than its square.
+    assert likeness.measure(values, given(clip, 0), far).misfit < 400 * 0.5 * expected
 
 
 def replace_picture(target: likeness_module.Target, picture: torch.Tensor) -> likeness_module.Target:

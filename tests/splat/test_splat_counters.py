@@ -28,9 +28,8 @@ def _drawn_and_counted(scene: Scene, *, everywhere: bool) -> tuple[Rendering, Co
 
 
 @pytest.mark.parametrize("simd", SIMD)
-@pytest.mark.parametrize(
-    "name", [name for name in SCENES if name != "head"]
-)  # its 15,000 splats at every pixel take long
+# The 15,000 splats of the head take long at every pixel.
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "head"])
 def test_skipping_does_not_change_a_bit(name: str, simd: str, monkeypatch: pytest.MonkeyPatch) -> None:
     use_simd(monkeypatch, simd)
     drawn = render(SCENES[name])

@@ -101,6 +101,13 @@ def test_what_another_surface_hides_has_no_colour() -> None:
     assert bool((seen[back] == 0).all()), "the sheet behind it is hidden, though it faces the camera too"
 
 
+def test_what_turns_its_back_has_no_colour_though_nothing_hides_it() -> None:
+    """The inside of an open neck: the camera is behind both sheets."""
+    avatar, frame = two_sheets(apart=0.02)
+    behind = replace(frame.camera, R_cam_world=torch.diag(torch.tensor([-1.0, -1.0, 1.0])))
+    assert bool((seen_colours(avatar, replace(frame, camera=behind))[1] == 0).all())
+
+
 def test_what_lies_a_little_under_the_surface_counts_as_seen() -> None:
     """Lids and lips lie on each other; a raster's depth is no more exact than a pixel."""
     avatar, frame = two_sheets(apart=0.001)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import islice
 
 from avatar.train.order import frame_order
 
@@ -19,3 +20,16 @@ def test_a_resumed_run_sees_what_the_uninterrupted_one_does() -> None:
     assert list(frame_order(frames, seed=4, start=0, stop=23)) + list(frame_order(frames, 4, 23, 40)) == whole
     assert list(frame_order(frames, seed=5, start=0, stop=40)) != whole
     assert max(Counter(whole).values()) - min(Counter(whole).values()) <= 1
+
+
+def test_no_list_of_all_steps_is_made() -> None:
+    """A hundred million of them would not fit; a few are taken, so a few are looked up."""
+    looked_up: list[int] = []
+
+    class Frames(list[int]):
+        def __getitem__(self, index):
+            looked_up.append(index)
+            return super().__getitem__(index)
+
+    order = frame_order(Frames(range(5)), seed=0, start=0, stop=10_000)
+    assert len(list(islice(order, 12))) == len(looked_up) == 12

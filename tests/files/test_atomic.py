@@ -1,0 +1,35 @@
+"""Two writers of one file: each has a temporary file of its own, and what stands in the end is whole."""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from avatar.files.atomic import temporary_name, write_atomically
+
+
+def test_two_writers_at_once_never_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both have written and neither has renamed when they meet."""
+    file, meeting, sync = tmp_path / "run.json", threading.Barrier(2, timeout=20), os.fsync
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (sync(descriptor), meeting.wait()))
+    contents = [b"first " * 5000, b"second" * 7000]
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda content: write_atomically(file, content), contents))
+    assert file.read_bytes() in contents
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_another_process_has_other_temporary_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forked, it counts from the same number."""
+    from avatar.files import atomic
+
+    names = set()
+    for process in (1, 2):
+        monkeypatch.setattr(os, "getpid", lambda process=process: process)
+        monkeypatch.setattr(atomic, "_COUNTER", iter((7,)))
+        names.add(temporary_name(tmp_path / "clip.mp4").name)
+    assert len(names) == 2 and all(name.startswith(".clip.") and name.endswith(".mp4") for name in names)
