@@ -52,8 +52,8 @@ class FaceFollower:
 
     def __init__(self, source: Source, assets: HeadAssets, head_path: Path, say: Callable[[str], object]) -> None:
         """Raises UserError where MediaPipe or its model is missing. The head model's landmarks may take 30 s, once."""
-        self._assets, self._detector = assets, FaceDetector()
-        self._embedding = find_embedding(head_path, assets, say)
+        self._assets, self._embedding = assets, find_embedding(head_path, assets, say)
+        self._detector = FaceDetector()
         self.pictures = Newest(source)
         self._looking, self._is_closed = threading.Lock(), False
         self._last: Face | None = None
@@ -66,7 +66,7 @@ class FaceFollower:
         with self._looking:
             if not self._is_closed:
                 self._is_closed = True
-                self._detector.__exit__(None, None, None)
+                self._detector.close()
 
     def dropped(self) -> tuple[int, int]:
         """Pictures that a newer one overtook before they were looked at, and all."""

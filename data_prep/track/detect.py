@@ -26,6 +26,8 @@ _SMALL = 0.15  # of the longer side: smaller faces are overlooked in the whole p
 _WINDOW = 4.0  # heights of the face, around where it was
 _FLAT = 3.0  # standard deviation of grey levels; a picture without contrast holds no face
 _SAME = 0.3  # overlap (IoU) of boxes above which two findings are one face
+# MediaPipe waits forever for a thread that is gone where the garbage collector closes a landmarker, so it never does.
+_OPEN: list[Any] = []
 
 
 class Face(NamedTuple):
@@ -48,6 +50,7 @@ class FaceDetector:
 
     def __init__(self) -> None:
         self._mediapipe, self._landmarker = _load()
+        _OPEN.append(self._landmarker)
         self._last: Face | None = None
 
     def __enter__(self) -> FaceDetector:
@@ -56,7 +59,12 @@ class FaceDetector:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """For once; a detector that nobody closes stays in memory."""
         self._landmarker.close()
+        _OPEN.remove(self._landmarker)
 
     def largest(self, image: UInt8[np.ndarray, "H W 3"]) -> Face | None:
         """The largest face of a picture that belongs to no clip."""

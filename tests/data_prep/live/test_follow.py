@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -44,22 +45,22 @@ def test_the_mouth_is_followed(video: Path, head: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(follow, "CALIBRATION_SECONDS", 2.0)
     assets = load_head_assets(head)
     said: list[str] = []
-    follower = FaceFollower(open_source(str(video)), assets, head, said.append)
-    with pytest.raises(RuntimeError, match="comes after calibrate"):
-        follower.follow()
-    calibration = follower.calibrate(said.append)
-    assert said[-2:] == ["Look into the camera, calmly, lips closed.", "Fitting the face."]
-    assert len(calibration.faces) >= follow.FEWEST and calibration.identity.shape == (300,)
-    assert float(calibration.identity.abs().max()) < 5
-    first = calibration.faces[0].taken
-    frames, opened = [], []
-    with pytest.raises(UserError, match=f"me.mp4 has ended after {FRAMES} pictures"):
-        while True:
-            face = follower.follow()
-            assert face is not None
-            frames.append(round((face.taken - first) * FPS))
-            opened.append(float(rotation_matrix_to_axis_angle(matrix_from_6d(face.params.jaw)[None])[0, 0]))
-    assert len(frames) > 8 and frames == sorted(set(frames)) and frames[-1] == FRAMES - 1
+    with contextlib.closing(FaceFollower(open_source(str(video)), assets, head, said.append)) as follower:
+        with pytest.raises(RuntimeError, match="comes after calibrate"):
+            follower.follow()
+        calibration = follower.calibrate(said.append)
+        assert said[-2:] == ["Look into the camera, calmly, lips closed.", "Fitting the face."]
+        assert len(calibration.faces) >= follow.FEWEST and calibration.identity.shape == (300,)
+        assert float(calibration.identity.abs().max()) < 5
+        first = calibration.faces[0].taken
+        frames, opened = [], []
+        with pytest.raises(UserError, match=f"me.mp4 has ended after {FRAMES} pictures"):
+            while True:
+                face = follower.follow()
+                assert face is not None
+                frames.append(round((face.taken - first) * FPS))
+                opened.append(float(rotation_matrix_to_axis_angle(matrix_from_6d(face.params.jaw)[None])[0, 0]))
+        assert len(frames) > 8 and frames == sorted(set(frames)) and frames[-1] == FRAMES - 1
     truth = perform(SEED, FRAMES, "speech").jaw[frames]
     assert np.abs(np.array(opened) - truth).mean() < 0.06
     assert 0 < follower.milliseconds["fit"] < 1000 and follower.dropped()[1] == FRAMES
@@ -109,3 +110,20 @@ def test_the_command_follows_a_video_to_its_end(video: Path, head: Path, tmp_pat
         assert process.wait(20) == 130
     finally:
         process.kill()
+
+
+UNCLOSED = """
+import gc
+import numpy
+from data_prep.track.detect import FaceDetector
+for _ in range(3):
+    detector = FaceDetector()
+    detector.itself = detector
+    detector.find(numpy.random.default_rng(0).integers(0, 255, (200, 200, 3)).astype(numpy.uint8))
+    del detector
+    gc.collect()
+"""
+
+
+def test_a_detector_that_nobody_closed_does_not_wait_forever(tracking_models: None) -> None:
+    subprocess.run([sys.executable, "-c", UNCLOSED], timeout=60, check=True)
