@@ -11,6 +11,7 @@ Leaves convergence.md, convergence.csv and convergence.png in --out, and the sta
 from __future__ import annotations
 
 import argparse
+import json
 import itertools
 import re
 import sys
@@ -75,7 +76,8 @@ class Learner:
         self.objective = Objective(config.trainer, self.background, term)
         self.meshes = PosedMeshes(self.avatar)
         self.step, self.points = 0, [{"mark": 0.0, "seconds": 0.0, "step": 0}]
-        self.recorded = {"data_hash": subject.data_hash, "config": config.to_dict(), "perceptual": term.name}
+        recorded = {"data_hash": subject.data_hash, "config": config.to_dict(), "perceptual": term.name}
+        self.recorded = json.loads(json.dumps(recorded))  # as a checkpoint gives it back
         if files := list_checkpoints(folder):
             self._go_on(load_checkpoint(files[-1]))
 
