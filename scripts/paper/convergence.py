@@ -11,8 +11,8 @@ Leaves convergence.md, convergence.csv and convergence.png in --out, and the sta
 from __future__ import annotations
 
 import argparse
-import json
 import itertools
+import json
 import re
 import sys
 import time
