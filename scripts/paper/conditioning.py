@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from leave import leave, machine, table
+from leave import leave, machine, run, table
 
 from avatar.bench.hyper import (
     COVARIANCE_FLOATS,
@@ -228,4 +228,4 @@ def report(folder: Path, points: Sequence[Point], count: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(main)

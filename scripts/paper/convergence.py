@@ -14,7 +14,6 @@ import argparse
 import itertools
 import json
 import re
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import torch
-from leave import leave, machine, table
+from leave import leave, machine, run, table
 from systems import add_source_arguments, systems
 from torch import Tensor
 
@@ -140,7 +139,7 @@ def main(words: Sequence[str]) -> int:
     place = given.out / "convergence" / subject.name
     learners = [Learner(n, place / re.sub(r"\W+", "_", n), subject, assets, c) for n, c in configs.items()]
     frames = held_out(subject, learners[0].config, given.frames)
-    run(learners, marks(given.seconds), frames)
+    take_turns(learners, marks(given.seconds), frames)
     truth = frames[len(frames) // 2].composite(learners[0].background)
     report(given.out, subject.name, learners, given.seconds, (truth * 255).round().byte().numpy(), len(frames))
     return 0
@@ -162,7 +161,7 @@ def held_out(subject: Subject, config: Config, count: int) -> list[Frame]:
         return list(loader.frames(chosen))
 
 
-def run(learners: Sequence[Learner], at: Sequence[float], frames: Sequence[Frame]) -> None:
+def take_turns(learners: Sequence[Learner], at: Sequence[float], frames: Sequence[Frame]) -> None:
     loaders = [FrameLoader(x.subject, x.config.data.size, x.config.data.cache_mb << 20, 1) for x in learners]
     try:
         for mark in at:
@@ -238,7 +237,4 @@ def draw(
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except UserError as error:
-        sys.exit(f"convergence.py: {error}")
+    run(main)

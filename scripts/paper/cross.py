@@ -11,7 +11,6 @@ Leaves cross.md, cross.csv and cross.png in --out.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from leave import leave, table
+from leave import leave, run, table
 from systems import Request, add_arguments, is_measured, request_of, run_of, systems, train
 from torch import Tensor
 
@@ -147,4 +146,4 @@ def draw(found: Sequence[Driven], pictures: dict[str, list[np.ndarray]]) -> Figu
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(main)

@@ -1,14 +1,16 @@
-"""What a table or figure leaves: NAME.md, NAME.csv and NAME.png, each whole or not at all."""
+"""What a table or figure leaves: NAME.md, NAME.csv and NAME.png, each whole or not at all; and its exit."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avatar.bench.machine import describe_machine
+from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 
 if TYPE_CHECKING:
@@ -47,3 +49,11 @@ def machine() -> str:
         f"{found['processors']} cores of {found['processor']} ({found['simd'][-1]}), {found['threads']} threads, PyTorch "
         f"{found['torch']}, load {found['load']}."
     )
+
+
+def run(main: Callable[[Sequence[str]], int]) -> None:
+    """The script as a program: a mistake is a sentence."""
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UserError as error:
+        sys.exit(f"{Path(sys.argv[0]).name}: {error}")

@@ -11,13 +11,12 @@ Leaves slicing.md, slicing.csv and slicing.png in --out.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from leave import leave, table
+from leave import leave, run, table
 from torch.distributions import MultivariateNormal
 
 from avatar.bench.results import new_figure
@@ -104,4 +103,4 @@ def draw(found: Sequence[Slice]) -> Figure:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(main)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from leave import leave, table
+from leave import leave, run, table
 from systems import TABLES, Rows, add_arguments, is_measured, read_table, request_of, run_of, train, write_sweep
 
 from avatar.bench.render import inputs, stream_rate
@@ -185,4 +185,4 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(main)

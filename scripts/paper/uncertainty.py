@@ -1,6 +1,7 @@
 """Does a HyperGaussian's conditional variance say where the avatar is wrong? Maps, correlation, reliability.
 
     python scripts/paper/uncertainty.py FOLDER... --out runs/paper [--head HEAD] [--seeds 0 1 2] [key=value ...]
+    python scripts/paper/uncertainty.py RUN... --out runs/paper
 
 On frames that training has not seen, each pixel's squared error is compared with what three things predict for it:
 
@@ -9,21 +10,20 @@ On frames that training has not seen, each pixel's squared error is compared wit
     training   each Gaussian's mean squared error on training frames, blended as colours are
 
 Pixels count where the head mask does. Variance and edges have no unit; one factor gives each the mean error of the training
-frames. Trains through `avatar sweep` in --out, as the tables do, and shares their runs.
+frames. Tracked folders are trained through `avatar sweep` in --out, as the tables do, and share their runs.
 Leaves uncertainty.md, uncertainty.csv (the bins of the reliability plot) and uncertainty.png in --out.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from leave import leave, table
+from leave import leave, run, table
 from scipy.stats import spearmanr
 from systems import add_arguments, is_measured, request_of, run_of, systems, train
 from torch import Tensor
@@ -35,7 +35,7 @@ from avatar.data.loader import FrameLoader
 from avatar.gaussians.hyper import HyperHead, HyperHeads
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.losses.metrics import squared_error
-from avatar.runs.run import Run
+from avatar.runs.run import RUN_FILE, Run
 from avatar.splat import splat
 from avatar.splat.sh import C0
 from avatar.types import Frame
@@ -80,14 +80,15 @@ def main(words: Sequence[str]) -> int:
     add_arguments(parser)
     parser.add_argument("--frames", type=int, default=40, help="held-out frames, and as many of training")
     given = parser.parse_intermixed_args(words)
-    status, spec = train(request_of(given), "uncertainty.to_train", systems([SYSTEM]))
-    done = [job for job in spec.jobs if is_measured(given.out, job)]
-    if not done:
+    request, status = request_of(given), 0
+    runs = {path.name: path for path in request.folders if (path / RUN_FILE).is_file()}
+    if not runs:
+        status, spec = train(request, "uncertainty.to_train", systems([SYSTEM]))
+        done = [job for job in spec.jobs if is_measured(given.out, job)]
+        runs = {f"{job.subject}, seed {job.seed}": run_of(given.out, job) for job in done}
+    if not runs:
         return status or 1
-    found = [
-        examine(open_run(run_of(given.out, job), given.head), f"{job.subject}, seed {job.seed}", given.frames)
-        for job in done
-    ]
+    found = [examine(open_run(path, given.head), name, given.frames) for name, path in runs.items()]
     rows = [["run", "prediction", "mean prediction", "mean squared error"]]
     rows += [[f.name, name, *map(float, pair)] for f in found for name in PREDICTORS for pair in f.bins[name]]
     leave(given.out, "uncertainty", page(found), rows, draw(found))
@@ -266,4 +267,4 @@ def draw(found: Sequence[Found]) -> Figure:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(main)
