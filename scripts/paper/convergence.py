@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import torch
 from leave import leave, machine, run, table
-from systems import add_source_arguments, systems
+from systems import add_source_arguments, folders_and_overrides, systems
 from torch import Tensor
 
 from avatar.bench.results import new_figure
@@ -128,8 +128,7 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument("--systems", nargs="+", default=SYSTEMS, metavar="NAME", help="of any of the tables")
     parser.add_argument("--frames", type=int, default=20, help="held-out frames that are measured")
     given = parser.parse_intermixed_args(words)
-    overrides = [word for word in given.arguments if "=" in word]
-    folders = [Path(word) for word in given.arguments if "=" not in word]
+    folders, overrides = folders_and_overrides(given.arguments)
     if len(folders) != 1 or min(given.seconds) <= 0:
         parser.error("give one tracked folder, and seconds above 0")
     rows = {row["name"]: [*row["overrides"], *overrides] for row in systems(given.systems)}
@@ -231,6 +230,8 @@ def draw(
             own = [(point["seconds"], point[figure_name]) for point in points.values()]
             axes.plot(*zip(*own, strict=True), "o-", ms=3, label=name)
         axes.set(xscale="log", xlabel="seconds of training", ylabel=f"{figure_name.upper()}, head alone")
+        axes.set_xticks(shown, [f"{mark:g}" for mark in shown])
+        axes.set_xticks([], minor=True)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure

@@ -56,10 +56,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--side-by-side", action="store_true", help="a job for each processor; times do not compare")
 
 
+def folders_and_overrides(words: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """What is there is a folder, whatever its name."""
+    overrides = [word for word in words if "=" in word and not Path(word).exists()]
+    return [Path(word) for word in words if word not in overrides], overrides
+
+
 def request_of(given: argparse.Namespace) -> Request:
+    folders, overrides = folders_and_overrides(given.arguments)
     return Request(
-        folders=[Path(word) for word in given.arguments if "=" not in word],
-        overrides=[word for word in given.arguments if "=" in word],
+        folders=folders,
+        overrides=overrides,
         out=given.out,
         head=given.head,
         frame_offset=given.frame_offset,

@@ -137,7 +137,7 @@ def theirs_of(row: Row, name: str) -> str:
 
 
 def short(count: int) -> str:
-    return f"{count / 1e6:.1f}M" if count >= 1e6 else f"{count // 1000}K"
+    return f"{count / 1e6:.1f}M" if count >= 1e6 else f"{count // 1000}K" if count else "0"
 
 
 def page(title: str, rows: Sequence[Row], notes: Sequence[str]) -> list[str]:

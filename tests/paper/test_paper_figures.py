@@ -12,6 +12,7 @@ import cross
 import numpy as np
 import pytest
 import slicing
+import systems
 import torch
 import uncertainty
 from lively import lively_run
@@ -186,3 +187,17 @@ def test_convergence_goes_on_from_its_last_mark(folder: Path, tmp_path: Path) ->
 def test_marks_lie_between_the_pictures() -> None:
     assert convergence.marks([20.0, 5.0]) == [5.0, 7.9, 12.6, 20.0]
     assert json.loads(json.dumps(convergence.marks([5.0]))) == [5.0]
+
+
+def test_a_folder_may_have_an_equals_sign_in_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "n=8"
+    folder.mkdir()
+    assert systems.folders_and_overrides([str(folder), "a.b=1", "someone"]) == ([folder, Path("someone")], ["a.b=1"])
+
+
+def test_finished_runs_are_examined_without_training(folder: Path, tmp_path: Path) -> None:
+    run = lively_run(folder, tmp_path / "n=8", "data.size=32")
+    words = [str(run), "--head", str(folder / "head_model"), "--out", str(tmp_path / "out"), "--frames", "1"]
+    assert uncertainty.main(words) == 0
+    assert {line["run"] for line in lines(tmp_path / "out" / "uncertainty.csv")} == {"n=8"}
+    assert not (tmp_path / "out" / "jobs").exists()
