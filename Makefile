@@ -42,7 +42,7 @@ arm64: ## compile the core for 64-bit ARM with a cross compiler (Debian: g++-aar
 gpu-check: setup ## verify the GPU's kernels without a GPU (installs Triton, 700 MB)
 	PIP_FLAGS="$(PIP_FLAGS)" scripts/check_gpu_kernels.sh
 
-paper-smoke: setup ## run scripts/paper, which makes the paper's tables, tiny
+paper-smoke: setup ## run scripts/paper, which makes the paper's tables and figures, tiny
 	scripts/paper/smoke.sh
 
 check: setup ## lint, formatting and types

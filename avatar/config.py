@@ -110,7 +110,7 @@ MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 
 CHOICES: dict[str, tuple[str, ...]] = {
-    "model.name": ("hypergaussians", "flashavatar", "covariance", "ndgs"),
+    "model.name": ("hypergaussians", "flashavatar", "covariance", "ndgs", "splattingavatar", "monogaussianavatar"),
     "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
     "trainer.lpips_net": ("vgg", "alex", "squeeze"),
     "trainer.lpips_region": ("frame", "head"),

@@ -10,13 +10,15 @@ from torch import Tensor, nn
 
 from avatar.compute.device import brought, on_gpu
 from avatar.config import ModelConfig
-from avatar.gaussians.compose import compose_raw, compose_slice
+from avatar.gaussians.compose import compose_carried, compose_raw, compose_slice
 from avatar.gaussians.covariance import CovarianceHeads
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size, positional_encoding
+from avatar.gaussians.growth import alive_after, evenly_ordered
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
+from avatar.gaussians.mesh_points import MeshPoints
 from avatar.gaussians.ndgs import NdGaussians
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
@@ -24,6 +26,7 @@ from avatar.head.model import HeadModel, PoseTensors
 from avatar.types import Gaussians, HeadParams
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
+WITH_LATENTS = ("hypergaussians", "covariance", "ndgs")
 
 
 class Avatar(nn.Module):
@@ -33,40 +36,53 @@ class Avatar(nn.Module):
     `latent_grid` the network is evaluated on that grid over the UV map and its latents are interpolated to the Gaussians.
     `name = "covariance"`: the same through the covariance; `name = "ndgs"`: the latent slices N-dimensional Gaussians.
     `name = "flashavatar"`: the network gives the offsets itself; they are not smooth over the map, so no grid is used.
+    `name = "monogaussianavatar"`: the same for the first `count` points of a set that grows in training.
+    `name = "splattingavatar"`: no network; learned places on the mesh, which alone moves the Gaussians.
 
     `to(device)` moves all that drawing needs. `head` stays on the CPU, for those who look at the mesh; cameras and head
     parameters may be on either side.
     """
 
     code: Tensor
+    count: Tensor | None  # of the points that are alive; None: all are
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__()
         self.config = config
         self.head = HeadModel(assets, identity)
-        self.embedding = Embedding(assets, uv_texels(assets, config.uv_size))
+        grows = config.name == "monogaussianavatar"
+        texels = uv_texels(assets, config.uv_size)
+        self.embedding = Embedding(assets, evenly_ordered(texels) if grows else texels)
         N = len(self.embedding)
+        alive = alive_after(0, 1, N) if grows else N
         neutral = self.embedding.points(self.head.neutral_vertices())
-        has_latents = config.name != "flashavatar"
+        has_latents = config.name in WITH_LATENTS
         self.grid: LatentGrid | None = None
         if has_latents and config.latent_grid is not None:
             self.grid = latent_grid(assets, self.embedding.texels, config.uv_size, neutral, config.latent_grid)
         places = neutral if self.grid is None else self.grid.places
         self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
 
-        self.deformation = DeformationMLP(
-            code_size=encoded_size(config.frequencies),
-            condition_size=assets.num_expressions + CONDITION_EXTRAS,
-            out_size=config.latent_dim if has_latents else 10,
-            width=config.mlp_width,
-            layers=config.mlp_layers,
-        )
+        self.deformation: DeformationMLP | None = None
+        if config.name != "splattingavatar":
+            self.deformation = DeformationMLP(
+                code_size=encoded_size(config.frequencies),
+                condition_size=assets.num_expressions + CONDITION_EXTRAS,
+                out_size=config.latent_dim if has_latents else 10,
+                width=config.mlp_width,
+                layers=config.mlp_layers,
+            )
+        self.mesh_points: MeshPoints | None = None
+        if config.name in ("splattingavatar", "monogaussianavatar"):
+            place = self.embedding.texels.face, self.embedding.barycentric
+            self.mesh_points = MeshPoints(assets.faces, self.head.neutral_vertices(), *place, learned=not grows)
+        self.register_buffer("count", torch.tensor(alive) if grows else None)
         self.hyper: HyperHeads | CovarianceHeads | None = None
         if config.name in ("hypergaussians", "covariance"):
             self.hyper = (HyperHeads if config.name == "hypergaussians" else CovarianceHeads)(N, config.latent_dim)
         self.ndgs = NdGaussians(N, config.latent_dim) if config.name == "ndgs" else None
 
-        initial_scale = torch.log(knn_scales(neutral))
+        initial_scale = torch.log(torch.cat((knn_scales(neutral[:alive]), knn_scales(neutral)[alive:])))
         self.log_scales = nn.Parameter(initial_scale[:, None].repeat(1, 3))
         self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(N, 1))
         initial_opacity = torch.logit(torch.tensor(config.initial_opacity))
@@ -75,6 +91,7 @@ class Avatar(nn.Module):
         self.sh_dc = nn.Parameter(torch.zeros(N, 1, 3))
         self.sh_rest = nn.Parameter(torch.zeros(N, coefficients - 1, 3))
         self._pose: PoseTensors | None = None  # for posing on a GPU
+        self.register_load_state_dict_post_hook(_check_loaded)
 
     def __len__(self) -> int:
         """The number of Gaussians."""
@@ -83,9 +100,11 @@ class Avatar(nn.Module):
     def forward(self, params: HeadParams, vertices: Float[Tensor, "V 3"] | None = None) -> Gaussians:
         """The Gaussians of one frame, world space. `vertices`: the head posed by `params` already, metres."""
         vertices = self.vertices(params) if vertices is None else vertices
-        values = self.deformation(self.code, self.condition(params))
-        sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
-        base = self.quats, self.log_scales, self.opacity_logits, sh
+        base = self.base()
+        if self.deformation is None:
+            assert self.mesh_points is not None
+            return compose_carried(self.mesh_points.points(vertices), self.mesh_points.turns(vertices), *base)
+        values = self.deformation(self.living(self.code), self.condition(params))
         if on_gpu(values) and values.dtype == torch.float32 and self.is_fused:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
@@ -93,17 +112,48 @@ class Avatar(nn.Module):
             return place_gpu(vertices, values, self.packed, *base, self.embedding, grid)
         if self.grid is not None:
             values = self.grid.interpolate(values)
-        points = self.embedding.points(vertices)
+        points = self.points(vertices)
         if self.ndgs is not None:
             return compose_slice(points, *base, *self.ndgs(values))
         if self.hyper is not None:
             values = self.hyper(values)
         return compose_raw(points, *base, values)
 
+    def base(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Quaternions, log-scales, logits of the opacities and colours of the Gaussians that are alive."""
+        sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
+        quats, log_scales, opacity_logits, sh = map(self.living, (self.quats, self.log_scales, self.opacity_logits, sh))
+        return quats, log_scales, opacity_logits, sh
+
+    def living(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "alive ..."]:
+        """Those of the points that are alive."""
+        return values if self.count is None else values[: int(self.count)]
+
+    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "alive 3"]:
+        """Where the Gaussians are on the mesh, metres."""
+        if self.mesh_points is None:
+            return self.embedding.points(vertices)
+        return self.living(self.mesh_points.points(vertices))
+
+    def encode_points(self) -> None:
+        """Give the network the places that points on the mesh have now."""
+        if self.mesh_points is None or self.count is None:
+            return
+        vertices = self.head.neutral_vertices().to(self.code.device)
+        self.code = positional_encoding(self.mesh_points.points(vertices).detach(), self.config.frequencies)
+
+    def check_points(self) -> None:
+        """After parameters were loaded. Raises ValueError for points that cannot be there."""
+        if self.mesh_points is not None:
+            self.mesh_points.check()
+        if self.count is not None and not 1 <= int(self.count) <= len(self):
+            raise ValueError(f"has {int(self.count)} points alive of {len(self)}")
+        self.encode_points()
+
     @property
     def is_fused(self) -> bool:
         """Whether a GPU has kernels for all that follows the network; else torch's own operations do it there."""
-        return self.ndgs is None and not isinstance(self.hyper, CovarianceHeads)
+        return self.ndgs is None and self.mesh_points is None and not isinstance(self.hyper, CovarianceHeads)
 
     @property
     def packed(self) -> Float[Tensor, "blocks rows 16"] | None:
@@ -133,8 +183,12 @@ class Avatar(nn.Module):
     def condition(self, params: HeadParams) -> Float[Tensor, " D"]:
         """The network's input, with expression coefficients that the frame does not carry as zeros."""
         condition = brought(params.condition(), self.code.device)
-        missing = self.deformation.condition_size - len(condition)
+        missing = 0 if self.deformation is None else self.deformation.condition_size - len(condition)
         if missing == 0:
             return condition
         E = len(params.expression)
         return torch.cat((condition[:E], condition.new_zeros(missing), condition[E:]))
+
+
+def _check_loaded(avatar: Avatar, _: object) -> None:
+    avatar.check_points()

@@ -22,7 +22,8 @@ from torch.nn.functional import embedding_bag
 
 from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
-from avatar.gaussians.compose import compose, compose_slice, split_offsets
+from avatar.gaussians.compose import compose, compose_carried, compose_slice, split_offsets
+from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.ndgs import Slice
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
@@ -44,19 +45,21 @@ class Renderer:
     def __init__(self, avatar: Avatar, background: Float[Tensor, " 3"]) -> None:
         self.background = brought(background.detach().clone(), avatar.code.device)
         self._avatar = avatar
-        self._network = FoldedNetwork(avatar)
+        self._network = None if avatar.deformation is None else FoldedNetwork(avatar, avatar.deformation)
         self._on_gpu = on_gpu(avatar.code) and avatar.is_fused
         self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
         self._packed = avatar.packed.detach().clone() if self._on_gpu and avatar.packed is not None else None
-        self._ndgs = deepcopy(avatar.ndgs)
-        self._base = {
-            name: getattr(avatar, name).detach().clone() for name in ("quats", "log_scales", "opacity_logits")
-        }
-        self._base["sh"] = torch.cat((avatar.sh_dc, avatar.sh_rest), dim=1)
+        self._ndgs, self._mesh_points = deepcopy(avatar.ndgs), deepcopy(avatar.mesh_points)
+        names = ("quats", "log_scales", "opacity_logits", "sh")
+        self._base = {name: value.detach().clone() for name, value in zip(names, avatar.base(), strict=True)}
 
     @torch.no_grad()
     def gaussians(self, params: HeadParams) -> Gaussians:
         """What `avatar(params)` gives, to rounding."""
+        if self._network is None:
+            assert self._mesh_points is not None
+            vertices = self.vertices(params)
+            return compose_carried(self.points(vertices), self._mesh_points.turns(vertices), **self._base)
         if self._on_gpu:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
@@ -130,11 +133,15 @@ class Renderer:
 
     def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
         """Where the Gaussians are bound on the mesh, metres."""
+        if self._mesh_points is not None:
+            return self._mesh_points.points(vertices)[: len(self._base["quats"])]
         embedding = self._avatar.embedding
         return embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
 
     def latents(self, params: HeadParams) -> Float[Tensor, "N n"]:
-        """The network's output for each Gaussian."""
+        """The network's output for each Gaussian. Raises ValueError for an avatar without a network."""
+        if self._network is None:
+            raise ValueError(f"model={self._avatar.config.name} has no network")
         latents, grid = self._network(self._avatar.condition(params)), self._avatar.grid
         if grid is None:
             return latents
@@ -167,10 +174,9 @@ def drawn(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"])
 class FoldedNetwork:
     """The deformation network with the first layer's product with the code done; `avatar.deformation` to rounding."""
 
-    def __init__(self, avatar: Avatar) -> None:
-        network = avatar.deformation
+    def __init__(self, avatar: Avatar, network: DeformationMLP) -> None:
         for_code, for_condition = network.input.weight.detach().split((network.code_size, network.condition_size), 1)
-        self._of_code: Float[Tensor, "M width"] = avatar.code @ for_code.T
+        self._of_code: Float[Tensor, "M width"] = avatar.living(avatar.code) @ for_code.T
         self._for_condition, self._bias = for_condition.clone(), network.input.bias.detach().clone()
         self._layers = [
             (layer.get_parameter("weight").detach().T.clone(), layer.get_parameter("bias").detach().clone())

@@ -34,6 +34,8 @@ def test_the_papers_recipe(overrides: list[str]) -> None:
         (["experiment=paper", "model=flashavatar"], {"model.name": "flashavatar"}),
         (["experiment=paper", "model=covariance"], {"model.name": "covariance"}),
         (["experiment=paper", "model=ndgs"], {"model.name": "ndgs"}),
+        (["experiment=paper", "model=splattingavatar"], {"model.name": "splattingavatar"}),
+        (["experiment=paper", "model=monogaussianavatar"], {"model.name": "monogaussianavatar"}),
     ],
 )
 def test_the_papers_systems_differ_in_what_the_paper_says_and_in_nothing_else(
@@ -76,7 +78,10 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("modle=flashavatar", "no configuration key 'modle'; the nearest is 'model'"),
         ("trainer.iteration=3", "the nearest is 'trainer.iterations'"),
         ("iterations=3", "the nearest is 'trainer.iterations'"),
-        ("model=flashavtar", "configs/model/ has covariance, flashavatar, hypergaussians, ndgs"),
+        (
+            "model=flashavtar",
+            "configs/model/ has covariance, flashavatar, hypergaussians, monogaussianavatar, ndgs, splat",
+        ),
         ("trainer.iterations=many", "trainer.iterations=many is not valid: it must be a whole number"),
         ("trainer.iterations=1.5", "trainer.iterations=1.5 is not valid: it must be a whole number"),
         ("trainer.iterations=true", "trainer.iterations=true is not valid: it must be a whole number"),

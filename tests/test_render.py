@@ -27,6 +27,11 @@ def trained_looking(*overrides: str) -> Avatar:
         for parameter in avatar.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
         avatar.opacity_logits += 2.0
+        if avatar.mesh_points is not None:  # a place is in metres
+            avatar.mesh_points.place *= 0.02
+            avatar.mesh_points.walk()
+        if avatar.count is not None:
+            avatar.count.fill_(len(avatar) // 2)
         if avatar.ndgs is not None:  # latents near the mean, so that not all is faded away
             avatar.deformation.output.weight *= 0.1
     return avatar
@@ -40,8 +45,10 @@ def trained_looking(*overrides: str) -> Avatar:
         ("model=flashavatar",),
         ("model=covariance",),
         ("model=ndgs",),
+        ("model=splattingavatar",),
+        ("model=monogaussianavatar",),
     ],
-    ids=["hypergaussians on a grid", "hypergaussians", "flashavatar", "covariance", "ndgs"],
+    ids=lambda overrides: overrides[0].removeprefix("model"),
 )
 def test_the_renderer_gives_what_the_avatar_gives(overrides: tuple[str, ...]) -> None:
     avatar = trained_looking(*overrides)

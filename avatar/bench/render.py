@@ -77,7 +77,12 @@ def describe(trained: TrainedAvatar) -> dict[str, Any]:
 
 
 def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> list[Row]:
-    """Compare, then time. Raises UserError when the renderer draws another picture: its time would say nothing."""
+    """Compare, then time. Raises UserError when the renderer draws another picture: its time would say nothing; and for an
+    avatar without a network, whose steps are others."""
+    if trained.avatar.deformation is None:
+        raise UserError(
+            f"the steps of a frame of model={trained.config.model.name} are not timed; choose another avatar"
+        )
     renderer = Renderer(trained.avatar, torch.tensor(trained.config.data.background))
     rows = []
     for size in sizes:

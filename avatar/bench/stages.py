@@ -10,7 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.gaussians.compose import compose_raw
+from avatar.gaussians.deformation import DeformationMLP
 from avatar.losses.photometric import PhotometricLoss
 from avatar.model import Avatar
 from avatar.train.optim import schedule, set_rates
@@ -58,8 +60,10 @@ class StagedStep:
         points = watch.measure("embedding", lambda: avatar.embedding.points(vertices))
         condition = avatar.condition(frame.params)
 
-        network = list(avatar.deformation.parameters())
-        (raw,) = self._forward("network", lambda: (avatar.deformation(avatar.code, condition),), [], network)
+        deformation = network_of(avatar)
+        (raw,) = self._forward(
+            "network", lambda: (deformation(avatar.code, condition),), [], list(deformation.parameters())
+        )
         if avatar.grid is not None:
             interpolate = avatar.grid.interpolate
             (raw,) = self._forward("interpolation", lambda z: (interpolate(z),), [raw])
@@ -117,6 +121,13 @@ class StagedStep:
                     tensor.grad = gradient
                 else:
                     cotangents.append(gradient)
+
+
+def network_of(avatar: Avatar) -> DeformationMLP:
+    """Raises UserError for an avatar whose steps are others than the stages that are timed."""
+    if avatar.deformation is None or avatar.mesh_points is not None:
+        raise UserError(f"the stages of a step of model={avatar.config.name} are not timed; choose another model")
+    return avatar.deformation
 
 
 def gradients(link: Link, cotangents: Sequence[Tensor]) -> list[Tensor]:

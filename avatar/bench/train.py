@@ -12,7 +12,7 @@ import torch
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians, time_of
 from avatar.bench.floor import floor_ms
-from avatar.bench.stages import StagedStep
+from avatar.bench.stages import StagedStep, network_of
 from avatar.commands.opening import split_sizes
 from avatar.config import Config, load_config
 from avatar.data.loader import FrameLoader
@@ -157,9 +157,9 @@ def floors(avatar: Avatar) -> dict[str, float]:
     Heads: parameters and latents read twice, their gradients written once, offsets and their gradients moved once.
     Optimizer: parameters, gradients and both moments read, all but the gradients written. Check: gradients read.
     """
-    threads, places = torch.get_num_threads(), len(avatar.code)
-    first, *others = [layer.weight for layer in avatar.deformation.modules() if isinstance(layer, torch.nn.Linear)]
-    code = first[:, : avatar.deformation.code_size].numel()
+    threads, places, network = torch.get_num_threads(), len(avatar.code), network_of(avatar)
+    first, *others = [layer.weight for layer in network.modules() if isinstance(layer, torch.nn.Linear)]
+    code = first[:, : network.code_size].numel()
     products = 2 * code + 3 * sum(weight.numel() for weight in others)
     everything = sum(parameter.nbytes for parameter in avatar.parameters())
     found = {

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.gaussians.deformation import DeformationMLP
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.model import Avatar
 from avatar.runs.trained import TrainedAvatar
@@ -68,12 +69,17 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
             "an avatar of model=ndgs cannot be exported for browsers, which do not know its opacities; train one with "
             "model=hypergaussians"
         )
+    if model.mesh_points is not None or model.deformation is None:
+        raise UserError(
+            f"an avatar of model={model.config.name} cannot be exported for browsers, which do not know points that have "
+            "left their texel; train one with model=hypergaussians"
+        )
     moved = (trained.recording.tracks["expression"] != 0).any(dim=0).nonzero().flatten()
     used, corners = torch.unique(model.embedding.corners, return_inverse=True)
     arrays: dict[str, Tensor] = {
         **_head_arrays(model, assets, used, moved),
         "barycentric": model.embedding.barycentric,
-        **_network_arrays(model, moved, assets.num_expressions),
+        **_network_arrays(model, model.deformation, moved, assets.num_expressions),
         "quats": model.quats,
         "log_scales": model.log_scales,
         "opacity_logits": model.opacity_logits,
@@ -125,9 +131,10 @@ def _head_arrays(
     }
 
 
-def _network_arrays(model: Avatar, moved: Int[Tensor, " e"], expressions: int) -> dict[str, Tensor]:
+def _network_arrays(
+    model: Avatar, network: DeformationMLP, moved: Int[Tensor, " e"], expressions: int
+) -> dict[str, Tensor]:
     """The deformation network with the first layer's product with the positional code done."""
-    network = model.deformation
     for_code, for_condition = network.input.weight.split((network.code_size, network.condition_size), dim=1)
     conditions = torch.cat((moved, torch.arange(expressions, network.condition_size)))
     return {

@@ -79,6 +79,28 @@ def compose_slice(
     )
 
 
+def compose_carried(
+    points: Float[Tensor, "N 3"],
+    turns: Float[Tensor, "N 4"],
+    quats: Float[Tensor, "N 4"],
+    log_scales: Float[Tensor, "N 3"],
+    opacity_logits: Float[Tensor, " N"],
+    sh: Float[Tensor, "N K 3"],
+) -> Gaussians:
+    """Gaussians that a mesh carries and that are otherwise the same in every frame (`avatar.gaussians.mesh_points`).
+
+    turns   the mesh's rotation at each, unit quaternions
+    """
+    base = torch.nn.functional.normalize(quats, dim=-1)
+    return Gaussians(
+        means=points,
+        quats=torch.nn.functional.normalize(quaternion_product(turns, base), dim=-1),
+        scales=torch.exp(log_scales),
+        opacities=torch.sigmoid(opacity_logits),
+        sh=sh,
+    )
+
+
 def compose_raw(
     points: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],

@@ -179,7 +179,10 @@ def _uncertainty(run: Run) -> list[Markup]:
     image = uncertainty_map(run)
     if image is None:
         return []
-    caption = "sigmoid(2.5 u) of each Gaussian on the UV map: dark is sure, bright is unsure; half-way at the start"
+    caption = (
+        "sigmoid(2.5 u) of each Gaussian on the UV map: bright is a large conditional variance; half-way at the start. It "
+        "does not predict the error (docs/paper.md)"
+    )
     return [section("Uncertainty", element("div", picture(image, caption, format="png"), class_="gallery wide"))]
 
 

@@ -95,7 +95,10 @@ def load_module(module: torch.nn.Module, tensors: Mapping[str, Tensor], source: 
     """Put the parameters among a file's tensors into a module; UserError naming the first that does not fit."""
     own = {name: tuple(value.shape) for name, value in module.state_dict().items()}
     check_fit(own, tensors, source)
-    module.load_state_dict({name: tensors[f"{_MODEL}{name}"] for name in own})
+    try:
+        module.load_state_dict({name: tensors[f"{_MODEL}{name}"] for name in own})
+    except ValueError as error:
+        raise UserError(f"the avatar in {source} is damaged: it {error}; copy it again, or train again") from None
 
 
 def check_fit(own: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor], source: Path | str) -> None:

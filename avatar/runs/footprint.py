@@ -16,7 +16,7 @@ from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
-from avatar.model import CONDITION_EXTRAS
+from avatar.model import CONDITION_EXTRAS, WITH_LATENTS
 
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
 
@@ -57,8 +57,13 @@ def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) ->
         "sh_rest": (N, (config.sh_degree + 1) ** 2 - 1, 3),
     }
     layers = [("input", inputs, width), *((f"hidden.{i}", width, width) for i in range(config.mlp_layers - 1))]
-    for name, given, made in (*layers, ("output", width, OFFSETS if config.name == "flashavatar" else n)):
-        shapes |= {f"deformation.{name}.weight": (made, given), f"deformation.{name}.bias": (made,)}
+    if config.name != "splattingavatar":
+        for name, given, made in (*layers, ("output", width, n if config.name in WITH_LATENTS else OFFSETS)):
+            shapes |= {f"deformation.{name}.weight": (made, given), f"deformation.{name}.bias": (made,)}
+    if config.name in ("splattingavatar", "monogaussianavatar"):
+        shapes |= {"mesh_points.face": (N,), "mesh_points.place": (N, 3)}
+    if config.name == "monogaussianavatar":
+        shapes["count"] = ()
     if config.name == "ndgs":
         shapes |= {"ndgs.mean": (3 + n, N), "ndgs.root": (triangle_size(n), N), "ndgs.cross": (3, n, N)}
     for name, m in HEADS.items():
@@ -128,6 +133,6 @@ def parameter_needs(shapes: Shapes, copies: int, more_of_heads: int = 0) -> list
 
 def places(config: ModelConfig, gaussians: int) -> int:
     """Where the network is evaluated: at every Gaussian, or at the nodes of a grid, of which each needs four at most."""
-    if config.name == "flashavatar" or config.latent_grid is None:
+    if config.name not in WITH_LATENTS or config.latent_grid is None:
         return gaussians
     return min(4 * gaussians, (config.latent_grid + 2) ** 2)

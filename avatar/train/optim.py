@@ -23,8 +23,11 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
         {"params": [avatar.opacity_logits], "lr": rates.opacity},
         {"params": [avatar.log_scales], "lr": rates.scale},
         {"params": [avatar.quats], "lr": rates.rotation},
-        {"params": list(avatar.deformation.parameters()), "lr": rates.mlp},
     ]
+    if avatar.deformation is not None:
+        groups.append({"params": list(avatar.deformation.parameters()), "lr": rates.mlp})
+    if avatar.mesh_points is not None and avatar.mesh_points.place.requires_grad:
+        groups.append({"params": [avatar.mesh_points.place], "lr": rates.hyper})
     for distributions in (avatar.hyper, avatar.ndgs):
         if distributions is not None:
             groups.append({"params": list(distributions.parameters()), "lr": rates.hyper})

@@ -23,6 +23,7 @@ from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
 from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
+from avatar.train.points import move_points
 from avatar.types import Frame, Gaussians
 
 Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
@@ -120,6 +121,7 @@ def training_step(
         judge(loss, [parameter.grad for parameter in avatar.parameters() if parameter.grad is not None])
     set_rates(optimizer, schedule(step, objective.config))
     optimizer.step()
+    move_points(avatar, optimizer, step + 1, objective.config)
     return Outcome(loss, image.detach(), target)
 
 

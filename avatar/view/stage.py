@@ -139,7 +139,7 @@ def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _uncertainty_colours(trained: TrainedAvatar) -> Float[Tensor, "N 1 3"] | None:
-    """Coefficients of a colour for each Gaussian, on the scale of the report's map: dark where it is sure."""
+    """Coefficients of a colour for each Gaussian, on the scale of the report's map."""
     if trained.avatar.hyper is None:
         return None
     with torch.no_grad():

@@ -11,34 +11,31 @@ Leaves TABLE.md, TABLE.csv and TABLE.png in --out.
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-import os
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-import yaml
+from leave import leave, run, table
+from systems import TABLES, Rows, add_arguments, is_measured, read_table, request_of, run_of, train, write_sweep
 
 from avatar.bench.render import inputs, stream_rate
 from avatar.bench.results import new_figure
-from avatar.cli import main as command
 from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.evaluation.compare import Cell
-from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
 from avatar.render import Renderer
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Spec, read_spec
 from avatar.sweep.state import read_state
 
-HERE = Path(__file__).resolve().parent
-PROTOCOL = "hypergaussians"  # the paper's way of measuring
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 FIGURES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 5)}  # title, digits
 COLUMNS = ("system", *(title for title, _ in FIGURES.values()), "FPS", "minutes", "parameters")
 THEIRS = ("psnr", "ssim", "lpips", "fps", "parameters")
@@ -60,38 +57,26 @@ class Row:
 
 def main(words: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=sorted(path.stem for path in HERE.glob("*.yaml")))
-    parser.add_argument("arguments", nargs="+", metavar="FOLDER or key=value", help="tracked folders, and overrides")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--head", type=Path, help="folder of the head model")
-    parser.add_argument("--frame-offset", type=int, help="image number minus tracking number, where it is not clear")
+    parser.add_argument("table", choices=TABLES)
+    add_arguments(parser)
     parser.add_argument("--systems", nargs="+", metavar="NAME", help="train these alone")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--side-by-side", action="store_true", help="a job for each processor; times do not compare")
     given = parser.parse_intermixed_args(words)
-    overrides = [word for word in given.arguments if "=" in word]
-    folders = [Path(word) for word in given.arguments if "=" not in word]
-    content = yaml.safe_load((HERE / f"{given.table}.yaml").read_text(encoding="utf-8"))
-    subjects = [subject(folder, given.head, given.frame_offset) for folder in folders]
-    wanted = {"to_train": chosen(content["rows"], given.systems), "sweep": content["rows"]}
-    paths = {name: given.out / f"{given.table}.{name}.yaml" for name in wanted}
-    for name, rows in wanted.items():
-        spec = sweep_spec(rows, subjects, given.seeds, overrides)
-        spec["threads"] = 1 if given.side_by_side else os.cpu_count() or 1
-        write_atomically(paths[name], yaml.safe_dump(spec, sort_keys=False).encode())
-    status = command(["sweep", str(paths["to_train"]), "--out", str(given.out)])
+    request, content = request_of(given), read_table(given.table)
+    whole = given.out / f"{given.table}.sweep.yaml"
+    write_sweep(whole, request, content["rows"])
+    status, _ = train(request, f"{given.table}.to_train", chosen(content["rows"], given.systems))
     if status not in (0, 1):  # 1: some jobs failed, and the table says which are missing
         return status
     try:
-        rows, notes = read_rows(given.out, read_spec(paths["sweep"]), content["rows"])
-        leave(given.out, given.table, content["title"], rows, notes)
+        rows, notes = read_rows(given.out, read_spec(whole), content["rows"])
     except UserError as error:
         print(f"No table: {error}", file=sys.stderr)
         return 1
+    leave(given.out, given.table, page(content["title"], rows, notes), as_rows(rows), draw(rows))
     return status
 
 
-def chosen(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None) -> list[Mapping[str, Any]]:
+def chosen(rows: Rows, names: Sequence[str] | None) -> list[Mapping[str, Any]]:
     """The systems to train. The first always is: the others are compared with it."""
     known = [row["name"] for row in rows if "overrides" in row]
     if unknown := [name for name in names or () if name not in known]:
@@ -99,30 +84,7 @@ def chosen(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None) -> li
     return [row for row in rows if names is None or row["name"] in (known[0], *names)]
 
 
-def subject(folder: Path, head: Path | None, frame_offset: int | None) -> dict[str, Any]:
-    """A subject of a sweep's file."""
-    given = {"folder": str(folder.resolve()), "head": head and str(head.resolve()), "frame_offset": frame_offset}
-    return {key: value for key, value in given.items() if value is not None}
-
-
-def sweep_spec(
-    rows: Sequence[Mapping[str, Any]],
-    subjects: Sequence[Mapping[str, Any]],
-    seeds: Sequence[int],
-    overrides: Sequence[str],
-) -> dict[str, Any]:
-    """The sweep's file, as a dictionary; systems without overrides are the paper's alone."""
-    variants = {row["name"]: row["overrides"] for row in rows if "overrides" in row}
-    return {
-        "subjects": list(subjects),
-        "variants": variants,
-        "overrides": list(overrides),
-        "seeds": list(seeds),
-        "protocols": [PROTOCOL],
-    }
-
-
-def read_rows(folder: Path, spec: Spec, rows: Sequence[Mapping[str, Any]]) -> tuple[list[Row], list[str]]:
+def read_rows(folder: Path, spec: Spec, rows: Rows) -> tuple[list[Row], list[str]]:
     """What the sweep has found for the table's systems, and remarks. Raises UserError where there is nothing yet."""
     comparison = fold_results(folder, spec)
     (measured,) = comparison.protocols
@@ -134,16 +96,12 @@ def read_rows(folder: Path, spec: Spec, rows: Sequence[Mapping[str, Any]]) -> tu
         if name in comparison.labels:
             place = list(comparison.labels).index(name)
             cells = {figure: measured.rows[figure][place] for figure in FIGURES if figure in measured.rows}
-        jobs = [job for job in spec.jobs if job.variant == name and (run_of(folder, job) / "eval").is_dir()]
+        jobs = [job for job in spec.jobs if job.variant == name and is_measured(folder, job)]
         minutes = [read_state(folder / "jobs" / job.name).seconds / 60 for job in jobs]
         fps, parameters = drawn(run_of(folder, jobs[0]), jobs[0]) if jobs else (None, None)
         mean = statistics.mean(minutes) if minutes else None
         found.append(Row(name, cells, fps, mean, parameters, row.get("published", {})))
     return found, notes
-
-
-def run_of(folder: Path, job: Job) -> Path:
-    return folder / "jobs" / job.name / "run"
 
 
 def drawn(run: Path, job: Job) -> tuple[float, int]:
@@ -179,36 +137,32 @@ def theirs_of(row: Row, name: str) -> str:
 
 
 def short(count: int) -> str:
-    return f"{count / 1e6:.1f}M" if count >= 1e6 else f"{count // 1000}K"
+    return f"{count / 1e6:.1f}M" if count >= 1e6 else f"{count // 1000}K" if count else "0"
 
 
-def markdown(title: str, rows: Sequence[Row], notes: Sequence[str]) -> str:
+def page(title: str, rows: Sequence[Row], notes: Sequence[str]) -> list[str]:
     theirs = [f"theirs: {name if name == 'parameters' else name.upper()}" for name in THEIRS]
-    lines = [f"# {title}", "", f"| {' | '.join((*COLUMNS, *theirs))} |", "|---" * (len(COLUMNS) + len(theirs)) + "|"]
-    for row in rows:
-        published = [theirs_of(row, name) for name in THEIRS]
-        lines.append(f"| {' | '.join((*shown(row), *published))} |")
+    cells = [[*shown(row), *(theirs_of(row, name) for name in THEIRS)] for row in rows]
     legend = (
         "Theirs: as published, on other subjects and another machine. FPS: on this machine's processors, drawing alone. "
         "Minutes: training and evaluation. Parameters: of the network and the distributions."
     )
-    return "\n".join([*lines, "", legend, *(f"\n{note}" for note in notes)]) + "\n"
+    lines = [f"# {title}", "", *table([*COLUMNS, *theirs], cells), "", legend]
+    return [*lines, *(line for note in notes for line in ("", note))]
 
 
-def as_csv(rows: Sequence[Row]) -> str:
-    """A line for each system; empty where nothing was measured or published."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
+def as_rows(rows: Sequence[Row]) -> list[list[object]]:
+    """A line for each system; None where nothing was measured or published."""
     ours = (*FIGURES, "fps", "minutes", "parameters")
-    writer.writerow(("system", *ours, *(f"published_{name}" for name in THEIRS)))
+    lines: list[list[object]] = [["system", *ours, *(f"published_{name}" for name in THEIRS)]]
     for row in rows:
-        means = [row.cells[name].mean if name in row.cells else "" for name in FIGURES]
-        rest = ["" if value is None else value for value in (row.fps, row.minutes, row.parameters)]
-        writer.writerow((row.name, *means, *rest, *(row.published.get(name, "") for name in THEIRS)))
-    return file.getvalue()
+        means = [row.cells[name].mean if name in row.cells else None for name in FIGURES]
+        rest = [row.fps, row.minutes, row.parameters, *(row.published.get(name) for name in THEIRS)]
+        lines.append([row.name, *means, *rest])
+    return lines
 
 
-def draw(rows: Sequence[Row], path: Path) -> None:
+def draw(rows: Sequence[Row]) -> Figure:
     """Differences to the first system, ours with their intervals and the paper's, figure by figure."""
     figure = new_figure(12, 1.2 + 0.4 * len(rows))
     places = range(len(rows))
@@ -227,18 +181,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axes.grid(alpha=0.3)
     figure.axes[0].invert_yaxis()
     figure.axes[0].legend(fontsize=8)
-    image = io.BytesIO()
-    figure.savefig(image, dpi=100, format="png")
-    write_atomically(path, image.getvalue())
-
-
-def leave(folder: Path, name: str, title: str, rows: Sequence[Row], notes: Sequence[str]) -> None:
-    page = markdown(title, rows, notes)
-    write_atomically(folder / f"{name}.md", page.encode())
-    write_atomically(folder / f"{name}.csv", as_csv(rows).encode())
-    draw(rows, folder / f"{name}.png")
-    print(f"\n{page}\nTable {folder / name}.{{md,csv,png}}")
+    return figure
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(main)

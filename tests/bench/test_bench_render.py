@@ -63,6 +63,13 @@ def test_the_frames_are_held_out_and_of_the_size_that_is_asked_for(trained: Path
     assert len(measure(one_frame, (16,), repeats=2)) == 1
 
 
+def test_an_avatar_without_a_network_gets_a_sentence(tracked_folder: Path, tmp_path: Path) -> None:
+    train_small(tracked_folder, tmp_path / "run", ["model=splattingavatar"])
+    run = open_trained(tmp_path / "run")
+    with pytest.raises(UserError, match="the steps of a frame of model=splattingavatar are not timed"):
+        measure(run, (16,), repeats=2)
+
+
 def test_calls_take_turns() -> None:
     call = next_of([lambda: 1, lambda: 2])
     assert [call() for _ in range(5)] == [1, 2, 1, 2, 1]

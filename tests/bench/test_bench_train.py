@@ -11,6 +11,7 @@ from small_runs import new_avatar, open_small, small_config
 from avatar.bench import Request
 from avatar.bench.stages import StagedStep
 from avatar.bench.train_report import run
+from avatar.errors import UserError
 from avatar.train.optim import make_optimizer
 from avatar.train.step import Objective, choose_perceptual, training_step
 
@@ -54,3 +55,12 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     assert line.split()[3:] == sums, "the stages of the table add up to what it says"
     assert {"interpolation"} <= figures["rows"][2]["stages"].keys() - figures["rows"][0]["stages"].keys()
     assert iio.imread(tmp_path / "bench_train.png").shape[1] > 500
+
+
+@pytest.mark.parametrize("model", ["splattingavatar", "monogaussianavatar"])
+def test_a_model_of_other_stages_gets_a_sentence(tracked_folder: Path, tmp_path: Path, model: str) -> None:
+    request = Request(
+        tmp_path, quick=True, inputs=(tracked_folder,), overrides=(f"model={model}", "data.size=32"), frame_offset=1
+    )
+    with pytest.raises(UserError, match=f"the stages of a step of model={model} are not timed"):
+        run(request)

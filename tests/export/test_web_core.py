@@ -87,6 +87,16 @@ def test_opacities_that_change_are_refused_in_a_sentence(tracked_folder: Path, t
     assert not (tmp_path / "a.avatar").exists()
 
 
+@pytest.mark.parametrize("model", ["splattingavatar", "monogaussianavatar"])
+def test_points_that_left_their_texel_are_refused_in_a_sentence(
+    tracked_folder: Path, tmp_path: Path, model: str
+) -> None:
+    trained = lively_avatar(tracked_folder, tmp_path / "run", f"model={model}")
+    with pytest.raises(UserError, match=f"model={model} cannot be exported for browsers"):
+        write_web_avatar(trained, tmp_path / "a.avatar")
+    assert not (tmp_path / "a.avatar").exists()
+
+
 def test_quantised_parameters_lose_little_and_save_much(tracked_folder: Path, tmp_path: Path) -> None:
     trained = lively_avatar(tracked_folder, tmp_path / "run")
     truth, small = drawn_here(trained), drawn_by_node(trained, "small", tmp_path)

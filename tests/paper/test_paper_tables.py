@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+import systems
+import table
 import yaml
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
@@ -18,26 +17,14 @@ from avatar.config import flatten, load_config
 from avatar.sweep.spec import read_spec
 from avatar.sweep.state import read_state
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts" / "paper"
-TABLES = sorted(path.stem for path in SCRIPTS.glob("*.yaml"))
 MAY_DIFFER = {"model.name", "model.latent_dim", "model.mlp_width", "model.mlp_layers"}
 
 
-@pytest.fixture(scope="module")
-def table() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("paper_table", SCRIPTS / "table.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["paper_table"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
 def rows(name: str) -> list[dict]:
-    return yaml.safe_load((SCRIPTS / f"{name}.yaml").read_text())["rows"]
+    return systems.read_table(name)["rows"]
 
 
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("name", systems.TABLES)
 def test_systems_differ_from_the_papers_own_in_the_model_alone(name: str) -> None:
     paper = flatten(load_config(["experiment=paper"]).to_dict())
     models = set()
@@ -50,15 +37,15 @@ def test_systems_differ_from_the_papers_own_in_the_model_alone(name: str) -> Non
 
 
 def test_what_two_tables_call_the_same_is_the_same() -> None:
-    first, second = ({row["name"]: row for row in rows(name)} for name in TABLES)
+    first, second = ({row["name"]: row for row in rows(name)} for name in systems.TABLES)
     both = first.keys() & second.keys()
     assert both == {"FlashAvatar", "HyperGaussians n=8"}
     assert all(first[name] == second[name] for name in both)
 
 
-@pytest.mark.parametrize("name", TABLES)
-def test_a_table_is_a_sweep_that_can_be_read(name: str, table: ModuleType, tmp_path: Path) -> None:
-    content = table.sweep_spec(rows(name), [table.subject(Path("someone"), None, 1)], [0, 1], ["data.size=64"])
+@pytest.mark.parametrize("name", systems.TABLES)
+def test_a_table_is_a_sweep_that_can_be_read(name: str, tmp_path: Path) -> None:
+    content = systems.sweep_spec(rows(name), [systems.subject(Path("someone"), None, 1)], [0, 1], ["data.size=64"])
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(content))
     spec = read_spec(tmp_path / "sweep.yaml")
     assert len(spec.jobs) == 2 * sum("overrides" in row for row in rows(name))
@@ -66,7 +53,7 @@ def test_a_table_is_a_sweep_that_can_be_read(name: str, table: ModuleType, tmp_p
     assert {load_config(job.overrides).data.size for job in spec.jobs} == {64}
 
 
-def test_a_table_holds_what_was_measured_and_is_not_made_twice(table: ModuleType, tmp_path: Path) -> None:
+def test_a_table_holds_what_was_measured_and_is_not_made_twice(tmp_path: Path) -> None:
     write_tracked_folder(tmp_path / "someone", frames=12, size=32)
     out = tmp_path / "out"
     words = ["table1", str(tmp_path / "someone"), "--head", str(tmp_path / "someone" / "head_model"), "--out", str(out)]

@@ -98,6 +98,14 @@ def test_the_gradient_of_gaussians_that_never_turn_is_that_through_the_reference
         )
 
 
+def test_the_gradient_of_gaussians_that_the_mesh_turns_is_that_through_the_reference(tmp_path: Path) -> None:
+    avatar = patterned_avatar(tmp_path, "model=splattingavatar")
+    with frozen(avatar):
+        check_gradient(
+            Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0)), drawn_clip(avatar, 4, 3)
+        )
+
+
 def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
     target = targets(clip.pictures[2], BACKGROUND, 2)[level]
     values, pose = mistracked(clip)

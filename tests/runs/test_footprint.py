@@ -26,6 +26,8 @@ MIB = 2**20
         ("model=covariance", "model.latent_dim=3"),
         ("preset=paper", "model=covariance"),
         ("model=ndgs", "model.latent_dim=5"),
+        ("model=splattingavatar",),
+        ("model=monogaussianavatar", "model.uv_size=9"),
     ],
 )
 def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, ...]) -> None:

@@ -45,7 +45,9 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
     assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 3
 
 
-@pytest.mark.parametrize("model", ["hypergaussians", "flashavatar", "covariance", "ndgs"])
+@pytest.mark.parametrize(
+    "model", ["hypergaussians", "flashavatar", "covariance", "ndgs", "splattingavatar", "monogaussianavatar"]
+)
 def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(tracked_folder: Path, tmp_path: Path, model: str) -> None:
     """Across the boundaries where a spherical-harmonics degree and the perceptual term come in."""
     train_small(tracked_folder, tmp_path / "whole", [f"model={model}"])
@@ -74,7 +76,7 @@ def test_a_resumed_run_of_the_papers_recipe_has_the_bits_too(tracked_folder: Pat
     assert not [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])]
 
 
-@pytest.mark.parametrize("model", ["covariance", "ndgs"])
+@pytest.mark.parametrize("model", ["covariance", "ndgs", "splattingavatar", "monogaussianavatar"])
 def test_the_papers_other_systems_learn(tracked_folder: Path, tmp_path: Path, model: str) -> None:
     """The pictures get nearer, and every parameter that the latent is weighed by leaves its start."""
     config = small_config("preset=paper", f"model={model}", "model.mlp_width=24", "trainer.iterations=150")
@@ -92,8 +94,8 @@ def test_the_papers_other_systems_learn(tracked_folder: Path, tmp_path: Path, mo
         return float(psnr(image, frame.composite(background)))
 
     assert score(trained) > score(untrained) + 2.0
-    part = trained.ndgs if model == "ndgs" else trained.hyper
-    assert part is not None
+    part = trained.ndgs or trained.hyper or torch.nn.Module()
+    assert {model} <= {"splattingavatar", "monogaussianavatar"} or list(part.parameters())
     for name, parameter in part.named_parameters():
         assert bool((parameter != 0).any(dim=0).all()), f"{name} did not move"
 

@@ -1,0 +1,36 @@
+"""The order in which points begin to take part, and when."""
+
+from __future__ import annotations
+
+import torch
+from heads import grid_head
+
+from avatar.gaussians.growth import alive_after, evenly_ordered
+from avatar.gaussians.uv import UVTexels, uv_texels
+
+
+def test_a_set_doubles_at_every_tenth_of_the_training() -> None:
+    found = [alive_after(step, 1000, 1600) for step in (0, 99, 100, 199, 200, 300, 399, 400, 1000)]
+    assert found == [100, 100, 200, 200, 400, 800, 800, 1600, 1600]
+    assert alive_after(0, 1000, 5) == 1 and alive_after(7, 7, 5) == 5
+    assert all(alive_after(3 * step, 30, 1600) == alive_after(step, 10, 1600) for step in range(11))
+
+
+def test_every_beginning_is_spread_over_the_map() -> None:
+    row, column = torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij")
+    texels = UVTexels(row.flatten(), column.flatten(), torch.arange(256), torch.rand(256, 3))
+    ordered = evenly_ordered(texels)
+    assert sorted(ordered.face.tolist()) == list(range(256))
+    for part in range(4):  # in each prefix every block of the map has as many as any other
+        chosen = slice(0, 16 << part)
+        blocks = torch.bincount(ordered.row[chosen] // 4 * 4 + ordered.column[chosen] // 4, minlength=16)
+        assert blocks.tolist() == [1 << part] * 16
+    again = texels.face[ordered.row * 16 + ordered.column]
+    assert torch.equal(again, ordered.face) and torch.equal(ordered.barycentric, texels.barycentric[ordered.face])
+
+
+def test_a_heads_texels_stay_themselves() -> None:
+    texels = uv_texels(grid_head(), 20)
+    ordered = evenly_ordered(texels)
+    before = {(r, c): f for r, c, f in zip(*(values.tolist() for values in texels[:3]), strict=True)}
+    assert before == {(r, c): f for r, c, f in zip(*(values.tolist() for values in ordered[:3]), strict=True)}
