@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -82,6 +82,7 @@ class TrainerConfig:
     perceptual: str
     perceptual_weight: float
     dssim_weight: float
+    dssim_start: float | None = field(default=None, kw_only=True)  # what runs have that were recorded before the key
     perceptual_start: float
     lpips_net: str
     lpips_every: int
@@ -140,6 +141,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.mouth_weight": (0, 10**6),
     "trainer.perceptual_weight": (0, 10**6),
     "trainer.dssim_weight": (0, 10**6),
+    "trainer.dssim_start": (0, 1),
     "trainer.perceptual_start": (0, 1),
     "trainer.lpips_every": (1, MOST_STEPS),
     "trainer.log_every": (1, MOST_STEPS),
@@ -216,9 +218,10 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
     if not isinstance(values, dict):
         raise UserError(f"the configuration has {shown(values)} where the keys {prefix}* should be")
     kinds = get_type_hints(schema)
+    has_default = {f.name for f in dataclasses.fields(schema) if f.default is not dataclasses.MISSING}
     if unknown := [key for key in values if key not in kinds]:
         raise _no_such_key(f"{prefix}{unknown[0]}")
-    if missing := [key for key in kinds if key not in values]:
+    if missing := [key for key in kinds if key not in values and key not in has_default]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(
         **{
@@ -226,6 +229,7 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
             if isinstance(kind, type) and dataclasses.is_dataclass(kind)
             else checked_value(f"{prefix}{name}", values[name], kind)
             for name, kind in kinds.items()
+            if name in values
         }
     )
 

@@ -42,11 +42,14 @@ class PerceptualTerm:
     term: Weighted | None = None
     every: int = 1  # takes part in every so many-th step, with so many times the weight
     between: Weighted | None = None  # stands in for it in the other steps
+    before: Weighted | None = None  # stands in for it in steps before its first
 
-    def at(self, step: int, start: int) -> Weighted | None:
-        """The term of step `step` (from 0) when there is one from step `start` on."""
-        if self.term is None or step < start:
+    def at(self, step: int, start: int, early: int | None = None) -> Weighted | None:
+        """The term of step `step` (from 0) when it takes part from step `start` on, and what is before it from `early`."""
+        if self.term is None:
             return None
+        if step < start:
+            return None if early is None or step < early else self.before
         if (step - start) % self.every:
             return self.between
         return self.term._replace(weight=self.term.weight * self.every)
@@ -73,8 +76,10 @@ class Objective:
         return min(step // self.config.sh_interval, stored)
 
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
-        start = round(self.config.perceptual_start * self.config.iterations)
-        term = self.perceptual.at(step, start)
+        config = self.config
+        start = round(config.perceptual_start * config.iterations)
+        early = None if config.dssim_start is None else round(config.dssim_start * config.iterations)
+        term = self.perceptual.at(step, start, early)
         function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
         return photometric_loss(
             image,
@@ -83,8 +88,8 @@ class Objective:
             frame.head_mask,
             perceptual=function,
             perceptual_weight=term.weight if term else 0.0,
-            mouth_weight=self.config.mouth_weight,
-            delta=self.config.huber_delta,
+            mouth_weight=config.mouth_weight,
+            delta=config.huber_delta,
         )
 
     def draw(self, step: int, frame: Frame, gaussians: Gaussians, stored_degree: int) -> Float[Tensor, "H W 3"]:
@@ -151,14 +156,14 @@ def choose_perceptual(
             crops = config.lpips_region == "head"
             function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
             term = Weighted(function, config.perceptual_weight, crops)
-            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place)
+            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place, in_its_place)
         except UserError as error:
             if recorded is not None:
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
             if config.perceptual == "lpips":
                 raise
             say(f"Training with D-SSIM in place of LPIPS: {error}")
-    return PerceptualTerm("dssim", in_its_place)
+    return PerceptualTerm("dssim", in_its_place, before=in_its_place)
 
 
 def too_small(term: str, side: int, size: tuple[int, int]) -> str:
