@@ -50,6 +50,7 @@ class ModelConfig:
     frequencies: int
     sh_degree: int
     initial_opacity: float
+    uv_detail: int = 1  # for avatars that were made before the key
 
 
 @dataclass
@@ -82,7 +83,7 @@ class TrainerConfig:
     perceptual: str
     perceptual_weight: float
     dssim_weight: float
-    dssim_start: float | None = field(default=None, kw_only=True)  # what runs have that were recorded before the key
+    dssim_start: float | None = field(default=None, kw_only=True)  # for runs that were made before the key
     perceptual_start: float
     lpips_net: str
     lpips_every: int
@@ -124,6 +125,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "data.cache_mb": (1, 2**20),
     "data.workers": (1, 64),
     "model.uv_size": (2, 2048),
+    "model.uv_detail": (1, 8),
     "model.latent_dim": (1, 4096),
     "model.latent_grid": (1, 2048),
     "model.mlp_width": (1, 65536),

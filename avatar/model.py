@@ -44,13 +44,13 @@ class Avatar(nn.Module):
         super().__init__()
         self.config = config
         self.head = HeadModel(assets, identity)
-        self.embedding = Embedding(assets, uv_texels(assets, config.uv_size))
+        self.embedding = Embedding(assets, uv_texels(assets, config.uv_size, config.uv_detail))
         N = len(self.embedding)
         neutral = self.embedding.points(self.head.neutral_vertices())
         has_latents = config.name != "flashavatar"
         self.grid: LatentGrid | None = None
         if has_latents and config.latent_grid is not None:
-            self.grid = latent_grid(assets, self.embedding.texels, config.uv_size, neutral, config.latent_grid)
+            self.grid = latent_grid(assets, self.embedding.texels, neutral, config.latent_grid)
         places = neutral if self.grid is None else self.grid.places
         self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
 
