@@ -67,7 +67,10 @@ def detailed_faces(assets: HeadAssets) -> Bool[Tensor, " F"]:
 def painted(
     texels: UVTexels, values: Shaped[np.ndarray, "N C"]
 ) -> tuple[Shaped[np.ndarray, "S S C"], Bool[np.ndarray, "S S"]]:
-    """The values as a map, S the side of the finest raster, and where there are any; 0 elsewhere."""
+    """The values as a map, S the side of the finest raster, and where there are any; 0 elsewhere.
+
+    A coarse texel whose centre lies where the raster is finer has no Gaussian, so half of one may stay empty beside it.
+    """
     size = int(texels.side.max())
     image, covered = np.zeros((size, size, values.shape[1]), values.dtype), np.zeros((size, size), bool)
     for side in texels.side.unique().tolist():
