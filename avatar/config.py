@@ -83,7 +83,7 @@ class TrainerConfig:
     perceptual: str
     perceptual_weight: float
     dssim_weight: float
-    dssim_start: float | None = field(default=None, kw_only=True)  # for runs that were made before the key
+    dssim_early: float = field(default=0.0, kw_only=True)  # for runs that were made before the key
     perceptual_start: float
     lpips_net: str
     lpips_every: int
@@ -143,7 +143,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.mouth_weight": (0, 10**6),
     "trainer.perceptual_weight": (0, 10**6),
     "trainer.dssim_weight": (0, 10**6),
-    "trainer.dssim_start": (0, 1),
+    "trainer.dssim_early": (0, 10**6),
     "trainer.perceptual_start": (0, 1),
     "trainer.lpips_every": (1, MOST_STEPS),
     "trainer.log_every": (1, MOST_STEPS),

@@ -64,7 +64,7 @@ def test_the_best_recipe_is_the_default_with_its_kept_ingredients() -> None:
     assert {key: value for key, value in ours.items() if value != default[key]} == {
         "model.uv_detail": 2,
         "trainer.iterations": 5000,
-        "trainer.dssim_start": 0.0,
+        "trainer.dssim_early": 0.1,
         "trainer.dssim_weight": 0.2,
     }
 
@@ -187,7 +187,7 @@ def test_a_recorded_configuration_that_is_damaged_gets_a_sentence(damage, messag
 
 def test_a_configuration_recorded_before_a_key_existed_has_what_was_done_then() -> None:
     values = load_config().to_dict()
-    values["trainer"].pop("dssim_start")
+    values["trainer"].pop("dssim_early")
     values["model"].pop("uv_detail")
     assert config_from_dict(values) == load_config()
 

@@ -44,12 +44,12 @@ class PerceptualTerm:
     between: Weighted | None = None  # stands in for it in the other steps
     before: Weighted | None = None  # stands in for it in steps before its first
 
-    def at(self, step: int, start: int, early: int | None = None) -> Weighted | None:
-        """The term of step `step` (from 0) when it takes part from step `start` on, and what is before it from `early`."""
+    def at(self, step: int, start: int) -> Weighted | None:
+        """The term of step `step` (from 0) when there is one from step `start` on."""
         if self.term is None:
             return None
         if step < start:
-            return None if early is None or step < early else self.before
+            return self.before
         if (step - start) % self.every:
             return self.between
         return self.term._replace(weight=self.term.weight * self.every)
@@ -76,10 +76,8 @@ class Objective:
         return min(step // self.config.sh_interval, stored)
 
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
-        config = self.config
-        start = round(config.perceptual_start * config.iterations)
-        early = None if config.dssim_start is None else round(config.dssim_start * config.iterations)
-        term = self.perceptual.at(step, start, early)
+        start = round(self.config.perceptual_start * self.config.iterations)
+        term = self.perceptual.at(step, start)
         function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
         return photometric_loss(
             image,
@@ -88,8 +86,8 @@ class Objective:
             frame.head_mask,
             perceptual=function,
             perceptual_weight=term.weight if term else 0.0,
-            mouth_weight=config.mouth_weight,
-            delta=config.huber_delta,
+            mouth_weight=self.config.mouth_weight,
+            delta=self.config.huber_delta,
         )
 
     def draw(self, step: int, frame: Frame, gaussians: Gaussians, stored_degree: int) -> Float[Tensor, "H W 3"]:
@@ -147,6 +145,7 @@ def choose_perceptual(
     if config.perceptual == "none":
         return PerceptualTerm("none")
     in_its_place = Weighted(dssim, config.dssim_weight)
+    before = Weighted(dssim, config.dssim_early) if config.dssim_early else None
     lpips_name = f"lpips-{config.lpips_net}"
     if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
         try:
@@ -156,14 +155,14 @@ def choose_perceptual(
             crops = config.lpips_region == "head"
             function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
             term = Weighted(function, config.perceptual_weight, crops)
-            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place, in_its_place)
+            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place, before)
         except UserError as error:
             if recorded is not None:
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
             if config.perceptual == "lpips":
                 raise
             say(f"Training with D-SSIM in place of LPIPS: {error}")
-    return PerceptualTerm("dssim", in_its_place, before=in_its_place)
+    return PerceptualTerm("dssim", in_its_place, before=before)
 
 
 def too_small(term: str, side: int, size: tuple[int, int]) -> str:

@@ -112,26 +112,26 @@ def test_a_sparse_perceptual_term_keeps_its_weight_on_average_and_has_a_stand_in
 def test_dssim_may_begin_before_the_perceptual_term() -> None:
     late, early = Weighted(lambda image, target, mask: image.sum(), 0.05), Weighted(dssim, 0.03)
     term = PerceptualTerm("test", late, before=early)
-    assert [term.at(step, 4, 2) for step in range(6)] == [None, None, early, early, late, late]
-    assert [term.at(step, 4, None) for step in (0, 3, 4)] == [None, None, late]
-    assert PerceptualTerm("none", before=early).at(1, 4, 0) is None
+    assert [term.at(step, 4) for step in (0, 3, 4, 5)] == [early, early, late, late]
+    assert PerceptualTerm("none", before=early).at(1, 4) is None
 
 
-@pytest.mark.parametrize(("start", "takes_part"), [("null", [False, False, True]), ("0.25", [False, True, True])])
-def test_the_share_of_steps_without_dssim_is_that_of_the_configuration(start: str, takes_part: list[bool]) -> None:
-    config = small_config(f"trainer.dssim_start={start}", "trainer.iterations=8", "trainer.perceptual=dssim").trainer
+@pytest.mark.parametrize(("early", "share"), [(0.0, [0.0, 0.0, 1.0]), (0.1, [0.5, 0.5, 1.0])])
+def test_dssim_weighs_in_each_half_what_the_configuration_says(early: float, share: list[float]) -> None:
+    overrides = f"trainer.dssim_early={early}", "trainer.dssim_weight=0.2", "trainer.perceptual=dssim"
+    config = small_config(*overrides, "trainer.iterations=8").trainer
     objective = Objective(config, torch.ones(3), choose_perceptual(config, print))
     image, mask = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)), torch.ones(16, 16)
     camera = Camera(torch.eye(3), torch.zeros(3), 1.0, 1.0, 8.0, 8.0, 16, 16)
     params = HeadParams(torch.zeros(1), torch.zeros(6), torch.zeros(12), torch.zeros(2), torch.zeros(6))
     frame = Frame(0, "0", camera, params, image, mask, mask, mask)
-    losses = [objective.loss(step, frame, image, 1 - image) for step in (1, 2, 4)]
-    assert [float(loss.perceptual) > 0 for loss in losses] == takes_part
+    terms = [float(objective.loss(step, frame, image, 1 - image).perceptual) for step in (0, 3, 4)]
+    assert [term / terms[-1] for term in terms] == pytest.approx(share) and terms[-1] > 0.01
 
 
 def test_lpips_lets_dssim_begin_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(step_module, "load_lpips", lambda *_, **__: Lpips("squeeze"))
-    term = choose_perceptual(small_config("trainer.dssim_weight=0.3").trainer, print)
+    term = choose_perceptual(small_config("trainer.dssim_early=0.3").trainer, print)
     assert term.name == "lpips-squeeze" and term.before == Weighted(dssim, 0.3)
 
 
