@@ -50,6 +50,7 @@ class ModelConfig:
     frequencies: int
     sh_degree: int
     initial_opacity: float
+    uv_detail: int
 
 
 @dataclass
@@ -82,6 +83,7 @@ class TrainerConfig:
     perceptual: str
     perceptual_weight: float
     dssim_weight: float
+    dssim_early: float
     perceptual_start: float
     lpips_net: str
     lpips_every: int
@@ -123,6 +125,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "data.cache_mb": (1, 2**20),
     "data.workers": (1, 64),
     "model.uv_size": (2, 2048),
+    "model.uv_detail": (1, 8),
     "model.latent_dim": (1, 4096),
     "model.latent_grid": (1, 2048),
     "model.mlp_width": (1, 65536),
@@ -140,6 +143,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.mouth_weight": (0, 10**6),
     "trainer.perceptual_weight": (0, 10**6),
     "trainer.dssim_weight": (0, 10**6),
+    "trainer.dssim_early": (0, 10**6),
     "trainer.perceptual_start": (0, 1),
     "trainer.lpips_every": (1, MOST_STEPS),
     "trainer.log_every": (1, MOST_STEPS),

@@ -51,7 +51,7 @@ class Avatar(nn.Module):
         self.config = config
         self.head = HeadModel(assets, identity)
         grows = config.name == "monogaussianavatar"
-        texels = uv_texels(assets, config.uv_size)
+        texels = uv_texels(assets, config.uv_size, config.uv_detail)
         self.embedding = Embedding(assets, evenly_ordered(texels) if grows else texels)
         N = len(self.embedding)
         alive = alive_after(0, 1, N) if grows else N
@@ -59,7 +59,7 @@ class Avatar(nn.Module):
         has_latents = config.name in WITH_LATENTS
         self.grid: LatentGrid | None = None
         if has_latents and config.latent_grid is not None:
-            self.grid = latent_grid(assets, self.embedding.texels, config.uv_size, neutral, config.latent_grid)
+            self.grid = latent_grid(assets, self.embedding.texels, neutral, config.latent_grid)
         places = neutral if self.grid is None else self.grid.places
         self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
 

@@ -61,6 +61,16 @@ def test_the_default_is_the_fast_preset_of_the_papers_model() -> None:
     assert load_config(["preset=fast", "model.latent_grid=null"]).model.latent_grid is None
 
 
+def test_the_best_recipe_is_the_default_with_its_kept_ingredients() -> None:
+    ours, default = flatten(load_config(["experiment=best"]).to_dict()), flatten(load_config().to_dict())
+    assert {key: value for key, value in ours.items() if value != default[key]} == {
+        "model.uv_detail": 2,
+        "trainer.iterations": 5000,
+        "trainer.dssim_early": 0.1,
+        "trainer.dssim_weight": 0.2,
+    }
+
+
 def test_later_overrides_win_and_survive_a_round_trip() -> None:
     config = load_config(["experiment=demo", "model=flashavatar", "trainer.iterations=7", "trainer.iterations=9"])
     assert config.trainer.iterations == 9
@@ -178,6 +188,13 @@ def test_a_recorded_configuration_that_is_damaged_gets_a_sentence(damage, messag
     with pytest.raises(UserError) as caught:
         config_from_dict(values)
     assert message in str(caught.value)
+
+
+def test_a_configuration_recorded_before_a_key_existed_has_what_was_done_then() -> None:
+    values = load_config().to_dict()
+    values["trainer"].pop("dssim_early")
+    values["model"].pop("uv_detail")
+    assert config_from_dict(values) == load_config()
 
 
 def test_every_key_in_the_yaml_files_has_a_comment() -> None:

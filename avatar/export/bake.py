@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.gaussians.embedding import Embedding
-from avatar.gaussians.uv import UVTexels, uv_texels
+from avatar.gaussians.uv import painted, uv_texels
 from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
@@ -92,13 +92,9 @@ def _normals(vertices: Float[Tensor, "V 3"], faces: Tensor) -> Float[Tensor, "F 
 def _fill_from_gaussians(trained: TrainedAvatar, texture: np.ndarray, is_known: np.ndarray) -> None:
     """Give texels that nobody has seen the mean colour of the Gaussian of that place."""
     model = trained.avatar
-    own: UVTexels = model.embedding.texels
-    small = model.config.uv_size
     with torch.no_grad():
         values = (model.sh_dc[:, 0] * C0 + 0.5).clamp(0, 1).numpy()
-    coarse, covered = np.zeros((small, small, 3), np.float32), np.zeros((small, small), bool)
-    coarse[own.row, own.column] = values
-    covered[own.row, own.column] = True
+    coarse, covered = painted(model.embedding.texels, values)
     size = len(texture)
     fine = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_NEAREST)
     has = cv2.resize(covered.astype(np.uint8), (size, size), interpolation=cv2.INTER_NEAREST).astype(bool)

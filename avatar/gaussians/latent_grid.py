@@ -29,10 +29,8 @@ class LatentGrid(NamedTuple):
     places: Float[Tensor, "M 3"]  # of the nodes on the neutral mesh, metres
 
 
-def latent_grid(
-    assets: HeadAssets, texels: UVTexels, raster: int, points: Float[Tensor, "N 3"], cells: int
-) -> LatentGrid:
-    """The grid of `cells` x `cells` cells over the `raster` x `raster` UV map that `texels` were taken from.
+def latent_grid(assets: HeadAssets, texels: UVTexels, points: Float[Tensor, "N 3"], cells: int) -> LatentGrid:
+    """The grid of `cells` x `cells` cells over the UV map that `texels` were taken from.
 
     points   of the texels on the neutral mesh, metres; a node lies at their mean, weighted as they are interpolated from it
     Only nodes that some Gaussian takes part of are made.
@@ -41,7 +39,7 @@ def latent_grid(
     sides = []
     for texel in (texels.row, texels.column):
         # In units of cells, with the first cell's centre at 0; outside the outermost centres the nearest one counts.
-        position = ((texel.double() + 0.5) * cells / raster - 0.5).clamp(0, cells - 1)
+        position = ((texel.double() + 0.5) * cells / texels.side - 0.5).clamp(0, cells - 1)
         low = position.floor().clamp(max=max(cells - 2, 0))
         sides.append((low.long(), position - low))
     (row, down), (column, right) = sides

@@ -6,28 +6,84 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
+from scipy.spatial import KDTree
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.rasterize import rasterize_mesh
 
+DETAILED = ("lips", "left_eyeball", "right_eyeball")  # region names of FLAME_masks.pkl; what moves most is about them
+REACH = 0.012  # metres from them, on the template: lids, lashes and the corners of the mouth are within it
+
+FINEST = 2048  # texels a side, of a raster and of a detailed one
+
 
 class UVTexels(NamedTuple):
-    """The covered texels of an S x S raster of the UV map, row by row from the top."""
+    """The covered texels of a raster of the UV map, row by row from the top; where it is finer, after the others."""
 
     row: Int[Tensor, " N"]
     column: Int[Tensor, " N"]
     face: Int[Tensor, " N"]
     barycentric: Float[Tensor, "N 3"]
+    side: Int[Tensor, " N"]  # of the texel's raster, in texels: row and column count on it
 
 
-def uv_texels(assets: HeadAssets, size: int) -> UVTexels:
-    """Texels of a `size` x `size` raster whose centre lies in a triangle of the UV layout.
+def uv_texels(assets: HeadAssets, size: int, detail: int = 1) -> UVTexels:
+    """Texels of a `size` x `size` raster whose centre lies in a triangle of the UV layout; about mouth and eyes
+    those of one that is `detail` times as fine.
 
     Row 0 is the top of the map (v = 1). Texels of a triangle that touches the region `boundary` (the rim of the neck) are
-    left out, as in FlashAvatar. Raises ValueError when nothing is covered.
+    left out, as in FlashAvatar. Raises ValueError when nothing is covered, UserError for a raster that is too fine and
+    for detail on a head model that does not say where its mouth and eyes are.
     """
+    coarse = _raster(assets, size)
+    if detail == 1:
+        return coarse
+    if size * detail > FINEST:
+        raise UserError(
+            f"model.uv_size={size} times model.uv_detail={detail} is {size * detail} texels a side: at most {FINEST} are "
+            "possible"
+        )
+    fine, is_detailed = _raster(assets, size * detail), detailed_faces(assets)
+    outside, inside = ~is_detailed[coarse.face], is_detailed[fine.face]
+    return UVTexels(*(torch.cat((a[outside], b[inside])) for a, b in zip(coarse, fine, strict=True)))
+
+
+def detailed_faces(assets: HeadAssets) -> Bool[Tensor, " F"]:
+    """The triangles that lie within REACH of lips and eyeballs. Raises UserError where the head model names neither."""
+    named = [assets.regions[name] for name in DETAILED if len(assets.regions.get(name, ()))]
+    if not named:
+        raise UserError(
+            "model.uv_detail needs to know where mouth and eyes are, and the head model names no region "
+            f"{', '.join(DETAILED)}: put its FLAME_masks.pkl beside it, or train with model.uv_detail=1"
+        )
+    points = assets.template.numpy()
+    distances = KDTree(points[torch.cat(named).numpy()]).query(points, distance_upper_bound=REACH)[0]
+    return torch.from_numpy(np.isfinite(distances))[assets.faces].all(dim=1)
+
+
+def painted(
+    texels: UVTexels, values: Shaped[np.ndarray, "N C"]
+) -> tuple[Shaped[np.ndarray, "S S C"], Bool[np.ndarray, "S S"]]:
+    """The values as a map, S the side of the finest raster, and where there are any; 0 elsewhere.
+
+    A coarse texel whose centre lies where the raster is finer has no Gaussian, so half of one may stay empty beside it.
+    """
+    size = int(texels.side.max())
+    image, covered = np.zeros((size, size, values.shape[1]), values.dtype), np.zeros((size, size), bool)
+    for side in texels.side.unique().tolist():
+        own, times = (texels.side == side).numpy(), size // side
+        for i in range(times):
+            for j in range(times):
+                place = texels.row.numpy()[own] * times + i, texels.column.numpy()[own] * times + j
+                image[place], covered[place] = values[own], True
+    return image, covered
+
+
+def _raster(assets: HeadAssets, size: int) -> UVTexels:
+    """The texels of one raster."""
     if size < 1:
         raise ValueError(f"the UV raster must have at least one texel a side, got {size}")
     uv = assets.uvs.numpy()
@@ -45,4 +101,5 @@ def uv_texels(assets: HeadAssets, size: int) -> UVTexels:
         torch.from_numpy(column),
         torch.from_numpy(raster.face_id[covered].astype(np.int64)),
         torch.from_numpy(raster.barycentric[covered]),
+        torch.full((len(row),), size),
     )

@@ -9,6 +9,7 @@ import torch
 from avatar.data.loader import FrameLoader
 from avatar.evaluation.draw import panel
 from avatar.evaluation.measure import Pair
+from avatar.gaussians.uv import painted
 from avatar.render import Renderer
 from avatar.runs.run import Run
 
@@ -46,8 +47,8 @@ def uncertainty_map(run: Run) -> np.ndarray | None:
         return None
     with torch.no_grad():
         values = torch.sigmoid(UNCERTAINTY_GAIN * hyper.uncertainty()).cpu().numpy()
-    size = run.config.model.uv_size
     colours = cv2.applyColorMap(np.round(values * 255).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
-    image = np.full((size, size, 3), 255, np.uint8)
-    image[texels.row.numpy(), texels.column.numpy()] = colours
+    image, covered = painted(texels, colours)
+    image[~covered] = 255
+    size = len(image)
     return cv2.resize(image, None, fx=max(1, 512 // size), fy=max(1, 512 // size), interpolation=cv2.INTER_NEAREST)

@@ -40,7 +40,7 @@ _OTHERS = ("colours and shapes of the Gaussians", "model.uv_size")
 def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
     """How many Gaussians an avatar of this head has. Raises UserError where the UV raster is too coarse to have any."""
     try:
-        return len(uv_texels(assets, config.uv_size).face)
+        return len(uv_texels(assets, config.uv_size, config.uv_detail).face)
     except ValueError as error:
         raise UserError(f"model.uv_size={config.uv_size} is too small: {error}") from None
 

@@ -43,11 +43,14 @@ class PerceptualTerm:
     term: Weighted | None = None
     every: int = 1  # takes part in every so many-th step, with so many times the weight
     between: Weighted | None = None  # stands in for it in the other steps
+    before: Weighted | None = None  # stands in for it in steps before its first
 
     def at(self, step: int, start: int) -> Weighted | None:
         """The term of step `step` (from 0) when there is one from step `start` on."""
-        if self.term is None or step < start:
+        if self.term is None:
             return None
+        if step < start:
+            return self.before
         if (step - start) % self.every:
             return self.between
         return self.term._replace(weight=self.term.weight * self.every)
@@ -144,6 +147,7 @@ def choose_perceptual(
     if config.perceptual == "none":
         return PerceptualTerm("none")
     in_its_place = Weighted(dssim, config.dssim_weight)
+    before = Weighted(dssim, config.dssim_early) if config.dssim_early else None
     lpips_name = f"lpips-{config.lpips_net}"
     if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
         try:
@@ -153,14 +157,14 @@ def choose_perceptual(
             crops = config.lpips_region == "head"
             function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
             term = Weighted(function, config.perceptual_weight, crops)
-            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place)
+            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place, before)
         except UserError as error:
             if recorded is not None:
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
             if config.perceptual == "lpips":
                 raise
             say(f"Training with D-SSIM in place of LPIPS: {error}")
-    return PerceptualTerm("dssim", in_its_place)
+    return PerceptualTerm("dssim", in_its_place, before=before)
 
 
 def too_small(term: str, side: int, size: tuple[int, int]) -> str:

@@ -27,6 +27,7 @@ MODELS = {
     "no HyperGaussians": ("model=flashavatar",),
     "no view dependence": ("model.sh_degree=0",),
     "covariance": ("model=covariance",),
+    "detail": ("model.uv_detail=2",),
 }
 
 

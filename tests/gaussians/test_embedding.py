@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from heads import grid_head, random_params
 
+from avatar.errors import UserError
 from avatar.gaussians.embedding import Embedding, knn_scales
-from avatar.gaussians.uv import uv_texels
+from avatar.gaussians.uv import detailed_faces, painted, uv_texels
 from avatar.head.model import HeadModel
 
 
@@ -28,6 +31,47 @@ def test_all_texels_of_the_map_are_covered_except_the_boundarys() -> None:
     rows = ((1 - centres > 0.05 + 0.9 / 6) & (1 - centres < 0.95)).sum()
     assert len(texels.row) == rows * columns
     assert not np.isin(assets.faces[texels.face], assets.regions["boundary"]).any()
+
+
+def test_detail_makes_the_raster_finer_about_the_lips_and_nowhere_else() -> None:
+    assets = grid_head(rows=31, columns=41)  # vertices 5 and 6.7 mm apart
+    plain, fine, both = uv_texels(assets, 40), uv_texels(assets, 120), uv_texels(assets, 40, detail=3)
+    near = detailed_faces(assets)
+    lips = assets.template[assets.regions["lips"]]
+    reach = torch.cdist(assets.template, lips).amin(dim=1)[assets.faces].amax(dim=1)
+    assert bool(near[reach < 0.0119].all()) and not bool(near[reach > 0.0121].any())
+    assert 0 < int(near.sum()) < len(near)
+    is_fine = both.side == 120
+    assert set(both.side.tolist()) == {40, 120} and torch.equal(is_fine, near[both.face])
+    for part, whole, inside in ((~is_fine, plain, ~near), (is_fine, fine, near)):
+        kept = inside[whole.face]
+        assert int(kept.sum()) == int(part.sum()) > 0
+        assert all(torch.equal(a[part], b[kept]) for a, b in zip(both, whole, strict=True))
+
+
+def test_a_detailed_map_is_painted_on_the_finer_raster() -> None:
+    assets = grid_head(rows=31, columns=41)
+    both = uv_texels(assets, 32, detail=2)
+    image, covered = painted(both, both.face[:, None].numpy())
+    fine = uv_texels(assets, 64)
+    assert covered.shape == (64, 64) and covered[fine.row, fine.column].mean() > 0.9
+    inside = both.side == 64
+    assert np.array_equal(image[both.row[inside], both.column[inside], 0], both.face[inside].numpy())
+    corner = both.row[~inside] * 2 + 1, both.column[~inside] * 2 + 1
+    assert (image[corner][:, 0] == both.face[~inside].numpy()).mean() > 0.9  # but where a fine texel lies over it
+    assert not covered[0].any() and not image[~covered].any()
+
+
+def test_detail_needs_regions_and_room() -> None:
+    assets = grid_head()
+    bare = replace(assets, regions={"boundary": assets.regions["boundary"]})
+    assert len(uv_texels(bare, 16).face)
+    with pytest.raises(UserError, match="names no region lips, left_eyeball, right_eyeball: put its FLAME_masks.pkl"):
+        uv_texels(bare, 16, detail=2)
+    with pytest.raises(
+        UserError, match=r"model\.uv_size=1024 times model\.uv_detail=4 is 4096 texels a side: at most 2048"
+    ):
+        uv_texels(assets, 1024, detail=4)
 
 
 def test_points_follow_the_mesh() -> None:

@@ -18,7 +18,7 @@ def test_a_set_doubles_at_every_tenth_of_the_training() -> None:
 
 def test_every_beginning_is_spread_over_the_map() -> None:
     row, column = torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij")
-    texels = UVTexels(row.flatten(), column.flatten(), torch.arange(256), torch.rand(256, 3))
+    texels = UVTexels(row.flatten(), column.flatten(), torch.arange(256), torch.rand(256, 3), torch.full((256,), 16))
     ordered = evenly_ordered(texels)
     assert sorted(ordered.face.tolist()) == list(range(256))
     for part in range(4):  # in each prefix every block of the map has as many as any other

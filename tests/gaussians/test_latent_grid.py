@@ -20,7 +20,7 @@ RASTER = 32
 def grid_of(assets: HeadAssets, cells: int):
     texels = uv_texels(assets, RASTER)
     points = Embedding(assets, texels).points(HeadModel(assets, torch.zeros(0)).neutral_vertices())
-    return texels, points, latent_grid(assets, texels, RASTER, points, cells)
+    return texels, points, latent_grid(assets, texels, points, cells)
 
 
 @pytest.mark.parametrize("cells", [1, 2, 5, 16, 32, 100])

@@ -36,7 +36,7 @@ class Scene:
         self.embedding = Embedding(assets, texels)
         N = len(self.embedding)
         neutral = self.embedding.points(head.neutral_vertices())
-        self.grid = latent_grid(assets, texels, 22, neutral, 6).interpolate if has_grid else None
+        self.grid = latent_grid(assets, texels, neutral, 6).interpolate if has_grid else None
         g = torch.Generator().manual_seed(1)
         rows = N if self.grid is None else self.grid.num_cells
         heads = HyperHeads(N, latents)

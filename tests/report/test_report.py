@@ -72,6 +72,18 @@ def test_uncertainty_is_grey_before_training_and_lies_where_the_gaussians_are(ru
     assert len(np.unique(image[::scale, ::scale][painted], axis=0)) == 1  # sigmoid(0) everywhere
 
 
+def test_uncertainty_of_a_detailed_avatar_has_the_finer_raster(tracked_folder: Path, tmp_path: Path) -> None:
+    train_small(tracked_folder, tmp_path / "run", ["trainer.iterations=2", "model.uv_detail=2"])
+    opened = open_run(tmp_path / "run")
+    side = opened.avatar.embedding.texels.side
+    assert set(side.tolist()) == {20, 40}
+    image = uncertainty_map(opened)
+    assert image is not None and image.shape[0] % 40 == 0
+    scale = image.shape[0] // 40
+    painted = (image[::scale, ::scale] != 255).any(axis=-1)
+    assert int((side == 40).sum()) < painted.sum() <= int((side == 40).sum() + 4 * (side == 20).sum())
+
+
 def test_protocols_without_a_figure_have_a_dash() -> None:
     protocols = {"a": {"means": {"psnr": 30.126, "lpips": None}, "frames": [1, 2]}, "b": {"means": {"ssim_head": 0.91}}}
     table = means_table(protocols)

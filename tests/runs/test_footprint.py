@@ -39,6 +39,12 @@ def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, .
     assert len(avatar.code) <= places(config, gaussians)
 
 
+def test_gaussians_of_a_finer_raster_are_counted() -> None:
+    config, assets = small_config("model.uv_detail=2").model, grid_head(rows=31, columns=41)
+    gaussians = count_gaussians(config, assets)
+    assert gaussians == len(Avatar(assets, torch.zeros(3), config)) > count_gaussians(small_config().model, assets)
+
+
 def test_a_map_too_coarse_for_a_single_gaussian_gets_a_sentence() -> None:
     with pytest.raises(UserError, match="model.uv_size=2 is too small: no texel of a 2 x 2 raster"):
         grid = grid_head()

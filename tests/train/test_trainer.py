@@ -10,6 +10,7 @@ import torch
 from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.errors import UserError
+from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
 from avatar.model import Avatar
@@ -17,8 +18,9 @@ from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_che
 from avatar.splat import splat
 from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
-from avatar.train.step import PerceptualTerm, Weighted, choose_perceptual
+from avatar.train.step import Objective, PerceptualTerm, Weighted, choose_perceptual
 from avatar.train.trainer import interruption, train
+from avatar.types import Camera, Frame, HeadParams
 
 
 def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_path: Path) -> None:
@@ -107,6 +109,32 @@ def test_a_sparse_perceptual_term_keeps_its_weight_on_average_and_has_a_stand_in
     assert found == [Weighted(rare.function, 0.2), stand_in, stand_in, stand_in] * 3
     assert term.at(6, 10) is None and PerceptualTerm("none").at(6, 0) is None
     assert [PerceptualTerm("always", rare).at(step, 2) for step in (1, 2, 3)] == [None, rare, rare]
+
+
+def test_dssim_may_begin_before_the_perceptual_term() -> None:
+    late, early = Weighted(lambda image, target, mask: image.sum(), 0.05), Weighted(dssim, 0.03)
+    term = PerceptualTerm("test", late, before=early)
+    assert [term.at(step, 4) for step in (0, 3, 4, 5)] == [early, early, late, late]
+    assert PerceptualTerm("none", before=early).at(1, 4) is None
+
+
+@pytest.mark.parametrize(("early", "share"), [(0.0, [0.0, 0.0, 1.0]), (0.1, [0.5, 0.5, 1.0])])
+def test_dssim_weighs_in_each_half_what_the_configuration_says(early: float, share: list[float]) -> None:
+    overrides = f"trainer.dssim_early={early}", "trainer.dssim_weight=0.2", "trainer.perceptual=dssim"
+    config = small_config(*overrides, "trainer.iterations=8").trainer
+    objective = Objective(config, torch.ones(3), choose_perceptual(config, print))
+    image, mask = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)), torch.ones(16, 16)
+    camera = Camera(torch.eye(3), torch.zeros(3), 1.0, 1.0, 8.0, 8.0, 16, 16)
+    params = HeadParams(torch.zeros(1), torch.zeros(6), torch.zeros(12), torch.zeros(2), torch.zeros(6))
+    frame = Frame(0, "0", camera, params, image, mask, mask, mask)
+    terms = [float(objective.loss(step, frame, image, 1 - image).perceptual) for step in (0, 3, 4)]
+    assert [term / terms[-1] for term in terms] == pytest.approx(share) and terms[-1] > 0.01
+
+
+def test_lpips_lets_dssim_begin_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(step_module, "load_lpips", lambda *_, **__: Lpips("squeeze"))
+    term = choose_perceptual(small_config("trainer.dssim_early=0.3").trainer, print)
+    assert term.name == "lpips-squeeze" and term.before == Weighted(dssim, 0.3)
 
 
 def test_another_seed_is_another_avatar(tracked_folder: Path, tmp_path: Path) -> None:
