@@ -30,7 +30,7 @@ def video_writer(
 ) -> Iterator[Callable[[UInt8[np.ndarray, "H W 3"]], None]]:
     """A function that adds one RGB frame to `path` (.mp4: H.264, yuv420p, plays everywhere).
 
-    `preset` is the encoder's: "veryfast" takes a quarter of the usual one's time, for pictures that are only looked at.
+    `preset` is the encoder's: "veryfast" takes two fifths of the usual one's time, for pictures that are only looked at.
     An odd size gets one more row or column, a copy of the last. The file appears under its name when the block ends
     without an exception. Raises UserError for no frames, another size on the way, or an encoder that fails.
     """
