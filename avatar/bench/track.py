@@ -25,7 +25,7 @@ from avatar.commands.opening import split_sizes
 from avatar.commands.tracking import bar
 from avatar.config import Config, load_config
 from avatar.data.images import read_image, read_mask
-from avatar.data.recording import Recording
+from avatar.data.recording import TRACK_SHAPES, Recording
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.demo.motion import FPS
@@ -34,10 +34,16 @@ from avatar.demo.subject import make_subject
 from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
-from data_prep.avatar_track import TrackingInfo
+from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
 from data_prep.open import open_subject
+from data_prep.track.camera import Pinhole
 from data_prep.track.embedding import iris_embedding
+from data_prep.track.fit_result import Clip
+from data_prep.track.fitting import as_tracks, find_embedding
+from data_prep.track.landmark_fit import fit_landmarks
+from data_prep.track.landmarks import load_landmarks
 from data_prep.track.track import Choices, track
 
 SEEDS, ALL_SEEDS = (1,), (1, 2, 3)
@@ -72,6 +78,7 @@ class Result:
     seed: int
     detected: float  # share of the frames
     landmarks: float  # error of the quality report, per cent of the distance between the irises
+    first_vertices: Placement  # of the fit to landmarks alone
     vertices: Placement
     refined_vertices: Placement
     matte: float  # intersection over union with the true one
@@ -118,7 +125,7 @@ def measure(seed: int, scale: Scale, config: Config, scratch: Path) -> Result:
     seconds = time.perf_counter() - begin
     truth, assets = open_subject(Source(true_folder, head, frame_offset=1), split_sizes(config))
     own, _ = open_subject(Source(tracked, head), split_sizes(config), assets=assets)
-    return compare(seed, info, seconds, truth, own, assets, config, scratch)
+    return compare(seed, info, seconds, truth, own, assets, config, tracked, head, scratch)
 
 
 def compare(
@@ -129,6 +136,8 @@ def compare(
     own: Subject,
     assets: HeadAssets,
     config: Config,
+    tracked: Path,
+    head: Path,
     scratch: Path,
 ) -> Result:
     network, note = find_lpips("squeeze")
@@ -150,20 +159,36 @@ def compare(
     avatars[AUTOMATIC] = measured(avatar, own.recording, shown)
     better, refine_seconds = of_own.refined(avatar, own.recording)
     avatars[REFINED] = measured(of_own.trained(better, "refined"), better, shown)
+    first = tracked_by_landmarks(tracked, head, own.recording, assets)
     landmark_error = next(f["value"] for f in info.quality["figures"] if f["name"] == "landmark error")
-    matte, head = mask_overlaps(own, truth, pairs[::COMPARED_EVERY])
+    matte_overlap, head_overlap = mask_overlaps(own, truth, pairs[::COMPARED_EVERY])
     return Result(
         seed=seed,
         detected=len(own) / len(truth),
         landmarks=landmark_error,
+        first_vertices=placement(assets, first, truth.recording, pairs),
         vertices=placement(assets, own.recording, truth.recording, pairs),
         refined_vertices=placement(assets, better, truth.recording, pairs),
-        matte=matte,
-        head=head,
+        matte=matte_overlap,
+        head=head_overlap,
         track_seconds=track_seconds,
         refine_seconds=refine_seconds,
         avatars=avatars,
     )
+
+
+def tracked_by_landmarks(tracked: Path, head: Path, own: Recording, assets: HeadAssets) -> Recording:
+    """The fit to the stored landmarks of a tracked folder alone, without its pictures."""
+    clip = Clip(load_landmarks(tracked / LANDMARKS_FILE), own.intrinsics, [], [])
+    names = load_expression_names(head, assets.num_expressions)
+    fit = fit_landmarks(assets, names, find_embedding(head, assets), clip.landmarks, Pinhole(*own.intrinsics))
+    rows = as_tracks(fit, fit.motion, clip, assets.num_expressions)
+    tracks = {
+        name: torch.from_numpy(np.stack([getattr(rows[int(number)], name) for number in own.names])).float()
+        for name in TRACK_SHAPES
+        if name != "shape"
+    }
+    return replace(own, tracks=tracks | {"shape": torch.from_numpy(next(iter(rows.values())).shape).float()})
 
 
 def _pictures(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -225,10 +250,11 @@ def report(results: Sequence[Result], scale: Scale) -> list[str]:
     for result in results:
         lines += [
             "",
-            f"seed {result.seed}: {100 * result.detected:.1f} % detected, landmark error {result.landmarks:.2f} %, "
-            f"vertices {_parts(result.vertices)}, refined {_parts(result.refined_vertices)}; IoU: matte "
-            f"{result.matte:.3f}, head {result.head:.3f}; tracking {result.track_seconds:.0f} s, "
-            f"refining {result.refine_seconds:.0f} s",
+            f"seed {result.seed}: {100 * result.detected:.1f} % detected, landmark error {result.landmarks:.2f} %; IoU: "
+            f"matte {result.matte:.3f}, head {result.head:.3f}; tracking {result.track_seconds:.0f} s, refining "
+            f"{result.refine_seconds:.0f} s",
+            f"vertices by landmarks {_parts(result.first_vertices)}, tracked {_parts(result.vertices)}, refined "
+            f"{_parts(result.refined_vertices)}",
             f"{'avatar of the tracking':>24}{'PSNR':>8}{'gap':>7}{'SSIM':>8}{'LPIPS':>8}{'mouth':>8}",
         ]
         lines += [

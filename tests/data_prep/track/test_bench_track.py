@@ -79,13 +79,14 @@ def test_the_report_has_every_figure() -> None:
         return Figures(psnr, 0.9, 0.05, 20.0)
 
     avatars = {"true": figures(30.0), "automatic": figures(27.75)}
-    vertices, refined = Placement(2.1, 1.9, 0.6), Placement(1.8, 1.7, 0.4)
-    result = Result(2, 0.99, 0.71, vertices, refined, 0.98, 0.97, 50.2, 12.1, avatars)
+    first, vertices, refined = Placement(2.3, 2.0, 1.1), Placement(2.1, 1.9, 0.6), Placement(1.8, 1.7, 0.4)
+    result = Result(2, 0.99, 0.71, first, vertices, refined, 0.98, 0.97, 50.2, 12.1, avatars)
     assert result.gap("automatic") == pytest.approx(2.25)
     text = "\n".join(report([result], Scale(10, 64, 32, 5)))
     for part in (
         "seed 2: 99.0 % detected",
         "0.71 %",
+        "2.30 (2.00, 1.10)",
         "2.10 (1.90, 0.60)",
         "1.80 (1.70, 0.40)",
         "0.980",
@@ -103,6 +104,7 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
     (subject,) = json.loads((tmp_path / "bench_track.json").read_text())["subjects"]
     assert subject["seed"] == 1 and subject["detected"] == 1.0
     assert 0.0 < subject["landmarks"] < 2.0 and 0.0 < subject["vertices"]["moving"] < subject["vertices"]["all"] < 4.0
+    assert 0.0 < subject["first_vertices"]["moving"] != subject["vertices"]["moving"]
     assert subject["matte"] > 0.97 and subject["head"] > 0.95
     assert set(subject["avatars"]) == {"true", "true, video's pictures", "automatic", "automatic, refined"}
     assert f"{subject['avatars']['automatic']['psnr']:.2f}" in capsys.readouterr().out
