@@ -11,8 +11,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Future
 from copy import deepcopy
 
 import torch
@@ -21,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from avatar.compute.device import brought, on_gpu
+from avatar.compute.workers import single_threaded_workers
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose, compose_carried, compose_slice, split_offsets
 from avatar.gaussians.deformation import DeformationMLP
@@ -195,23 +195,3 @@ class FoldedNetwork:
             x, spare = spare, x
         weight, bias = self._layers[-1]
         return torch.addmm(bias, x, weight)
-
-
-@contextmanager
-def single_threaded_workers(count: int) -> Iterator[ThreadPoolExecutor]:
-    """`count` threads in each of which torch and the splatter use one core; other threads keep theirs."""
-    before = torch.get_num_threads()
-    all_run = threading.Barrier(count + 1)
-
-    def settle() -> None:
-        torch.get_num_threads()  # a thread's first use of torch sets its number to the process's: before, not after
-        torch.set_num_threads(1)
-        all_run.wait()
-
-    with ThreadPoolExecutor(count, thread_name_prefix="render") as pool:
-        for _ in range(count):
-            pool.submit(settle)
-        all_run.wait()
-        # torch sets the number for the calling thread and as the start value of threads to come: put that back.
-        torch.set_num_threads(before)
-        yield pool

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND_LINE = {"avatar/commands", "avatar/bench"}
-BELOW = {"types", "errors", "tensors", "head", "data", "files", "html"}  # what importers may build on
+BELOW = {"types", "errors", "tensors", "compute", "head", "data", "files", "html"}  # what importers may build on
 END_OF_THE_PATH = "avatar/motion/reenact.py"  # motion in, video out: it uses all before it, and nothing uses it
 # No package imports one that is to its right in this order, which is that of the data.
 ORDER = [

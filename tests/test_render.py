@@ -8,10 +8,11 @@ import pytest
 import torch
 from heads import EXPRESSIONS, grid_head, random_params
 
+from avatar.compute.workers import single_threaded_workers
 from avatar.config import load_config
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.render import AHEAD_PER_WORKER, Renderer, single_threaded_workers
+from avatar.render import AHEAD_PER_WORKER, Renderer
 from avatar.splat import splat
 from avatar.types import Camera, HeadParams
 

@@ -37,4 +37,5 @@ PARTS = {
     "quality": Part("avatar.bench.quality_report", "RUN..."),
     "stability": Part("avatar.bench.stability"),
     "refine": Part("avatar.bench.refine", "FOLDER"),
+    "track": Part("avatar.bench.track"),
 }

@@ -154,23 +154,39 @@ class Trial:
 
     def figures(self, avatar: Avatar, recording: Recording) -> Figures:
         """Of the held-out frames driven by a recording."""
-        size, background = self.config.data.size, torch.tensor(self.config.data.background)
-        renderer = Renderer(avatar, background)
-        found = []
-        for index in recording.split.test[::MEASURED_EVERY]:
-            frame = self.subject.frame(index, size)
-            image = renderer.render(recording.params(index), recording.camera(index, size)).image
-            render, truth = (to_8_bit(shown).double() / 255.0 for shown in (image, frame.composite(background)))
-            mask, mouth = frame.head_mask.double(), frame.mouth_mask.double()
-            found.append(
-                (
-                    float(psnr(render, truth, mask)),
-                    float(ssim(render, truth, mask)),
-                    lpips_in_mask(self.network, (render, truth), mask),
-                    float(psnr(render, truth, mouth)),
-                )
+        shown = [(index, index) for index in recording.split.test[::MEASURED_EVERY]]
+        return figures(avatar, recording, self.subject, shown, self.config, self.network)
+
+
+def figures(
+    avatar: Avatar,
+    recording: Recording,
+    truth: Subject,
+    shown: Sequence[tuple[int, int]],
+    config: Config,
+    network: Lpips | None,
+) -> Figures:
+    """Of the avatar driven by some frames of a recording, against the true subject's pictures in its head masks.
+
+    `shown` are the frames' indices in the recording and in the true subject.
+    """
+    size, background = config.data.size, torch.tensor(config.data.background)
+    renderer = Renderer(avatar, background)
+    found = []
+    for index, true_index in shown:
+        frame = truth.frame(true_index, size)
+        image = renderer.render(recording.params(index), recording.camera(index, size)).image
+        render, picture = (to_8_bit(pixels).double() / 255.0 for pixels in (image, frame.composite(background)))
+        mask, mouth = frame.head_mask.double(), frame.mouth_mask.double()
+        found.append(
+            (
+                float(psnr(render, picture, mask)),
+                float(ssim(render, picture, mask)),
+                lpips_in_mask(network, (render, picture), mask),
+                float(psnr(render, picture, mouth)),
             )
-        return Figures(*(_mean(np.array(column)) for column in zip(*found, strict=True)))
+        )
+    return Figures(*(_mean(np.array(column)) for column in zip(*found, strict=True)))
 
 
 def vertex_errors(head: HeadModel, recording: Recording, truth: Recording) -> tuple[float, float]:

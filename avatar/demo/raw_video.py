@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -57,16 +57,25 @@ def filmed(
     frames: int, size: int, seed: int, motion: Motion = "speech", threads: int | None = None
 ) -> Iterator[np.ndarray]:
     """The pictures, uint8 [size, size, 3], before they are encoded."""
-    identity = sample_identity(seed)
-    renderer = Renderer(identity)
+    renderer = Renderer(sample_identity(seed))
     performance = perform(seed, frames, motion)
-    change = make_room(size, seed) - background_of(identity, size, size)
-    rng = np.random.default_rng((seed, 11))
     with single_threads():
-        for _, _, picture in rendered(renderer, performance, size, threads):
-            # Where the person covers a part of a pixel, the renderer's own background is the rest of it.
-            behind = 1.0 - picture.alpha[..., None].astype(np.float32) / 255.0
-            yield expose(picture.image + behind * change, rng)
+        drawn = rendered(renderer, performance, size, threads)
+        yield from in_room(((picture.image, picture.alpha) for _, _, picture in drawn), size, seed)
+
+
+def in_room(pictures: Iterable[tuple[np.ndarray, np.ndarray]], size: int, seed: int) -> Iterator[np.ndarray]:
+    """Pictures of the person of `seed` and their alpha, as a camera in the person's room would have taken them.
+
+    All are uint8, `size` pixels wide and high; the pictures are over the person's own background, as the renderer and
+    `make_subject` leave them.
+    """
+    change = make_room(size, seed) - background_of(sample_identity(seed), size, size)
+    rng = np.random.default_rng((seed, 11))
+    for image, alpha in pictures:
+        # Where the person covers a part of a pixel, the renderer's own background is the rest of it.
+        behind = 1.0 - alpha[..., None].astype(np.float32) / 255.0
+        yield expose(image + behind * change, rng)
 
 
 def expose(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -8,7 +8,8 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 from avatar.compute.native import thread_count
-from avatar.render import AHEAD_PER_WORKER, single_threaded_workers
+from avatar.compute.workers import single_threaded_workers
+from avatar.render import AHEAD_PER_WORKER
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from skimage.segmentation import find_boundaries
 
 from avatar.data.images import read_image
 from avatar.errors import UserError
@@ -18,6 +17,7 @@ from data_prep.projection import filled_lips
 SHOWN = 8
 DRAWN_WIDTH = 560  # pixels; the mesh needs room for its lines
 MESH, MASK, LIPS, MOUTH = (79, 179, 255), (63, 208, 122), (255, 95, 168), (255, 210, 63)  # as in html/style.css
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 _SUBPIXEL = 4  # bits of the fixed-point coordinates of cv2's lines
 
 
@@ -85,9 +85,9 @@ def draw_mesh(image: np.ndarray, mesh: Mesh) -> np.ndarray:
     in_front = (corners[..., 2] > 0).all(axis=1) & np.isfinite(corners).all(axis=(1, 2))
     # Counter-clockwise seen from outside, in an image whose y points down.
     facing = mesh.faces[in_front & (area < 0)]
-    edges = np.unique(
-        np.sort(np.concatenate((facing[:, [0, 1]], facing[:, [1, 2]], facing[:, [2, 0]])), axis=1), axis=0
-    )
+    ends = np.sort(np.concatenate((facing[:, [0, 1]], facing[:, [1, 2]], facing[:, [2, 0]])).astype(np.int64), axis=1)
+    # Sorting one number for each edge takes a fifth of sorting pairs.
+    edges = np.stack(np.divmod(np.unique(ends[:, 0] * len(mesh.screen) + ends[:, 1]), len(mesh.screen)), axis=1)
     lines = np.clip(mesh.screen[edges][..., :2], -(2**13), 2**13)
     points = np.round((lines - 0.5) * 2**_SUBPIXEL).astype(np.int32)
     drawn = cv2.polylines(image.copy(), list(points), False, MESH, 1, cv2.LINE_AA, _SUBPIXEL)
@@ -96,7 +96,8 @@ def draw_mesh(image: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 def outline(canvas: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
     """Draw the outer pixels of the mask's pieces, and those around its holes, on the canvas."""
-    canvas[find_boundaries(mask, mode="inner")] = colour
+    inside = mask.astype(np.uint8)
+    canvas[cv2.erode(inside, _CROSS) != inside] = colour
 
 
 def _caption(clip: Clip, number: int) -> str:

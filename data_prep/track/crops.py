@@ -81,12 +81,16 @@ class BlurredCrops:
     ) -> tuple[Float[Tensor, "T N"], Float[Tensor, "T N 2"]]:
         """Values and derivatives by the frames' pixels, at pixels of the frames; the border goes on for ever."""
         own = self._crops
-        at = own.to_crop(pixels, frames)
-        x, y = at[..., 0], at[..., 1]
+        x, y = own.to_crop(pixels, frames).unbind(-1)
         middle = self._at(x, y, frames)
         dx = self._at(x + 0.5, y, frames) - self._at(x - 0.5, y, frames)
         dy = self._at(x, y + 0.5, frames) - self._at(x, y - 0.5, frames)
         return middle, torch.stack((dx, dy), dim=-1) * own.scale
+
+    def values(self, pixels: Float[Tensor, "T N 2"], frames: slice) -> Float[Tensor, "T N"]:
+        """The values of `sample` alone, in a fifth of its time."""
+        x, y = self._crops.to_crop(pixels, frames).unbind(-1)
+        return self._at(x, y, frames)
 
     def _at(self, x: Tensor, y: Tensor, frames: slice) -> Tensor:
         """Bilinear; the centre of the pixel in column i is at i + 0.5."""

@@ -12,6 +12,7 @@ from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from avatar.head.expression_names import load_expression_names
 from data_prep.track.camera import Pinhole
+from data_prep.track.chunks import side_by_side
 from data_prep.track.detect import FaceDetector
 from data_prep.track.embedding import LandmarkEmbedding, iris_embedding, official_embedding
 from data_prep.track.fit_result import Clip, Fit
@@ -19,7 +20,7 @@ from data_prep.track.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.motion import Motion, gaze_rotations, rotations
 from data_prep.track.photometric_fit import fit_pictures
 from data_prep.track.quality import landmark_figures
-from data_prep.track.rendered_embedding import rendered_embedding
+from data_prep.track.rendered_embedding import cached_embedding, rendered_embedding
 from data_prep.tracking import FrameTrack
 
 
@@ -32,8 +33,10 @@ def fit_tracks(
     embedding = find_embedding(head_path, head)
     names = load_expression_names(head_path, head.num_expressions)
     camera = Pinhole(*clip.intrinsics)
-    by_landmarks = fit_landmarks(head, names, embedding, clip.landmarks, camera)
-    by_pictures = fit_pictures(head, by_landmarks, camera, clip.images.__getitem__, clip.mattes.__getitem__, progress)
+    with side_by_side():
+        by_landmarks = fit_landmarks(head, names, embedding, clip.landmarks, camera)
+        read = clip.images.__getitem__, clip.mattes.__getitem__
+        by_pictures = fit_pictures(head, by_landmarks, camera, *read, progress)
     tracks = as_tracks(by_landmarks, by_pictures.motion, clip, head.num_expressions)
 
     def figures(tracks: dict[int, FrameTrack]) -> dict[str, Any]:
@@ -84,9 +87,9 @@ def find_embedding(
     head_path: Path, head: HeadAssets, say: Callable[[str], object] = lambda _: None
 ) -> LandmarkEmbedding:
     """The landmarks' places on the head model: those that lie beside it, else found once by pictures of it."""
-    official = official_embedding(head_path, head)
-    if official is not None:
-        return official
+    known = official_embedding(head_path, head) or cached_embedding(head)
+    if known is not None:
+        return known
     with FaceDetector() as detector:
 
         def landmarker(image: np.ndarray) -> np.ndarray | None:

@@ -123,22 +123,21 @@ def write_masks(
     make: Callable[[int], UInt8[np.ndarray, "H W"]],
     progress: Progress,
     title: str,
-    workers: int = WORKERS,
 ) -> None:
     """What `make` gives for each frame number, as PNG; made by some threads, in any order."""
 
     def one(number: int) -> None:
         write_image(mask_file(folder, number), make(number), [])
 
-    for _ in ahead(numbers, one, progress, title, workers):
+    for _ in ahead(numbers, one, progress, title):
         pass
 
 
 def ahead(
-    numbers: Sequence[int], make: Callable[[int], Made], progress: Progress, title: str, workers: int = WORKERS
+    numbers: Sequence[int], make: Callable[[int], Made], progress: Progress, title: str
 ) -> Iterator[tuple[int, Made]]:
     """Each frame number with what `make` gives for it, in order; made by some threads, a few frames ahead."""
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(WORKERS) as pool:
         pending: deque[tuple[int, Future[Made]]] = deque()
         try:
             for number in progress(numbers, len(numbers), title):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from data_prep.track.camera import Pinhole, by_pose, to_camera
+from data_prep.track.chunks import chunks_of, over_chunks
 from data_prep.track.columns import frame_columns
 from data_prep.track.motion import Motion
 from data_prep.track.normal_equations import NormalEquations
@@ -42,18 +42,31 @@ class LandmarkTerm:
         names = ("observed", "weights", "unit", "pair_weights")
         return replace(self, **{name: getattr(self, name)[frames] for name in names})
 
+    def of(self, rows: Int[Tensor, " K"]) -> LandmarkTerm:
+        """The same term of some landmarks, those of all pairs among them."""
+        new = torch.full((len(self.landmarks),), -1).scatter(0, rows, torch.arange(len(rows)))
+        return replace(
+            self,
+            landmarks=self.landmarks[rows.numpy()],
+            points=self.points.of(rows),
+            observed=self.observed[:, rows],
+            weights=self.weights[:, rows],
+            pairs=new[self.pairs],
+        )
+
     def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
-        total = 0.0
-        for chunk in _chunks(len(motion)):
+        def cost_of(chunk: slice) -> float:
             part = self.take(chunk)
             at = to_camera(motion[chunk], self.points.positions(identity, motion[chunk]))
             residuals, weights, scales = part._residuals(self.camera.project(at))
-            total += float((0.5 * weights * scales**2 * torch.log1p((residuals**2).sum(-1) / scales**2)).sum())
-        return total
+            return float((0.5 * weights * scales**2 * torch.log1p((residuals**2).sum(-1) / scales**2)).sum())
+
+        return sum(over_chunks(cost_of, len(motion), _FRAMES_AT_ONCE))
 
     def errors(self, identity: Float[Tensor, " I"], motion: Motion) -> Float[Tensor, "T L"]:
         """Distances between projected and found landmarks in pixels."""
-        at = [to_camera(motion[c], self.points.positions(identity, motion[c])) for c in _chunks(len(motion))]
+        chunks = chunks_of(len(motion), _FRAMES_AT_ONCE)
+        at = [to_camera(motion[c], self.points.positions(identity, motion[c])) for c in chunks]
         return (self.camera.project(torch.cat(at)) - self.observed).norm(dim=-1)
 
     def add_to(
@@ -61,7 +74,8 @@ class LandmarkTerm:
     ) -> None:
         """Add the Gauss-Newton Hessian and the gradient by columns of a step, and by the identity where that is shared."""
         with_identity = len(equations.shared) > 0
-        for chunk in _chunks(len(motion)):
+
+        def rows_of(chunk: slice) -> tuple[Tensor, Tensor, Tensor | None]:
             part, moving = self.take(chunk), motion[chunk]
             at = to_camera(moving, self.points.positions(identity, moving))
             slopes = self.camera.slopes(at)
@@ -75,7 +89,9 @@ class LandmarkTerm:
             J = (self._with_pairs(by_step) * row_scale).flatten(0, 1)  # [2 L + 2 P, T, D]
             r = (residuals * robust[..., None]).permute(1, 2, 0).flatten(0, 1)
             by_identity = self._with_pairs(derivatives.identity.unflatten(0, (-1, 2))) * row_scale
-            equations.add_rows(chunk, J, r, by_identity.flatten(0, 1) if with_identity else None)
+            return J, r, by_identity.flatten(0, 1) if with_identity else None
+
+        equations.add_chunks(rows_of, _FRAMES_AT_ONCE)
 
     def _with_pairs(self, rows: Float[Tensor, "L 2 T C"]) -> Float[Tensor, "L+P 2 T C"]:
         return torch.cat((rows, rows[self.pairs[:, 0]] - rows[self.pairs[:, 1]]))
@@ -87,8 +103,3 @@ class LandmarkTerm:
         L, P = off.shape[1], len(self.pairs)
         scales = torch.cat((off.new_full((L,), self.scale), off.new_full((P,), self.pair_scale)))
         return residuals, torch.cat((self.weights, self.pair_weights), dim=1), scales
-
-
-def _chunks(frames: int) -> Iterator[slice]:
-    for start in range(0, frames, _FRAMES_AT_ONCE):
-        yield slice(start, min(start + _FRAMES_AT_ONCE, frames))

@@ -25,7 +25,7 @@ _SURELY_HEAD = 0.30  # above and well inside the mesh
 _ALL_HEAD = 0.75  # above, inside the matte
 _DIVIDED = 1.0  # below: the rest needs no division
 _MARGIN_IN, _MARGIN_OUT = 7, 5  # pixels of SIDE by which the mesh may be wrong
-_ITERATIONS = 3
+_ITERATIONS = 1  # of GrabCut: three gain 0.0001 of IoU on demo people and take half as long again
 _NOWHERE = (255, 0, 255)  # a colour that no person has, in the place of the background
 
 

@@ -11,11 +11,17 @@ A is factorised by blocks (Cholesky), the border by its Schur complement C - B' 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from data_prep.track.chunks import chunks_of, over_chunks
+
+Rows = tuple[Float[Tensor, "R T D"], Float[Tensor, "R T"], Float[Tensor, "R T H"] | None]
+"""Derivatives of R residuals of some frames, the residuals, and the derivatives by the first H shared unknowns."""
 
 
 @dataclass
@@ -45,6 +51,14 @@ class NormalEquations:
             empty(G, G),
             empty(G),
         )
+
+    def add_chunks(self, rows_of: Callable[[slice], Rows], at_once: int) -> None:
+        """Add the rows of all frames, `at_once` frames at a time. Where nothing is shared, chunks are made side by side."""
+        if len(self.shared):  # sums over frames must not depend on who comes first
+            for chunk in chunks_of(len(self.gradient), at_once):
+                self.add_rows(chunk, *rows_of(chunk))
+        else:
+            over_chunks(lambda chunk: self.add_rows(chunk, *rows_of(chunk)), len(self.gradient), at_once)
 
     def add_rows(
         self,

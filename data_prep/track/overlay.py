@@ -52,7 +52,7 @@ def write_overlay(
             outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
         return canvas
 
-    with video_writer(folder / OVERLAY_VIDEO, fps) as add:
+    with video_writer(folder / OVERLAY_VIDEO, fps, preset="veryfast") as add:
         for number, canvas in ahead(numbers, draw, progress, "drawing the overlay"):
             add(canvas)
             if number in shown:

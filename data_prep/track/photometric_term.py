@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from data_prep.track.camera import Pinhole, by_pose, to_camera
+from data_prep.track.chunks import over_chunks
 from data_prep.track.columns import frame_columns
 from data_prep.track.crops import BlurredCrops
 from data_prep.track.motion import Motion
@@ -36,19 +37,21 @@ class PhotometricTerm:
     weights: Float[Tensor, "T N"]  # 0 where a point is not seen
 
     def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
-        total = 0.0
-        for chunk in _chunks(len(motion)):
+        def cost_of(chunk: slice) -> float:
             at = to_camera(motion[chunk], self.points.positions(identity, motion[chunk]))
-            residuals = self._residuals(self.camera.project(at), chunk)[0]
+            values = self.images.values(self.camera.project(at), self._frames(chunk))
+            residuals = (values - self.wanted[chunk]) / DEVIATION
             robust = ROBUST**2 * torch.log1p((residuals / ROBUST) ** 2)
-            total += float(0.5 * (self.weights[chunk] * robust).sum())
-        return total
+            return float(0.5 * (self.weights[chunk] * robust).sum())
+
+        return sum(over_chunks(cost_of, len(motion), _FRAMES_AT_ONCE))
 
     def add_to(
         self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
     ) -> None:
         with_identity = len(equations.shared) > 0
-        for chunk in _chunks(len(motion)):
+
+        def rows_of(chunk: slice) -> tuple[Tensor, Tensor, Tensor | None]:
             moving = motion[chunk]
             at = to_camera(moving, self.points.positions(identity, moving))
             residuals, gradient = self._residuals(self.camera.project(at), chunk)
@@ -59,19 +62,18 @@ class PhotometricTerm:
             _, derivatives = self.points.positions_and_derivatives(identity, moving, in_head, with_identity)
             pose = by_pose(moving, at, slopes)[:, :, 0].transpose(0, 1)  # [N, T, 6]
             J = frame_columns(pose, derivatives, columns)
-            r = (residuals * robust).T
-            equations.add_rows(chunk, J, r, derivatives.identity if with_identity else None)
+            return J, (residuals * robust).T, derivatives.identity if with_identity else None
+
+        equations.add_chunks(rows_of, _FRAMES_AT_ONCE)
 
     def _residuals(self, pixels: Float[Tensor, "T N 2"], chunk: slice) -> tuple[Tensor, Tensor]:
         """In deviations [T, N], and their derivatives by the pixels [T, N, 2]."""
-        frames = slice(self.first + chunk.start, self.first + chunk.stop)
-        values, gradient = self.images.sample(pixels, frames)
+        values, gradient = self.images.sample(pixels, self._frames(chunk))
         return (values - self.wanted[chunk]) / DEVIATION, gradient / DEVIATION
 
-
-def _chunks(frames: int):
-    for start in range(0, frames, _FRAMES_AT_ONCE):
-        yield slice(start, min(start + _FRAMES_AT_ONCE, frames))
+    def _frames(self, chunk: slice) -> slice:
+        """Where the images of a chunk are."""
+        return slice(self.first + chunk.start, self.first + chunk.stop)
 
 
 def mean_texture(

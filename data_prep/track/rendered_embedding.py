@@ -7,6 +7,7 @@ point of an adjacent triangle that does so best.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -37,13 +38,21 @@ def rendered_embedding(
 
     Raises UserError when the landmarker finds no faces in the pictures of the head model.
     """
-    path = cache_folder() / "embeddings" / f"{assets.fingerprint[:16]}-{_RECIPE}.npz"
-    found = load_embedding(path, assets)
+    found = cached_embedding(assets)
     if found is None:
         say("looking for the landmarks on the head model (once for each head model)")
         found = make_embedding(assets, landmarker)
-        save_embedding(path, found)
+        save_embedding(_place(assets), found)
     return found
+
+
+def cached_embedding(assets: HeadAssets) -> LandmarkEmbedding | None:
+    """What `rendered_embedding` made before, if it did."""
+    return load_embedding(_place(assets), assets)
+
+
+def _place(assets: HeadAssets) -> Path:
+    return cache_folder() / "embeddings" / f"{assets.fingerprint[:16]}-{_RECIPE}.npz"
 
 
 def make_embedding(assets: HeadAssets, landmarker: Landmarker, heads: int = HEADS) -> LandmarkEmbedding:

@@ -14,6 +14,7 @@ from avatar.head.rasterize import rasterize_mesh
 COUNT = 1250
 _DEPTH_TOLERANCE = 2e-3  # metres
 _FACING = (0.15, 0.5)  # cosine to the line of sight: not counted below, in full above
+_DEPTH_STEP = 2  # pixels of the crop that are one of the depth buffer
 _REACH = 1.35  # of the skin around the eyes' middle, in distances between the eyes; without a region "face"
 
 
@@ -60,7 +61,8 @@ def seen_weights(
     `screen` are the vertices in the matte's pixels with their depth in metres, `in_camera` in camera space.
     """
     h, w = matte.shape
-    depth = rasterize_mesh(screen, faces, h, w).depth
+    coarse = screen * np.array([1 / _DEPTH_STEP, 1 / _DEPTH_STEP, 1.0])
+    depth = rasterize_mesh(coarse, faces, -(-h // _DEPTH_STEP), -(-w // _DEPTH_STEP)).depth
     at = np.einsum("nk,nkc->nc", barycentric, screen[corners])
     column, row = np.floor(at[:, 0]).astype(int), np.floor(at[:, 1]).astype(int)
     inside = (column >= 1) & (column < w - 1) & (row >= 1) & (row < h - 1)
@@ -72,6 +74,6 @@ def seen_weights(
         np.linalg.norm(normal, axis=-1) * np.linalg.norm(middle, axis=-1), 1e-12
     )
     facing = np.clip((cosine - _FACING[0]) / (_FACING[1] - _FACING[0]), 0.0, 1.0)
-    nearest = depth[row, column]
+    nearest = depth[row // _DEPTH_STEP, column // _DEPTH_STEP]
     visible = (nearest == 0) | (at[:, 2] <= nearest + _DEPTH_TOLERANCE)
     return np.where(inside & visible, facing * (matte[row, column] / 255.0), 0.0)

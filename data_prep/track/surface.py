@@ -14,6 +14,7 @@ it and nothing else, so that dp = (R_parent d) x sum_i R_i g_i, besides what the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -62,15 +63,26 @@ class SurfacePoints:
         identities: int,
         expressions: Int[Tensor, " E"],
     ) -> None:
+        self._made_of = assets, corners, barycentric, identities, expressions
         self._parents = assets.parents
         self.num_points, self.num_identities, self.num_expressions = len(corners), identities, len(expressions)
         self._has_features = bool(assets.pose_dirs[corners].any())
         self._groups = _groups(assets, corners, barycentric.double(), identities, expressions, self._has_features)
 
+    def of(self, rows: Int[Tensor, " M"]) -> SurfacePoints:
+        """Some of the points."""
+        assets, corners, barycentric, identities, expressions = self._made_of
+        return SurfacePoints(assets, corners[rows], barycentric[rows], identities, expressions)
+
     def positions(self, identity: Float[Tensor, " I"], motion: Motion) -> Float[Tensor, "T N 3"]:
         """Where the points are in the head's own space, metres."""
         local, world = self._pose(motion)
-        return self._carried(self._turned(identity, motion, local, world), {ROOT}, len(motion))
+        T = len(motion)
+        total = torch.empty(T, self.num_points, 3, dtype=torch.float64)
+        for group, g in zip(self._groups, self._unturned(identity, motion, local), strict=True):
+            # [g_1 .. g_P] times the transposed rotations below each other: the sum of R_j g_j
+            total[:, group.rows] = g @ world[:, list(group.joints)].transpose(2, 3).flatten(1, 2)
+        return total
 
     def positions_and_derivatives(
         self,
@@ -97,7 +109,7 @@ class SurfacePoints:
         axes = _axes(motion)
         columns = []
         for joint in (JAW, LEFT_EYE, RIGHT_EYE, NECK):
-            carried = self._carried(turned, {joint}, T).transpose(0, 1)[:, None]  # [N, 1, T, 3]
+            carried = self._carried(turned, joint, T).transpose(0, 1)[:, None]  # [N, 1, T, 3]
             moment = torch.linalg.cross(carried, q)  # q . (w x r) = w . (r x q)
             column = _rows_times(moment, world[:, self._parents[joint]] @ axes[joint]).flatten(0, 1)
             if self._has_features:
@@ -105,7 +117,7 @@ class SurfacePoints:
                 own = by_features[..., 9 * (joint - 1) : 9 * joint]
                 column = column + _rows_times(own, change.flatten(2).transpose(1, 2))
             columns.append(column)
-        return self._carried(turned, {ROOT}, T), Derivatives(
+        return self._carried(turned, ROOT, T), Derivatives(
             torch.cat(columns, dim=-1),
             by_coefficients[..., :E],
             by_coefficients[..., E : E + 2],
@@ -125,28 +137,34 @@ class SurfacePoints:
             world.append(world[self._parents[joint]] @ local[-1])
         return local, torch.stack(world, dim=1)
 
-    def _turned(
-        self, identity: Tensor, motion: Motion, local: list[Tensor], world: Tensor
-    ) -> list[Float[Tensor, "T M P 3"]]:
-        """R_j g_j of every group's points and joints."""
+    def _unturned(self, identity: Tensor, motion: Motion, local: list[Tensor]) -> Iterator[Float[Tensor, "T M 3*P"]]:
+        """g_j of every group's points and joints."""
         parts = [motion.expression, motion.eyelids]
         if self._has_features:
             parts.append((torch.stack(local[1:], dim=1) - local[0][:, None]).flatten(1))
         coefficients = torch.cat(parts, dim=1)
-        turned = []
         for group in self._groups:
             rest = group.template + group.identity @ identity
             g = rest.flatten() + coefficients @ group.basis.flatten(0, 1).T
-            g = g.reshape(len(motion), len(rest), len(group.joints), 3)
+            yield g.reshape(len(motion), *rest.shape)
+
+    def _turned(
+        self, identity: Tensor, motion: Motion, local: list[Tensor], world: Tensor
+    ) -> list[Float[Tensor, "T M P 3"]]:
+        """R_j g_j of every group's points and joints."""
+        turned = []
+        for group, g in zip(self._groups, self._unturned(identity, motion, local), strict=True):
+            g = g.unflatten(2, (len(group.joints), 3))
             turned.append(torch.einsum("tpcd,tmpd->tmpc", world[:, list(group.joints)], g))
         return turned
 
-    def _carried(self, turned: list[Tensor], below: set[int], T: int) -> Float[Tensor, "T N 3"]:
-        """The sum of R_i g_i over the joints i that are, or hang on, one of `below`; over all of them for the root."""
-        total = torch.empty(T, self.num_points, 3, dtype=torch.float64)
+    def _carried(self, turned: list[Tensor], below: int, T: int) -> Float[Tensor, "T N 3"]:
+        """The sum of R_i g_i over the joint `below` and the joints that hang on it; over all of them for the root."""
+        total = torch.zeros(T, self.num_points, 3, dtype=torch.float64)
         for group, own in zip(self._groups, turned, strict=True):
-            is_below = [not below.isdisjoint(_ancestry(self._parents, joint)) for joint in group.joints]
-            total[:, group.rows] = own[:, :, is_below].sum(2)
+            for k, joint in enumerate(group.joints):
+                if below in _ancestry(self._parents, joint):
+                    total[:, group.rows] += own[:, :, k]
         return total
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -92,10 +93,16 @@ class Work:
                 size = self._footage.width, self._footage.height
                 write_given_mattes(folder, given, view, self._choices.span, look, size, self._progress)
                 return {}
-            matter, _ = open_matter()
             images = FrameImages(self._folder / FRAMES, numbers)
             rows = {number: row for row, number in enumerate(numbers)}
-            write_masks(folder, numbers, lambda n: matter(images[rows[n]]), self._progress, "making mattes", workers=1)
+            own = threading.local()  # a network is for one thread
+
+            def one(number: int) -> np.ndarray:
+                if not hasattr(own, "matter"):
+                    own.matter, _ = open_matter()
+                return own.matter(images[rows[number]])
+
+            write_masks(folder, numbers, one, self._progress, "making mattes")
             return {}
 
         return self._stages.run(MATTE, {"frames": frames_key, "network": network, "given": options["matte"]}, make)[1]

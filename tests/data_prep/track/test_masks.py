@@ -8,11 +8,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from skimage.segmentation import find_boundaries
 
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer
 from avatar.errors import UserError
+from data_prep.check.overlay import draw_mesh, outline
+from data_prep.fit import Mesh
 from data_prep.track.landmark_groups import OUTER_LIPS
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 
@@ -81,6 +84,22 @@ def test_the_ring_is_the_lowest_open_edge() -> None:
     tetrahedron = np.array([(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)])
     with pytest.raises(UserError, match="closed everywhere"):
         neck_ring(np.zeros((4, 3)), tetrahedron)
+
+
+def test_outlines_are_the_inner_pixels_of_the_mask() -> None:
+    noise = cv2.GaussianBlur(np.random.default_rng(0).random((40, 50)), (0, 0), 2)
+    mask, canvas = noise > 0.5, np.zeros((40, 50, 3), np.uint8)
+    outline(canvas, mask, (1, 2, 3))
+    np.testing.assert_array_equal(canvas[..., 2] == 3, find_boundaries(mask, mode="inner"))
+    assert mask[0].any()  # the picture's border is none of the mask's
+
+
+def test_every_edge_that_faces_the_camera_is_drawn_and_no_other() -> None:
+    screen = np.array([[4, 4, 1], [4, 30, 1], [30, 30, 1], [30, 4, 1], [50, 4, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4][::-1]])  # the last one looks away
+    drawn = draw_mesh(np.zeros((40, 60, 3), np.uint8), Mesh(screen, faces[[0, 2]], faces, faces[:0])).any(-1)
+    assert drawn[15, 3:5].any() and drawn[28:31, 15].any() and not drawn[:, 35:].any()
+    assert not drawn[3:5, 15].any()  # the edge from 0 to 3 belongs to the second face alone
 
 
 def test_the_mouth_is_inside_the_lips_outline() -> None:

@@ -132,6 +132,25 @@ def test_gradient_by_the_identity(make, step: float, share: float) -> None:
     torch.testing.assert_close(own.shared_gradient, differences, rtol=0, atol=share * float(differences.abs().max()))
 
 
+def test_some_landmarks_cost_what_they_cost_among_others() -> None:
+    term, motion = landmark_term(), some_motion()
+    rows = torch.tensor([0, 1, 2, 4, 7])  # with both ends of every pair
+    others = torch.ones(N, dtype=torch.bool)
+    others[rows] = False
+    alone = replace(term, weights=torch.where(others, 0.0, term.weights))
+    assert term.of(rows).cost(IDENTITY, motion) == pytest.approx(alone.cost(IDENTITY, motion), rel=1e-12)
+    assert term.of(rows).landmarks.tolist() == rows.tolist()
+    assert alone.cost(IDENTITY, motion) < term.cost(IDENTITY, motion)
+
+
+def test_values_are_those_of_samples_with_derivatives() -> None:
+    term = photometric_term()
+    pixels = 60.0 + noise(2, 7, 2, seed=20, scale=40.0)  # some of them outside
+    values, gradient = term.images.sample(pixels, slice(1, 3))
+    assert torch.equal(term.images.values(pixels, slice(1, 3)), values) and gradient.any()
+    assert not torch.equal(term.images.values(pixels, slice(2, 4)), values)
+
+
 def test_frames_that_do_not_follow_each_other_are_not_compared() -> None:
     term, motion = smoothness(), some_motion()
     jumped = replace(motion, jaw=motion.jaw + torch.tensor([0, 0, 0, 1.0, 1.0], dtype=torch.float64)[:, None])

@@ -1,0 +1,268 @@
+"""What a plain video costs against the true tracking: demo subjects filmed, tracked, and made into avatars.
+
+A subject's own folder is the truth. Its pictures in a room, with noise and compression, are the video that `avatar track`
+gets, with no choice made. Avatars of one recipe: trained on the true folder, on the video's frames and masks with the true
+tracking, on what `avatar track` made, and on that refined through the third. All are measured on held-out frames against
+the true pictures in the true head masks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from avatar.bench import Request
+from avatar.bench.refine import MEASURED_EVERY, Figures, Trial, figures
+from avatar.bench.results import leave
+from avatar.commands.opening import split_sizes
+from avatar.commands.tracking import bar
+from avatar.config import Config, load_config
+from avatar.data.images import read_image, read_mask
+from avatar.data.recording import TRACK_SHAPES, Recording
+from avatar.data.source import Source
+from avatar.data.subject import Subject
+from avatar.demo.motion import FPS
+from avatar.demo.raw_video import in_room
+from avatar.demo.subject import make_subject
+from avatar.evaluation.networks import find_lpips
+from avatar.files.video import video_writer
+from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.expression_names import load_expression_names
+from avatar.head.model import HeadModel
+from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
+from data_prep.open import open_subject
+from data_prep.track.camera import Pinhole
+from data_prep.track.embedding import iris_embedding
+from data_prep.track.fit_result import Clip
+from data_prep.track.fitting import as_tracks, find_embedding
+from data_prep.track.landmark_fit import fit_landmarks
+from data_prep.track.landmarks import load_landmarks
+from data_prep.track.track import Choices, track
+
+SEEDS, ALL_SEEDS = (1,), (1, 2, 3)
+TRUE, PICTURES, AUTOMATIC, REFINED = "true", "true, video's pictures", "automatic", "automatic, refined"
+COMPARED_EVERY = 5  # frames whose masks are compared
+
+
+@dataclass(frozen=True)
+class Scale:
+    frames: int
+    filmed: int  # pixels of the video, a side
+    size: int  # pixels that avatars are trained and measured at
+    iterations: int
+
+
+USUAL, QUICK = Scale(120, 384, 160, 1000), Scale(20, 192, 48, 20)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How far the face's vertices are from the true ones in the picture; per cent of the distance between the irises."""
+
+    all: float  # mean over vertices and frames
+    constant: float  # of each vertex's mean over the frames
+    moving: float  # what remains without that
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of one subject."""
+
+    seed: int
+    detected: float  # share of the frames
+    landmarks: float  # error of the quality report, per cent of the distance between the irises
+    first_vertices: Placement  # of the fit to landmarks alone
+    vertices: Placement
+    refined_vertices: Placement
+    matte: float  # intersection over union with the true one
+    head: float
+    track_seconds: float
+    refine_seconds: float
+    avatars: dict[str, Figures]
+
+    def gap(self, name: str) -> float:
+        """dB that an avatar is below that of the true tracking."""
+        return self.avatars[TRUE].psnr - self.avatars[name].psnr
+
+
+def run(request: Request) -> None:
+    scale = QUICK if request.quick else USUAL
+    config = load_config(
+        [
+            f"data.size={scale.size}",
+            f"trainer.iterations={scale.iterations}",
+            "trainer.preview_every=1000000",
+            *(("model.uv_size=24", "model.mlp_width=24") if request.quick else ()),
+            *request.overrides,
+        ]
+    )
+    results = []
+    for seed in ALL_SEEDS if request.full else SEEDS:
+        with tempfile.TemporaryDirectory(dir=request.out) as scratch:
+            results.append(measure(seed, scale, config, Path(scratch)))
+    content = {"scale": asdict(scale), "config": config.to_dict(), "subjects": [asdict(result) for result in results]}
+    leave(request.out, "bench_track", report(results, scale), content)
+
+
+def measure(seed: int, scale: Scale, config: Config, scratch: Path) -> Result:
+    """Everything about one subject; what is written on the way lies in `scratch`."""
+    true_folder, video, tracked = scratch / "true", scratch / "video.mp4", scratch / "tracked"
+    make_subject(true_folder, scale.frames, scale.filmed, seed)
+    with video_writer(video, FPS) as add:
+        for picture in in_room(_pictures(true_folder), scale.filmed, seed):
+            add(picture)
+    head = true_folder / "head_model"
+    begin = time.perf_counter()
+    # The whole picture: it is then the true one's, pixel for pixel.
+    info = track(video, tracked, head, load_head_assets(head), Choices(crop="none"), progress=bar)
+    seconds = time.perf_counter() - begin
+    truth, assets = open_subject(Source(true_folder, head, frame_offset=1), split_sizes(config))
+    own, _ = open_subject(Source(tracked, head), split_sizes(config), assets=assets)
+    return compare(seed, info, seconds, truth, own, assets, config, tracked, head, scratch)
+
+
+def compare(
+    seed: int,
+    info: TrackingInfo,
+    track_seconds: float,
+    truth: Subject,
+    own: Subject,
+    assets: HeadAssets,
+    config: Config,
+    tracked: Path,
+    head: Path,
+    scratch: Path,
+) -> Result:
+    network, note = find_lpips("squeeze")
+    print(f"LPIPS: {note}")
+    pairs = paired(own.recording, truth.recording)
+    held_out = set(own.split.test) & {mine for mine, true in pairs if true in truth.split.test}
+    shown = [pair for pair in pairs if pair[0] in held_out][::MEASURED_EVERY]
+    of_truth, of_own = (Trial(subject, assets, config, network, scratch) for subject in (truth, own))
+
+    def measured(avatar, recording: Recording, pairs: Sequence[tuple[int, int]]) -> Figures:
+        return figures(avatar, recording, truth, pairs, config, network)
+
+    avatars = {}
+    same = [(true, true) for _, true in shown]
+    avatars[TRUE] = measured(of_truth.trained(truth.recording, "true"), truth.recording, same)
+    given = truly_tracked(own.recording, truth.recording, pairs)
+    avatars[PICTURES] = measured(of_own.trained(given, "pictures"), given, shown)
+    avatar = of_own.trained(own.recording, "automatic")
+    avatars[AUTOMATIC] = measured(avatar, own.recording, shown)
+    better, refine_seconds = of_own.refined(avatar, own.recording)
+    avatars[REFINED] = measured(of_own.trained(better, "refined"), better, shown)
+    first = tracked_by_landmarks(tracked, head, own.recording, assets)
+    landmark_error = next(f["value"] for f in info.quality["figures"] if f["name"] == "landmark error")
+    matte_overlap, head_overlap = mask_overlaps(own, truth, pairs[::COMPARED_EVERY])
+    return Result(
+        seed=seed,
+        detected=len(own) / len(truth),
+        landmarks=landmark_error,
+        first_vertices=placement(assets, first, truth.recording, pairs),
+        vertices=placement(assets, own.recording, truth.recording, pairs),
+        refined_vertices=placement(assets, better, truth.recording, pairs),
+        matte=matte_overlap,
+        head=head_overlap,
+        track_seconds=track_seconds,
+        refine_seconds=refine_seconds,
+        avatars=avatars,
+    )
+
+
+def tracked_by_landmarks(tracked: Path, head: Path, own: Recording, assets: HeadAssets) -> Recording:
+    """The fit to the stored landmarks of a tracked folder alone, without its pictures."""
+    clip = Clip(load_landmarks(tracked / LANDMARKS_FILE), own.intrinsics, [], [])
+    names = load_expression_names(head, assets.num_expressions)
+    fit = fit_landmarks(assets, names, find_embedding(head, assets), clip.landmarks, Pinhole(*own.intrinsics))
+    rows = as_tracks(fit, fit.motion, clip, assets.num_expressions)
+    tracks = {
+        name: torch.from_numpy(np.stack([getattr(rows[int(number)], name) for number in own.names])).float()
+        for name in TRACK_SHAPES
+        if name != "shape"
+    }
+    return replace(own, tracks=tracks | {"shape": torch.from_numpy(next(iter(rows.values())).shape).float()})
+
+
+def _pictures(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    for path in sorted((folder / "imgs").iterdir()):
+        yield read_image(path), read_mask(folder / "alpha" / path.name)
+
+
+def paired(own: Recording, truth: Recording) -> list[tuple[int, int]]:
+    """Indices of the same pictures in both: those of the true folder are numbered from 1, those of the video from 0."""
+    true_index = {int(name) - 1: index for index, name in enumerate(truth.names)}
+    return [(index, true_index[int(name)]) for index, name in enumerate(own.names) if int(name) in true_index]
+
+
+def truly_tracked(own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Recording:
+    """The video's frames with the true tracking. Every frame must have a true one."""
+    true_rows = torch.tensor([true for _, true in pairs])
+    tracks = {name: values if name == "shape" else values[true_rows] for name, values in truth.tracks.items()}
+    return replace(own, tracks=tracks, intrinsics=truth.intrinsics)
+
+
+def placement(assets: HeadAssets, own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Placement:
+    """How far the face lies from the truth in the picture, over the frames that both have."""
+    irises = torch.from_numpy(iris_embedding(assets).corners[:, 0])
+    ours, theirs = (HeadModel(assets, recording.identity) for recording in (own, truth))
+    residuals, distances = [], []
+    for mine, true in pairs:
+        placed = own.camera(mine).project(ours.vertices(own.params(mine)))[:, :2]
+        expected = truth.camera(true).project(theirs.vertices(truth.params(true)))[:, :2]
+        residuals.append((placed - expected)[assets.regions["face"]].numpy())
+        distances.append(float((expected[irises[0]] - expected[irises[1]]).norm()))
+    # Turned heads show their eyes closer together; the widest tenth is seen from the front.
+    return in_parts(100.0 * np.stack(residuals) / np.percentile(distances, 90))
+
+
+def in_parts(residuals: Float[np.ndarray, "T V 2"]) -> Placement:
+    constant = residuals.mean(0)
+    lengths = (np.linalg.norm(part, axis=-1).mean() for part in (residuals, constant, residuals - constant))
+    return Placement(*map(float, lengths))
+
+
+def mask_overlaps(own: Subject, truth: Subject, pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
+    """Intersection over union of mattes and of head masks, means over frames of the video's size."""
+    found = []
+    for mine, true in pairs:
+        ours, theirs = own.pixels(mine), truth.pixels(true)
+        masks = [(pixels.alpha > 127, pixels.head_mask > 127) for pixels in (ours, theirs)]
+        found.append([(a & b).sum() / max((a | b).sum(), 1) for a, b in zip(*masks, strict=True)])
+    matte, head = np.mean(found, axis=0).tolist()
+    return matte, head
+
+
+def report(results: Sequence[Result], scale: Scale) -> list[str]:
+    lines = [
+        f"{scale.frames} frames of {scale.filmed}x{scale.filmed} tracked; held-out frames at {scale.size} px, head alone, "
+        f"{scale.iterations} steps, against the true pictures",
+        "Errors of the face's vertices in % of the eyes' distance: all, the same in all frames, without that; and after "
+        "refining",
+    ]
+    for result in results:
+        lines += [
+            "",
+            f"seed {result.seed}: {100 * result.detected:.1f} % detected, landmark error {result.landmarks:.2f} %; IoU: "
+            f"matte {result.matte:.3f}, head {result.head:.3f}; tracking {result.track_seconds:.0f} s, refining "
+            f"{result.refine_seconds:.0f} s",
+            f"vertices by landmarks {_parts(result.first_vertices)}, tracked {_parts(result.vertices)}, refined "
+            f"{_parts(result.refined_vertices)}",
+            f"{'avatar of the tracking':>24}{'PSNR':>8}{'gap':>7}{'SSIM':>8}{'LPIPS':>8}{'mouth':>8}",
+        ]
+        lines += [
+            f"{name:>24}{own.psnr:8.2f}{result.gap(name):7.2f}{own.ssim:8.4f}{own.lpips:8.4f}{own.mouth:8.2f}"
+            for name, own in result.avatars.items()
+        ]
+    return lines
+
+
+def _parts(error: Placement) -> str:
+    return f"{error.all:.2f} ({error.constant:.2f}, {error.moving:.2f})"
