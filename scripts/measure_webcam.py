@@ -29,15 +29,15 @@ from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.frame_fit import FrameFit
 from data_prep.live.pictures import LONGEST, open_source
-from data_prep.track.camera import Pinhole
-from data_prep.track.detect import Face, FaceDetector
-from data_prep.track.fitting import find_embedding
-from data_prep.track.focal import choose_focal
-from data_prep.track.footage import Span, whole
-from data_prep.track.landmark_fit import eye_distance, fit_landmarks
-from data_prep.track.landmarks import Landmarks
-from data_prep.track.levenberg import concatenated
-from data_prep.track.pictures import open_footage
+from data_prep.track.faces.detect import Face, FaceDetector
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.fitting import find_embedding
+from data_prep.track.fit.focal import choose_focal
+from data_prep.track.fit.landmark_fit import eye_distance, fit_landmarks
+from data_prep.track.fit.levenberg import concatenated
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Span, whole
 
 COMPARED = 200  # frames
 

@@ -38,12 +38,12 @@ from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
 from data_prep.open import open_subject
-from data_prep.track.camera import Pinhole
-from data_prep.track.embedding import iris_embedding
-from data_prep.track.fit_result import Clip
-from data_prep.track.fitting import as_tracks, find_embedding
-from data_prep.track.landmark_fit import fit_landmarks
-from data_prep.track.landmarks import load_landmarks
+from data_prep.track.faces.embedding import iris_embedding
+from data_prep.track.faces.landmarks import load_landmarks
+from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.fitting import as_tracks, find_embedding
+from data_prep.track.fit.landmark_fit import fit_landmarks
+from data_prep.track.fit.result import Clip
 from data_prep.track.track import Choices, track
 
 SEEDS, ALL_SEEDS = (1,), (1, 2, 3)

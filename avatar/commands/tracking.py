@@ -18,8 +18,8 @@ from data_prep.avatar_track import read_info, recognise
 from data_prep.cache import cache_folder
 from data_prep.open import HEAD_VARIABLE
 from data_prep.track.crop import parse_crop
-from data_prep.track.footage import Span
-from data_prep.track.pictures import is_footage, open_footage
+from data_prep.track.footage.pictures import is_footage, open_footage
+from data_prep.track.footage.source import Span
 from data_prep.track.stages import hash_of
 from data_prep.track.track import STAGES_VERSION, Choices, track
 

@@ -18,13 +18,13 @@ from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from avatar.types import HeadParams
 from data_prep.live.frame_fit import FrameFit
 from data_prep.live.pictures import LivePicture, Newest, Source
-from data_prep.track.camera import Pinhole
-from data_prep.track.detect import Face, FaceDetector, overlap
-from data_prep.track.fitting import find_embedding
-from data_prep.track.focal import choose_focal
-from data_prep.track.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.landmarks import Landmarks
-from data_prep.track.motion import Motion, gaze_rotations, rotations
+from data_prep.track.faces.detect import Face, FaceDetector, overlap
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.fitting import find_embedding
+from data_prep.track.fit.focal import choose_focal
+from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
+from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
 
 CALIBRATION_SECONDS = 4.0
 FEWEST, MOST = 20, 60  # pictures with the face that calibration is made from

@@ -17,18 +17,18 @@ from torch import Tensor
 
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames
-from data_prep.track.camera import Pinhole
-from data_prep.track.detect import Face
-from data_prep.track.embedding import LandmarkEmbedding
-from data_prep.track.expression_kind import is_statistical
-from data_prep.track.landmark_fit import LandmarkFit, faded, is_rigid, point_units, weighted_landmarks
-from data_prep.track.landmarks import Landmarks
-from data_prep.track.levenberg import Term, concatenated, minimise
-from data_prep.track.motion import Motion, at_rest
-from data_prep.track.normal_equations import NormalEquations
-from data_prep.track.priors import expected, score_targets
-from data_prep.track.smoothness import NOMINAL_FPS, Smoothness, make_smoothness
-from data_prep.track.start import start_poses
+from data_prep.track.faces.detect import Face
+from data_prep.track.faces.embedding import LandmarkEmbedding
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.expression_kind import is_statistical
+from data_prep.track.fit.landmark_fit import LandmarkFit, faded, is_rigid, point_units, weighted_landmarks
+from data_prep.track.fit.levenberg import Term, concatenated, minimise
+from data_prep.track.fit.motion import Motion, at_rest
+from data_prep.track.fit.normal_equations import NormalEquations
+from data_prep.track.fit.priors import expected, score_targets
+from data_prep.track.fit.smoothness import NOMINAL_FPS, Smoothness, make_smoothness
+from data_prep.track.fit.start import start_poses
 
 STEPS = 2  # of Levenberg-Marquardt; more do not bring it nearer to the fit of the whole clip
 FIRST_STEPS = 8  # of a face that nothing is known of

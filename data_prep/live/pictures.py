@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.errors import UserError
-from data_prep.track.detect import quiet
-from data_prep.track.ffmpeg import STALL_SECONDS
-from data_prep.track.footage import Footage, Span, View, check_size, whole
-from data_prep.track.pictures import open_footage
+from data_prep.track.faces.detect import quiet
+from data_prep.track.footage.ffmpeg import STALL_SECONDS
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Footage, Span, View, check_size, whole
 
 LONGEST = 1280  # pixels of a picture; the landmarks come from 256 pixels around the face
 SILENT_AFTER = 5.0  # seconds without a picture after which a camera is given up

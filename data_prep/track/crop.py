@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from avatar.errors import UserError
-from data_prep.track.footage import MIN_SIDE, Box, View
+from data_prep.track.footage.source import MIN_SIDE, Box, View
 
 DEFAULT_SIZE = 512  # pixels, as such data sets have
 # The square reaches beyond the landmarks, in heights of the face (chin to the top of the forehead).

@@ -14,8 +14,8 @@ from jaxtyping import UInt8
 
 from avatar.data.images import read_image, read_mask
 from avatar.errors import UserError
-from data_prep.track.footage import Footage, Span, TimedPicture, View
-from data_prep.track.landmarks import Landmarks
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.look import Look
 
 # JPEG without subsampled colours: see docs/data.md for its size and error beside PNG's.

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from avatar.errors import UserError
-from data_prep.track.cuts import CutFinder, Shot
-from data_prep.track.detect import Face, FaceDetector
-from data_prep.track.footage import Footage, Span, TimedPicture, check_span, stride, whole
-from data_prep.track.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
-from data_prep.track.person import follow_one
-from data_prep.track.timing import regular_timing
+from data_prep.track.faces.detect import Face, FaceDetector
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.faces.person import follow_one
+from data_prep.track.footage.cuts import CutFinder, Shot
+from data_prep.track.footage.source import Footage, Span, TimedPicture, check_span, stride, whole
+from data_prep.track.footage.timing import regular_timing
 
 LOOKED_AT = 1920  # pixels of the longer side; the landmarks come from 256 pixels around the face
 MAX_PICTURES = 3600  # two minutes at 30 a second

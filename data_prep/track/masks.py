@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from avatar.errors import UserError
 from data_prep.projection import silhouette
-from data_prep.track.landmark_groups import OUTER_LIPS
+from data_prep.track.faces.landmark_groups import OUTER_LIPS
 
 SIDE = 256  # pixels of the picture that is divided; the division is enlarged
 # Heights above the neck ring; 1 is the middle of the head.

@@ -44,7 +44,7 @@ def _segmentation() -> Matter:
 def _multiclass() -> Matter:
     """Through MediaPipe's own runner, which knows the file's normalisation. Class 0 is the background."""
     file = require(SELFIE_MULTICLASS)
-    from data_prep.track.detect import load_mediapipe, quiet
+    from data_prep.track.faces.detect import load_mediapipe, quiet
 
     mediapipe, vision, options = load_mediapipe()
     settings = vision.ImageSegmenterOptions(base_options=options(file), output_confidence_masks=True)

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from avatar.head.assets import HeadAssets
-from data_prep.track.embedding import LandmarkEmbedding
-from data_prep.track.fit_result import Fit
-from data_prep.track.focal import Focal
-from data_prep.track.landmark_groups import BROWS, LEFT_IRIS, LIDS, LIPS, NOSE, RIGHT_IRIS
-from data_prep.track.landmarks import Landmarks
+from data_prep.track.faces.embedding import LandmarkEmbedding
+from data_prep.track.faces.landmark_groups import BROWS, LEFT_IRIS, LIDS, LIPS, NOSE, RIGHT_IRIS
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.focal import Focal
+from data_prep.track.fit.result import Fit
 
 GRADES = ("good", "fair", "poor")
 GROUPS = {"lips": LIPS, "lids": LIDS, "brows": BROWS, "nose": NOSE, "irises": (LEFT_IRIS, RIGHT_IRIS)}

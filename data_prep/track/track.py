@@ -28,14 +28,14 @@ from data_prep.avatar_track import (
     recognise,
     write_tracking,
 )
-from data_prep.track.focal import Focal
-from data_prep.track.footage import Footage, View
+from data_prep.track.faces.landmarks import save_landmarks
+from data_prep.track.fit.focal import Focal
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Footage, View
 from data_prep.track.frames import (
     in_view,
 )
-from data_prep.track.landmarks import save_landmarks
 from data_prep.track.look import Look
-from data_prep.track.pictures import open_footage
 from data_prep.track.quality import judge
 from data_prep.track.stages import growing, hash_of
 from data_prep.track.work import Choices, Progress, Work

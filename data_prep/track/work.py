@@ -13,17 +13,17 @@ import numpy as np
 from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
 from data_prep.track.crop import choose_view
-from data_prep.track.fit_result import Clip, Fit
-from data_prep.track.fitting import fit_tracks
-from data_prep.track.focal import Focal, choose_focal
-from data_prep.track.footage import Box, Footage, Span, View
+from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
+from data_prep.track.fit.fitting import fit_tracks
+from data_prep.track.fit.focal import Focal, choose_focal
+from data_prep.track.fit.result import Clip, Fit
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Box, Footage, Span, View
 from data_prep.track.frames import FrameImages, FrameMattes, write_frames, write_given_mattes, write_masks
-from data_prep.track.landmarks import Landmarks, load_landmarks, save_landmarks
 from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matte import open_matter
 from data_prep.track.overlay import FrameParts, write_overlay
-from data_prep.track.pictures import open_footage
 from data_prep.track.stages import Stages
 
 Progress = Callable[[Iterable[Any], int | None, str], Iterable[Any]]

@@ -14,13 +14,13 @@ from avatar.demo.render import RenderedFrame, render_frame
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.expression_names import ExpressionNames, load_expression_names
 from avatar.head.model import HeadModel
-from data_prep.track.camera import Pinhole, to_camera
-from data_prep.track.embedding import LandmarkEmbedding, iris_embedding
-from data_prep.track.landmark_fit import LandmarkFit
-from data_prep.track.landmark_groups import FEATURES
-from data_prep.track.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
-from data_prep.track.motion import Motion
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding
+from data_prep.track.faces.landmark_groups import FEATURES
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.fit.camera import Pinhole, to_camera
+from data_prep.track.fit.landmark_fit import LandmarkFit
+from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.surface import SurfacePoints
 
 SIZE, SEED, FPS = 160, 1, 25.0
 NOISE = 0.012  # of the distance between the eyes: the landmarks' own

@@ -12,8 +12,8 @@ from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, filmed, make_room, make_video
 from avatar.demo.render import render_frame
 from avatar.errors import UserError
-from data_prep.track.footage import Span, whole
-from data_prep.track.video import open_video
+from data_prep.track.footage.source import Span, whole
+from data_prep.track.footage.video import open_video
 
 SEED, SIZE, FRAMES = 1, 96, 3
 

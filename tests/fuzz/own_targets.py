@@ -20,8 +20,8 @@ from avatar.runs.avatar_file import AVATAR_FILE, read_portrait, write_portrait
 from avatar.runs.trained import load_avatar
 from avatar.sweep.spec import read_spec
 from data_prep import avatar_track
-from data_prep.track.embedding import OFFICIAL_FILE, official_embedding
-from data_prep.track.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, load_landmarks, save_landmarks
+from data_prep.track.faces.embedding import OFFICIAL_FILE, official_embedding
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, load_landmarks, save_landmarks
 
 SWEEP = b"""subjects: [../anna, {folder: ../carla, head: ../head_model, frame_offset: 1}]
 head: ../head_model

@@ -23,7 +23,7 @@ from avatar.head.model import matrix_from_6d
 from data_prep.live import follow
 from data_prep.live.follow import FaceFollower
 from data_prep.live.pictures import open_source
-from data_prep.track.fitting import find_embedding
+from data_prep.track.fit.fitting import find_embedding
 
 pytestmark = [pytest.mark.usefixtures("tracking_models"), pytest.mark.slow]
 FRAMES, SIZE, SEED, FPS = 48, 192, 1, 10.0
@@ -115,7 +115,7 @@ def test_the_command_follows_a_video_to_its_end(video: Path, head: Path, tmp_pat
 UNCLOSED = """
 import gc
 import numpy
-from data_prep.track.detect import FaceDetector
+from data_prep.track.faces.detect import FaceDetector
 for _ in range(3):
     detector = FaceDetector()
     detector.itself = detector

@@ -11,11 +11,11 @@ import torch
 from spoken_scene import FPS, SIZE, Scene, spoken_scene
 
 from data_prep.live.frame_fit import LOST_AFTER, FrameFit
-from data_prep.track.detect import Face
-from data_prep.track.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.landmarks import Landmarks
-from data_prep.track.levenberg import concatenated
-from data_prep.track.motion import Motion
+from data_prep.track.faces.detect import Face
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
+from data_prep.track.fit.levenberg import concatenated
+from data_prep.track.fit.motion import Motion
 
 CALIBRATED, FRAMES = 24, 36  # the first ones are calibrated on, the others followed; the clip's fit knows all
 

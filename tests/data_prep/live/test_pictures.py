@@ -13,7 +13,7 @@ from videos import encode, spot
 
 from avatar.errors import UserError
 from data_prep.live.pictures import Camera, LivePicture, Newest, Played, open_source
-from data_prep.track.pictures import open_footage
+from data_prep.track.footage.pictures import open_footage
 
 WIDTH, HEIGHT = 80, 64
 BLANK = np.zeros((HEIGHT, WIDTH, 3), np.uint8)

@@ -9,9 +9,9 @@ import pytest
 
 from avatar.errors import UserError
 from data_prep.track.crop import choose_view, head_square, parse_crop
-from data_prep.track.cuts import CutFinder
-from data_prep.track.focal import choose_focal
-from data_prep.track.footage import Box, Span, check_span, stride, whole
+from data_prep.track.fit.focal import choose_focal
+from data_prep.track.footage.cuts import CutFinder
+from data_prep.track.footage.source import Box, Span, check_span, stride, whole
 
 
 def textured(seed: int, size: int = 96) -> np.ndarray:

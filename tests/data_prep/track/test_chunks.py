@@ -9,10 +9,10 @@ import pytest
 import torch
 from test_terms import COLUMNS, IDENTITIES, IDENTITY, T, landmark_term, photometric_term, some_motion
 
-from data_prep.track import landmark_term as landmarks
-from data_prep.track import photometric_term as pictures
-from data_prep.track.chunks import chunks_of, over_chunks, side_by_side
-from data_prep.track.normal_equations import NormalEquations
+from data_prep.track.fit import landmark_term as landmarks
+from data_prep.track.fit import photometric_term as pictures
+from data_prep.track.fit.chunks import chunks_of, over_chunks, side_by_side
+from data_prep.track.fit.normal_equations import NormalEquations
 
 
 @pytest.fixture

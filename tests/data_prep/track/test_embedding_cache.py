@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from heads import grid_head
 
-from data_prep.track import fitting
-from data_prep.track.embedding import LandmarkEmbedding
-from data_prep.track.rendered_embedding import cached_embedding, rendered_embedding
+from data_prep.track.faces.embedding import LandmarkEmbedding
+from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
+from data_prep.track.fit import fitting
 
 
 def test_what_is_known_needs_no_landmarker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,7 +19,7 @@ def test_what_is_known_needs_no_landmarker(tmp_path: Path, monkeypatch: pytest.M
     assert cached_embedding(head) is None
     made = LandmarkEmbedding(np.array([7]), np.array([[0, 1, 2]]), np.array([[0.5, 0.25, 0.25]]))
     with monkeypatch.context() as patch:
-        patch.setattr("data_prep.track.rendered_embedding.make_embedding", lambda *_: made)
+        patch.setattr("data_prep.track.faces.rendered_embedding.make_embedding", lambda *_: made)
         rendered_embedding(head, lambda image: None)
     monkeypatch.setattr(fitting, "official_embedding", lambda *_: None)
     monkeypatch.setattr(fitting, "FaceDetector", lambda: pytest.fail("the landmarker is loaded"))

@@ -14,15 +14,15 @@ from avatar.demo.render import RenderedFrame
 from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.projection import project_head
-from data_prep.track import photometric_fit
-from data_prep.track.camera import to_camera
-from data_prep.track.fit_result import Clip
-from data_prep.track.fitting import as_tracks
-from data_prep.track.landmark_fit import LandmarkFit, eye_distance, fit_landmarks
-from data_prep.track.landmark_groups import LIPS
-from data_prep.track.motion import Motion, at_rest
-from data_prep.track.photometric_fit import fit_pictures
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.faces.landmark_groups import LIPS
+from data_prep.track.fit import photometric_fit
+from data_prep.track.fit.camera import to_camera
+from data_prep.track.fit.fitting import as_tracks
+from data_prep.track.fit.landmark_fit import LandmarkFit, eye_distance, fit_landmarks
+from data_prep.track.fit.motion import Motion, at_rest
+from data_prep.track.fit.photometric_fit import fit_pictures
+from data_prep.track.fit.result import Clip
+from data_prep.track.fit.surface import SurfacePoints
 
 FRAMES = 16
 

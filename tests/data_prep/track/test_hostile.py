@@ -12,9 +12,9 @@ import pytest
 from videos import X264, encode, ffmpeg, talking
 
 from avatar.cli import main
-from data_prep.track.footage import Span
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Span
 from data_prep.track.look import look_at
-from data_prep.track.pictures import open_footage
 
 FRAMES, SIZE = 20, 160
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from avatar.errors import UserError
-from data_prep.track.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, load_landmarks, save_landmarks
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, load_landmarks, save_landmarks
 
 
 def some_landmarks(frames: int = 4) -> Landmarks:

@@ -16,7 +16,7 @@ from avatar.demo.render import Renderer
 from avatar.errors import UserError
 from data_prep.check.overlay import draw_mesh, outline
 from data_prep.fit import Mesh
-from data_prep.track.landmark_groups import OUTER_LIPS
+from data_prep.track.faces.landmark_groups import OUTER_LIPS
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 
 SIZE = 256

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from data_prep.track.levenberg import IdentityPrior, minimise
-from data_prep.track.motion import Motion, at_rest
-from data_prep.track.normal_equations import NormalEquations, NotPositiveDefinite, condition_number, solve
+from data_prep.track.fit.levenberg import IdentityPrior, minimise
+from data_prep.track.fit.motion import Motion, at_rest
+from data_prep.track.fit.normal_equations import NormalEquations, NotPositiveDefinite, condition_number, solve
 
 T, D, G = 5, 3, 2
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_prep.track.detect import Face, overlap
-from data_prep.track.person import follow_one
+from data_prep.track.faces.detect import Face, overlap
+from data_prep.track.faces.person import follow_one
 
 
 def face(x: float, size: float = 100.0) -> Face:

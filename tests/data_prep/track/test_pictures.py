@@ -10,8 +10,8 @@ import pytest
 from videos import ffmpeg
 
 from avatar.errors import UserError
-from data_prep.track.footage import Span, whole
-from data_prep.track.pictures import open_footage
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Span, whole
 
 
 def read(path: Path, span: Span | None = None) -> tuple[list, list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_prep.track.skin_points import seen_weights
+from data_prep.track.fit.skin_points import seen_weights
 
 SIZE, FOCAL = 101, 400.0  # an odd size: the depth buffer is of half of it
 # Two squares of 0.1 m that face the camera, one 0.05 m behind a half of the other; and a steep one at their right.

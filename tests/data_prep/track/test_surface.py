@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.types import HeadParams
-from data_prep.track.motion import (
+from data_prep.track.fit.motion import (
     NUM_FIXED,
     Columns,
     Motion,
@@ -22,7 +22,7 @@ from data_prep.track.motion import (
     left_jacobians,
     rotations,
 )
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.fit.surface import SurfacePoints
 
 T, N, IDENTITIES = 3, 11, 4
 USED = torch.tensor([0, 2, 3])  # of the head's expressions

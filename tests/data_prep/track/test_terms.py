@@ -10,18 +10,18 @@ import torch
 from heads import EXPRESSIONS, grid_head
 
 from avatar.head.expression_names import ExpressionNames
-from data_prep.track.camera import Pinhole, to_camera
-from data_prep.track.columns import free_columns, spread
-from data_prep.track.crops import BlurredCrops, cut_out
-from data_prep.track.landmark_term import LandmarkTerm
-from data_prep.track.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
-from data_prep.track.levenberg import Term
-from data_prep.track.motion import Motion, rotations
-from data_prep.track.normal_equations import NormalEquations
-from data_prep.track.photometric_term import PhotometricTerm, mean_texture
-from data_prep.track.priors import make_priors
-from data_prep.track.smoothness import make_smoothness
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.fit.camera import Pinhole, to_camera
+from data_prep.track.fit.columns import free_columns, spread
+from data_prep.track.fit.crops import BlurredCrops, cut_out
+from data_prep.track.fit.landmark_term import LandmarkTerm
+from data_prep.track.fit.levenberg import Term
+from data_prep.track.fit.motion import Motion, rotations
+from data_prep.track.fit.normal_equations import NormalEquations
+from data_prep.track.fit.photometric_term import PhotometricTerm, mean_texture
+from data_prep.track.fit.priors import make_priors
+from data_prep.track.fit.smoothness import make_smoothness
+from data_prep.track.fit.surface import SurfacePoints
 
 T, N, IDENTITIES = 5, 9, 3
 CAMERA = Pinhole(300.0, 310.0, 64.0, 60.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_prep.track.timing import regular_timing
+from data_prep.track.footage.timing import regular_timing
 
 
 @pytest.mark.parametrize("fps", [24000 / 1001, 25.0, 30000 / 1001, 30.0, 12.5])

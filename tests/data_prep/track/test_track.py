@@ -20,9 +20,9 @@ from data_prep.avatar_track import read_info
 from data_prep.check.folder import check_tracked_folder
 from data_prep.open import find_head
 from data_prep.track import work
-from data_prep.track.footage import Box
-from data_prep.track.landmarks import load_landmarks
-from data_prep.track.pictures import is_footage
+from data_prep.track.faces.landmarks import load_landmarks
+from data_prep.track.footage.pictures import is_footage
+from data_prep.track.footage.source import Box
 from data_prep.track.track import Choices, track
 
 pytestmark = [pytest.mark.usefixtures("tracking_models"), pytest.mark.slow]

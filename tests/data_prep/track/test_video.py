@@ -11,11 +11,11 @@ import pytest
 from videos import LOSSLESS, X264, centre_of, encode, ffmpeg, spot
 
 from avatar.errors import UserError
-from data_prep.track import ffmpeg as decoding
-from data_prep.track.footage import Box, Span, View, whole
-from data_prep.track.pictures import open_footage
-from data_prep.track.tone import has_zimg
-from data_prep.track.video import open_video
+from data_prep.track.footage import ffmpeg as decoding
+from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.source import Box, Span, View, whole
+from data_prep.track.footage.tone import has_zimg
+from data_prep.track.footage.video import open_video
 
 WIDTH, HEIGHT = 160, 96
 AT = (70.3, 40.6)

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from data_prep.track.motion import Columns
-from data_prep.track.surface import Derivatives
+from data_prep.track.fit.motion import Columns
+from data_prep.track.fit.surface import Derivatives
 
 
 def free_columns(expressions: int, *fixed: slice) -> Int[Tensor, " D"]:

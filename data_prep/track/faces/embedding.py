@@ -16,7 +16,7 @@ from avatar.files.atomic import write_atomically
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets, find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
-from data_prep.track.landmark_groups import LEFT_IRIS, NUM_MESH, RIGHT_IRIS
+from data_prep.track.faces.landmark_groups import LEFT_IRIS, NUM_MESH, RIGHT_IRIS
 
 OFFICIAL_FILE = "mediapipe_landmark_embedding.npz"  # of FLAME's downloads
 

@@ -18,17 +18,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
-from data_prep.track import landmark_groups as groups
-from data_prep.track.camera import Pinhole, to_camera
-from data_prep.track.chunks import over_chunks
-from data_prep.track.crops import BlurredCrops, Crops, Images, Mattes, cut_out
-from data_prep.track.landmark_fit import POINT_SHARE, LandmarkFit, eye_distance
-from data_prep.track.landmark_term import LandmarkTerm
-from data_prep.track.levenberg import minimise
-from data_prep.track.motion import Motion, at_rest
-from data_prep.track.photometric_term import PhotometricTerm, mean_texture
-from data_prep.track.skin_points import face_triangles, seen_weights, spread_points
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.faces import landmark_groups as groups
+from data_prep.track.fit.camera import Pinhole, to_camera
+from data_prep.track.fit.chunks import over_chunks
+from data_prep.track.fit.crops import BlurredCrops, Crops, Images, Mattes, cut_out
+from data_prep.track.fit.landmark_fit import POINT_SHARE, LandmarkFit, eye_distance
+from data_prep.track.fit.landmark_term import LandmarkTerm
+from data_prep.track.fit.levenberg import minimise
+from data_prep.track.fit.motion import Motion, at_rest
+from data_prep.track.fit.photometric_term import PhotometricTerm, mean_texture
+from data_prep.track.fit.skin_points import face_triangles, seen_weights, spread_points
+from data_prep.track.fit.surface import SurfacePoints
 
 EYES_IN_CROPS = 110.0  # pixels between the eyes, at most
 BLURS = (3.0, 1.2)  # per cent of the distance between the eyes

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_prep.track.chunks import chunks_of, over_chunks
+from data_prep.track.fit.chunks import chunks_of, over_chunks
 
 Rows = tuple[Float[Tensor, "R T D"], Float[Tensor, "R T"], Float[Tensor, "R T H"] | None]
 """Derivatives of R residuals of some frames, the residuals, and the derivatives by the first H shared unknowns."""

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from avatar.head.assets import HeadAssets
 from avatar.head.model import JAW, LEFT_EYE, NECK, RIGHT_EYE, ROOT
-from data_prep.track.motion import Motion, cross_matrix, gaze_axes, gaze_rotations, left_jacobians, rotations
+from data_prep.track.fit.motion import Motion, cross_matrix, gaze_axes, gaze_rotations, left_jacobians, rotations
 
 
 class _Group(NamedTuple):

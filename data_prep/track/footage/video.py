@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avatar.errors import UserError
-from data_prep.track.ffmpeg import Decoder, Shown, describe, first_picture
-from data_prep.track.footage import LAID_OVER_GREY, Box, Span, TimedPicture, View, check_size, opaque, stride
-from data_prep.track.tone import HDR_TRANSFERS, tone_filters
+from data_prep.track.footage.ffmpeg import Decoder, Shown, describe, first_picture
+from data_prep.track.footage.source import LAID_OVER_GREY, Box, Span, TimedPicture, View, check_size, opaque, stride
+from data_prep.track.footage.tone import HDR_TRANSFERS, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
 _STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\(\w+\))?: (\w+): (.*)")

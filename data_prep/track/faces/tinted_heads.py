@@ -12,8 +12,8 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE, HeadModel
 from avatar.head.rasterize import rasterize_mesh
 from avatar.types import HeadParams
-from data_prep.track.expression_kind import is_statistical, used_expressions
-from data_prep.track.motion import gaze_rotations, rotations
+from data_prep.track.fit.expression_kind import is_statistical, used_expressions
+from data_prep.track.fit.motion import gaze_rotations, rotations
 
 SIZE = 384  # pixels, the whole picture
 EYE_DISTANCE = 78.0  # pixels between the eyes' centres of a head seen from in front

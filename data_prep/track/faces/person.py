@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from data_prep.track.detect import Face, overlap
+from data_prep.track.faces.detect import Face, overlap
 
 _FOLLOWS = 0.2  # overlap (IoU) with the last place of a face that makes it the same one
 _PATIENCE = 15  # pictures that a face may be away and still be the same at the same place

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from data_prep.track.camera import Pinhole, by_pose, to_camera
-from data_prep.track.chunks import over_chunks
-from data_prep.track.columns import frame_columns
-from data_prep.track.crops import BlurredCrops
-from data_prep.track.motion import Motion
-from data_prep.track.normal_equations import NormalEquations
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.fit.camera import Pinhole, by_pose, to_camera
+from data_prep.track.fit.chunks import over_chunks
+from data_prep.track.fit.columns import frame_columns
+from data_prep.track.fit.crops import BlurredCrops
+from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.normal_equations import NormalEquations
+from data_prep.track.fit.surface import SurfacePoints
 
 DEVIATION = 0.03  # of grey values from 0 to 1
 ROBUST = 3.0  # scale of Cauchy's loss, in deviations

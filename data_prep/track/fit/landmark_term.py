@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from data_prep.track.camera import Pinhole, by_pose, to_camera
-from data_prep.track.chunks import chunks_of, over_chunks
-from data_prep.track.columns import frame_columns
-from data_prep.track.motion import Motion
-from data_prep.track.normal_equations import NormalEquations
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.fit.camera import Pinhole, by_pose, to_camera
+from data_prep.track.fit.chunks import chunks_of, over_chunks
+from data_prep.track.fit.columns import frame_columns
+from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.normal_equations import NormalEquations
+from data_prep.track.fit.surface import SurfacePoints
 
 _FRAMES_AT_ONCE = 32
 

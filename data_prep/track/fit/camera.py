@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_prep.track.motion import Motion
+from data_prep.track.fit.motion import Motion
 
 
 class Pinhole(NamedTuple):

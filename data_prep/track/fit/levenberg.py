@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from data_prep.track.columns import spread
-from data_prep.track.motion import Motion
-from data_prep.track.normal_equations import NormalEquations, NotPositiveDefinite, solve
+from data_prep.track.fit.columns import spread
+from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.normal_equations import NormalEquations, NotPositiveDefinite, solve
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-8, 1e6
 CONVERGED = 1e-4  # relative decrease of the cost below which the fit has come to rest

@@ -11,16 +11,16 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from avatar.head.expression_names import load_expression_names
-from data_prep.track.camera import Pinhole
-from data_prep.track.chunks import side_by_side
-from data_prep.track.detect import FaceDetector
-from data_prep.track.embedding import LandmarkEmbedding, iris_embedding, official_embedding
-from data_prep.track.fit_result import Clip, Fit
-from data_prep.track.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.motion import Motion, gaze_rotations, rotations
-from data_prep.track.photometric_fit import fit_pictures
+from data_prep.track.faces.detect import FaceDetector
+from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding, official_embedding
+from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
+from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.chunks import side_by_side
+from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
+from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
+from data_prep.track.fit.photometric_fit import fit_pictures
+from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.quality import landmark_figures
-from data_prep.track.rendered_embedding import cached_embedding, rendered_embedding
 from data_prep.tracking import FrameTrack
 
 

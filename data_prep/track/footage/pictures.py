@@ -15,9 +15,9 @@ import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES, has_transparency, read_bytes, read_image
 from avatar.errors import UserError
-from data_prep.track.footage import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque
-from data_prep.track.timing import DEFAULT_FPS
-from data_prep.track.video import open_video
+from data_prep.track.footage.source import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque
+from data_prep.track.footage.timing import DEFAULT_FPS
+from data_prep.track.footage.video import open_video
 
 _MAX_PICTURES = 100_000
 _TRACKED = {"imgs", "images", "image", "frames", "checkpoint", "flame_param"}  # what tracked folders hold

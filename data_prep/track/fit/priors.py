@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.head.expression_names import ExpressionNames, plain
-from data_prep.track.landmarks import BLENDSHAPES, Landmarks
-from data_prep.track.motion import Columns, Motion
-from data_prep.track.normal_equations import NormalEquations
+from data_prep.track.faces.landmarks import BLENDSHAPES, Landmarks
+from data_prep.track.fit.motion import Columns, Motion
+from data_prep.track.fit.normal_equations import NormalEquations
 
 SCORE_SHARE = 0.7  # of a blendshape's score is expected in its coefficient
 EXPRESSION_DEVIATION = 0.25  # of coefficients that go from 0 to 1

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
-from data_prep.track.camera import to_camera
-from data_prep.track.motion import Columns, Motion, cross_matrix
-from data_prep.track.normal_equations import NormalEquations
+from data_prep.track.fit.camera import to_camera
+from data_prep.track.fit.motion import Columns, Motion, cross_matrix
+from data_prep.track.fit.normal_equations import NormalEquations
 
 NOMINAL_FPS = 25.0
 POSE_SECOND = (0.6e-3, 0.6e-3, 1.2e-3)  # metres, of four points on the head along the camera's axes

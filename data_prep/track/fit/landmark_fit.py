@@ -16,19 +16,19 @@ from torch import Tensor
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames
 from avatar.head.model import JAW, LEFT_EYE, RIGHT_EYE
-from data_prep.track import landmark_groups as groups
-from data_prep.track.camera import Pinhole
-from data_prep.track.columns import free_columns
-from data_prep.track.embedding import LandmarkEmbedding, as_points, iris_embedding
-from data_prep.track.expression_kind import is_statistical, used_expressions
-from data_prep.track.landmark_term import LandmarkTerm
-from data_prep.track.landmarks import Landmarks
-from data_prep.track.levenberg import IdentityPrior, minimise
-from data_prep.track.motion import Columns, Motion, at_rest
-from data_prep.track.priors import Priors, make_priors
-from data_prep.track.smoothness import Smoothness, make_smoothness
-from data_prep.track.start import start_poses
-from data_prep.track.surface import SurfacePoints
+from data_prep.track.faces import landmark_groups as groups
+from data_prep.track.faces.embedding import LandmarkEmbedding, as_points, iris_embedding
+from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.columns import free_columns
+from data_prep.track.fit.expression_kind import is_statistical, used_expressions
+from data_prep.track.fit.landmark_term import LandmarkTerm
+from data_prep.track.fit.levenberg import IdentityPrior, minimise
+from data_prep.track.fit.motion import Columns, Motion, at_rest
+from data_prep.track.fit.priors import Priors, make_priors
+from data_prep.track.fit.smoothness import Smoothness, make_smoothness
+from data_prep.track.fit.start import start_poses
+from data_prep.track.fit.surface import SurfacePoints
 
 POINT_SHARE = 0.02  # of the distance between the eyes: the landmarks' standard deviation
 ROBUST, ROBUST_PAIRS = 4.0, 3.0  # scale of the loss, in those deviations

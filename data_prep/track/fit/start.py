@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_prep.track.camera import Pinhole
+from data_prep.track.fit.camera import Pinhole
 
 _BEHIND = 1e-3  # metres; a head nearer than this is not in front of the camera
 

@@ -16,7 +16,7 @@ from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.projection import project_head
-from data_prep.track.landmarks import Landmarks
+from data_prep.track.faces.landmarks import Landmarks
 from data_prep.tracking import FrameTrack
 
 _FIELDS = ("R", "t", "jaw", "eyes", "eyelids", "neck", "expression")

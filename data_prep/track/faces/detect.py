@@ -18,7 +18,7 @@ from jaxtyping import Float32, UInt8
 
 from avatar.errors import UserError
 from avatar.files.third_party import FACE_LANDMARKER, require
-from data_prep.track.landmarks import NUM_POINTS
+from data_prep.track.faces.landmarks import NUM_POINTS
 
 MAX_FACES = 4
 INSTALL = "tracking needs MediaPipe: pip install 'hyperavatar[track]'"
