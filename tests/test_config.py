@@ -190,13 +190,6 @@ def test_a_recorded_configuration_that_is_damaged_gets_a_sentence(damage, messag
     assert message in str(caught.value)
 
 
-def test_a_configuration_recorded_before_a_key_existed_has_what_was_done_then() -> None:
-    values = load_config().to_dict()
-    values["trainer"].pop("dssim_early")
-    values["model"].pop("uv_detail")
-    assert config_from_dict(values) == load_config()
-
-
 def test_every_key_in_the_yaml_files_has_a_comment() -> None:
     for file in sorted(config_dir().glob("*/*.yaml")):
         others = file.parent.name == "model" and file.stem != "hypergaussians"
