@@ -118,6 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_run(refine)
     add_folder(refine)
     refine.add_argument("--out", type=Path, metavar="SUBJECT", help="a new tracked folder (default: RUN/refined/NAME)")
+    add_device(refine)
 
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
     add_run(report)
@@ -256,6 +257,7 @@ def add_export(export: argparse.ArgumentParser) -> None:
 def add_view(view: argparse.ArgumentParser) -> None:
     add_avatar(view)
     add_folder(view)
+    add_device(view)
     view.add_argument("--drive", type=Path, action="append", default=[], metavar="FILE", help="a motion to play, too")
     view.add_argument("--size", type=int, metavar="N", help="width of the picture in pixels (default: as in training)")
     view.add_argument(
