@@ -207,6 +207,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_tracking(bench)
     add_head(bench)
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
+    add_device(bench)
     extent = bench.add_mutually_exclusive_group()
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
     extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")

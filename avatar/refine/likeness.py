@@ -142,7 +142,8 @@ class Likeness:
             gaussians = self.avatar(params := head_params(values), self._head.vertices(params))
             picture = self._draw_moved(gaussians, values, given, target)
             error = misfit(picture, target)
-            return Fit(error.detach(), *torch.autograd.grad(error, values), picture.detach())
+            (gradient,) = torch.autograd.grad(error, values)
+            return Fit(error.detach(), gradient, picture.detach())
         pose = moved_pose(values, given, self.centre)
         eye = -(pose.R.T @ pose.t)  # where the camera is, in the head's space
         gaussians = self.avatar(head_params(values))
