@@ -27,7 +27,7 @@ def run_refine(arguments: Namespace) -> int:
     target: Path = arguments.out or arguments.run / REFINED_FOLDER / run.subject.name
     check_folder_output(target)
     check_outputs([target], [Path(run.subject.manifest.source)])
-    status = refine_run(run, target, arguments.device)
+    status = refine_run(run, target, arguments.device or "auto")
     if status == OK:
         print(f"Next         avatar train {target} --out ANOTHER_RUN")
     return status
