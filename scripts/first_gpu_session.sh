@@ -44,7 +44,13 @@ part demo-data .venv/bin/avatar demo-data "$out/actor" --frames 120 --size 512
 for device in cuda cpu; do
   part "train-$device" .venv/bin/avatar train "$out/actor" --out "$out/run-$device" --device "$device" --iterations 300
   part "eval-$device" .venv/bin/avatar eval "$out/run-$device" --device "$device"
+  part "refine-$device" .venv/bin/avatar refine "$out/run-$device" --out "$out/refined-$device" --device "$device"
+  part "bench-render-$device" .venv/bin/avatar bench render "$out/run-$device" --out "$out/bench-$device" --device "$device"
+  part "bench-train-$device" .venv/bin/avatar bench train "$out/actor" --out "$out/bench-$device" --device "$device"
 done
+# Two jobs; where there are several GPUs, each on one of its own (OUT/sweep/jobs/*/log.txt).
+printf 'subjects: [actor]\nseeds: [0, 1]\noverrides: [trainer.iterations=100]\nprotocols: [strict]\n' >"$out/sweep.yaml"
+part sweep .venv/bin/avatar sweep "$out/sweep.yaml" --out "$out/sweep"
 if [ ${#failed[@]} -gt 0 ]; then
   echo "failed: ${failed[*]}; see $out/NAME.log"
   exit 1

@@ -188,10 +188,10 @@ MUTATIONS = [
         first="reference[17x33",
     ),
     Mutation(
-        "project_backward",
+        "harmonics",
         "a colour below 0 has a gradient",
-        "tl.where(red > 0.0, m_red, 0.0)",
-        "m_red",
+        "tl.where(value > 0.0, upstream, 0.0)",
+        "upstream",
         first="reference[17x33",
     ),
     Mutation(

@@ -80,7 +80,7 @@ def check_repeats(scene: Scene, repeats: int) -> str:
 def check_no_waiting(rehearsal: Rehearsal, device: torch.device) -> str:
     """Steps and frames with torch told to raise where the host waits for the GPU; the first ones may wait."""
     renderer = Renderer(rehearsal.avatar, rehearsal.background)
-    for mode in ("default", "error"):
+    for mode in ("default", "error") if device.type == "cuda" else ("default",):
         if device.type == "cuda":
             torch.cuda.set_sync_debug_mode(mode)
         try:
@@ -124,7 +124,7 @@ def tune(scene: Scene, repeats: int, quick: bool) -> list[tuple[gpu_draw.Tuning,
             gpu_draw.TUNING = tuning
             CAPACITIES.forget()  # other tiles, other numbers of pairs
             times = paired_medians(
-                {"forward": scene.forward, "backward": scene.backward}, repeats, warm_up=min(3, repeats)
+                {"forward": scene.forward, "backward": scene.backward}, repeats, warm_up=min(3, repeats - 1)
             )
             rows.append((tuning, times["forward"], times["backward"]))
     finally:
@@ -152,7 +152,7 @@ def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: 
         "a training step, first half": settled(lambda: rehearsal.train(STAND_IN, late=False)),
         "a training step with D-SSIM": settled(lambda: rehearsal.train(STAND_IN, late=True)),
     }
-    return paired_medians(functions, repeats, warm_up=min(3, repeats))
+    return paired_medians(functions, repeats, warm_up=min(3, repeats - 1))
 
 
 def report(

@@ -12,6 +12,7 @@ class Part(NamedTuple):
 
     module: str
     inputs: str = ""  # what stands after the part's name: nothing, FOLDER, RUN or RUN...
+    on_gpu: bool = False  # whether it measures a GPU too
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,15 @@ class Request:
     head: Path | None = None
     tracking: Path | None = None
     frame_offset: int | None = None
+    device: str = "cpu"  # or a GPU that has passed its test, as torch calls it; for parts that measure one
 
 
 PARTS = {
-    "splat": Part("avatar.bench.splat_report"),
+    "splat": Part("avatar.bench.splat_report", on_gpu=True),
     "hyper": Part("avatar.bench.hyper_report"),
-    "render": Part("avatar.bench.render", "RUN"),
+    "render": Part("avatar.bench.render", "RUN", on_gpu=True),
     "transfer": Part("avatar.bench.transfer"),
-    "train": Part("avatar.bench.train_report", "FOLDER"),
+    "train": Part("avatar.bench.train_report", "FOLDER", on_gpu=True),
     "quality": Part("avatar.bench.quality_report", "RUN..."),
     "stability": Part("avatar.bench.stability"),
     "refine": Part("avatar.bench.refine", "FOLDER"),

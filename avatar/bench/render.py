@@ -21,7 +21,9 @@ from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import limited_to
 from avatar.bench.render_plot import write_plot
 from avatar.bench.results import leave
+from avatar.bench.splat_gpu import settle
 from avatar.commands.opening import open_trained
+from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
 from avatar.render import Renderer
 from avatar.runs.trained import TrainedAvatar
@@ -58,6 +60,7 @@ class Row:
 
 def run(request: Request) -> None:
     trained = open_trained(request.inputs[0], request.head)
+    trained.avatar.to(torch.device(request.device))
     rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
     content = {"avatar": describe(trained), "rows": [asdict(row) for row in rows]}
     leave(request.out, "bench_render", table(rows, describe(trained)), content, lambda path: write_plot(rows, path))
@@ -77,25 +80,27 @@ def describe(trained: TrainedAvatar) -> dict[str, Any]:
 
 
 def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> list[Row]:
-    """Compare, then time. Raises UserError when the renderer draws another picture: its time would say nothing; and for an
-    avatar without a network, whose steps are others."""
+    """Compare, then time, where the avatar is. Raises UserError when the renderer draws another picture: its time would
+    say nothing; and for an avatar without a network, whose steps are others. On a GPU the steps are one launch or two, and
+    not timed apart."""
     if trained.avatar.deformation is None:
         raise UserError(
             f"the steps of a frame of model={trained.config.model.name} are not timed; choose another avatar"
         )
     renderer = Renderer(trained.avatar, torch.tensor(trained.config.data.background))
+    device, is_gpu = renderer.background.device, on_gpu(renderer.background)
     rows = []
     for size in sizes:
         frames = inputs(trained, size, count=repeats)
         error = compare(trained, renderer, frames[:5])
         with torch.no_grad():
             with limited_to(threads=1):
-                alone = {name: next_of(calls) for name, calls in steps(renderer, frames).items()}
-                alone["frame"] = next_of([partial(renderer.render, *frame) for frame in frames])
+                alone = {} if is_gpu else {name: next_of(calls) for name, calls in steps(renderer, frames).items()}
+                alone["frame"] = next_of([partial(settled, device, renderer.render, *frame) for frame in frames])
                 times = paired_medians(alone, repeats, warm_up=3)
             together = {
-                "renderer": next_of([partial(renderer.render, *frame) for frame in frames]),
-                "avatar": next_of([partial(draw_unfolded, trained, *frame) for frame in frames]),
+                "renderer": next_of([partial(settled, device, renderer.render, *frame) for frame in frames]),
+                "avatar": next_of([partial(settled, device, draw_unfolded, trained, *frame) for frame in frames]),
             }
             latency = paired_medians(together, repeats, warm_up=3)
         rates = [stream_rate(renderer, frames) for _ in range(3)]
@@ -103,7 +108,7 @@ def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> li
             Row(
                 size,
                 error,
-                {name: times[name] for name in STEPS},
+                {name: times[name] for name in STEPS if name in times},
                 times["frame"],
                 latency["renderer"],
                 latency["avatar"],
@@ -155,7 +160,14 @@ def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callabl
 
 
 def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
-    return splat(trained.avatar(params), camera, torch.tensor(trained.config.data.background))
+    background = brought(torch.tensor(trained.config.data.background), trained.avatar.code.device)
+    return splat(trained.avatar(params), camera, background)
+
+
+def settled(device: torch.device, function: Callable[..., object], *arguments: object) -> None:
+    """Call it, and wait until a GPU is done with it."""
+    function(*arguments)
+    settle(device)
 
 
 def next_of(calls: Sequence[Callable[[], object]]) -> Callable[[], object]:
@@ -176,7 +188,7 @@ def table(rows: Sequence[Row], avatar: dict[str, Any]) -> list[str]:
     threads = torch.get_num_threads()
     grid = f", latents on {avatar['latent_grid']}x{avatar['latent_grid']} cells" if avatar["latent_grid"] else ""
     lines: dict[str, list[str]] = {"image width": [f"{row.size} px" for row in rows]}
-    lines |= {f"{step}, 1 thread": [show(row.steps[step]) for row in rows] for step in STEPS}
+    lines |= {f"{step}, 1 thread": [show(row.steps[step]) for row in rows] for step in rows[0].steps}
     lines |= {
         "whole frame, 1 thread": [show(row.frame) for row in rows],
         f"whole frame, {threads} threads": [show(row.latency) for row in rows],

@@ -22,7 +22,8 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
         steps.barh(names, spans, left=done, label=step)
         done = [a + b for a, b in zip(done, spans, strict=True)]
     steps.set_xlabel("milliseconds of one frame with one thread")
-    steps.legend(fontsize=8, ncols=6, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    if rows[0].steps:
+        steps.legend(fontsize=8, ncols=6, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     bars = rates.barh(names, [row.stream_fps for row in rows], color="0.4")
     rates.bar_label(bars, fmt="%.0f", padding=3, fontsize=8)
     rates.margins(x=0.2)

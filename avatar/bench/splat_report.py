@@ -13,7 +13,7 @@ from avatar.bench.machine import available_simd
 from avatar.bench.results import leave
 from avatar.bench.scenes import HEAD_SPLATS
 from avatar.bench.splat import Row, all_variants, measure
-from avatar.bench.splat_gpu import gpu_backends
+from avatar.bench.splat_gpu import ON_GPU, gpu_backends
 from avatar.bench.splat_plot import total, write_plot
 from avatar.bench.splat_work import Work, floors, work_of
 
@@ -25,15 +25,18 @@ OTHER_SPLATTERS = ("gsplat", "diff_gaussian_rasterization", "diff_surfel_rasteri
 
 
 def run(request: Request) -> None:
-    """Measure, print and write; `quick` takes scenes too small to say anything."""
+    """Measure, print and write; `quick` takes scenes too small to say anything. A GPU is measured beside the CPU."""
+    is_left_out = ON_GPU if request.device == "cpu" else ()
     if request.quick:
         variants = all_variants(
             QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE, plain_sizes=QUICK_SIZES, all_threads=True
         )
-        rows = measure(variants, repeats=3, validation_size=QUICK_SIZE)
+        repeats, validation_size = 3, QUICK_SIZE
     else:
         sizes, counts = (FULL_SIZES, FULL_COUNTS) if request.full else (USUAL_SIZES, USUAL_COUNTS)
-        rows = measure(all_variants(sizes, counts, all_threads=request.full), repeats=21, validation_size=512)
+        variants, repeats, validation_size = all_variants(sizes, counts, all_threads=request.full), 21, 512
+    variants = [variant for variant in variants if variant.backend not in is_left_out]
+    rows = measure(variants, repeats=repeats, validation_size=validation_size)
     works = [
         work_of(*scene, with_memory=not request.quick)
         for scene in dict.fromkeys((row.variant.count, row.variant.size) for row in rows)

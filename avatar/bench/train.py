@@ -12,16 +12,20 @@ import torch
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians, time_of
 from avatar.bench.floor import floor_ms
+from avatar.bench.splat_gpu import settle
 from avatar.bench.stages import StagedStep, network_of
 from avatar.commands.opening import split_sizes
+from avatar.compute.device import on_gpu
 from avatar.config import Config, load_config
 from avatar.data.loader import FrameLoader
+from avatar.data.shelf import Shelf, shelf_bytes
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
+from avatar.train.ahead import Guard
 from avatar.train.optim import make_optimizer
 from avatar.train.posed import PosedMeshes
-from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.train.step import Judge, Objective, choose_perceptual, training_step
 from avatar.types import Frame
 from data_prep.open import find_head, open_subject
 
@@ -33,7 +37,8 @@ QUICK = ("model.uv_size=20", "data.size=48", "model.mlp_width=16")
 
 @dataclass(frozen=True)
 class Row:
-    """One preset. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged."""
+    """One preset. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged. Stages and their
+    floors are the CPU's: a GPU's step is not cut."""
 
     preset: str
     gaussians: int
@@ -55,10 +60,12 @@ class Trainee:
     objective: Objective
     frames: Iterator[Frame]
     meshes: PosedMeshes
+    judge: Judge | None  # None: every step is checked at once
 
     def step(self, number: int) -> None:
         frame = next(self.frames)
-        training_step(self.avatar, self.optimizer, self.objective, number, frame, self.meshes.vertices(frame))
+        vertices = self.meshes.vertices(frame)
+        training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
 
 
 def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:
@@ -73,6 +80,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
         avatar = Avatar(assets, subject.identity, config.model)
         with torch.no_grad():  # opacities as after training: what is drawn decides what drawing costs
             avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
+        avatar.to(torch.device(request.device))
         trainees[preset] = trainee(avatar, subject, config, say if preset == PRESETS[0] else silent)
     steps: dict[tuple[str, bool], Callable[[], object]] = {}
     for preset, learner in trainees.items():
@@ -87,8 +95,8 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
             sum(p.numel() for p in learner.avatar.parameters()),
             times[preset, False],
             per_step(times[preset, True], steps_at_once(learner)),
-            stages(learner, subject, repeats),
-            floors(learner.avatar),
+            {} if on_gpu(learner.avatar.code) else stages(learner, subject, repeats),
+            {} if on_gpu(learner.avatar.code) else floors(learner.avatar),
         )
         for preset, learner in trainees.items()
     ]
@@ -97,20 +105,24 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
 def trainee(
     avatar: Avatar, subject: Subject, config: Config, say: Callable[[str], None], perceptual: str | None = None
 ) -> Trainee:
-    """The avatar with a few decoded frames that are spread over the training split.
+    """The avatar with a few decoded frames that are spread over the training split, all where the avatar is.
 
     `perceptual` is the recorded term of a run, which its steps are timed with; None chooses as a new run would.
     """
     train = subject.split.train
     chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
-    with FrameLoader(subject, config.data.size) as loader:
+    device, is_gpu = avatar.code.device, on_gpu(avatar.code)
+    shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
+    with FrameLoader(subject, config.data.size, shelf=shelf) as loader:
         frames = list(loader.frames(chosen))
-    meshes = PosedMeshes(avatar.head)
+    meshes = PosedMeshes(avatar if is_gpu else avatar.head)
     for frame in frames:
         meshes.vertices(frame)
-    term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size))
-    objective = Objective(config.trainer, torch.tensor(config.data.background), term)
-    return Trainee(config, avatar, make_optimizer(avatar, config.trainer), objective, cycle(frames), meshes)
+    term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
+    objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
+    optimizer = make_optimizer(avatar, config.trainer)
+    judge = Guard(optimizer, device).judge if is_gpu else None
+    return Trainee(config, avatar, optimizer, objective, cycle(frames), meshes, judge)
 
 
 def silent(_: str) -> None:
@@ -131,6 +143,7 @@ def run_steps(learner: Trainee, late: bool) -> None:
             learner.step(number)
     else:
         learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1)
+    settle(learner.avatar.code.device)
 
 
 def per_step(time: Time, steps: int) -> Time:

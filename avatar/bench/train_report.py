@@ -38,6 +38,8 @@ def table(rows: Sequence[Row]) -> list[str]:
             f"{faster[row.preset]:6.1f}x"
         )
     names = stage_names(rows)
+    if not names:
+        return lines
     heading = "stage: forward / backward (floor)"
     lines += ["", f"{heading:>40} {''.join(f'{row.preset:>24}' for row in rows)}"]
     for name in names:
@@ -74,6 +76,8 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
             width = sum(row.stages[key].median for key in (name, f"{name}, backward") if key in row.stages)
             axes.barh(row.preset, width, left=left[row.preset], color=f"C{index % 10}", label=name)
             left[row.preset] += width
+    if not stage_names(rows):
+        axes.barh([row.preset for row in rows], [row.late.median for row in rows], label="second half")
     handles, labels = axes.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     axes.legend(unique.values(), unique.keys(), fontsize=8, ncols=2)

@@ -6,14 +6,20 @@ from argparse import Namespace
 from importlib import import_module
 from pathlib import Path
 
+import torch
+
 from avatar.bench import PARTS, Request
 from avatar.commands import OK
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.compute.choose import choose_device
+from avatar.compute.device import CPU
+from avatar.config_values import check_device
 from avatar.errors import UserError
 
 
 def run_bench(arguments: Namespace) -> int:
     out: Path = arguments.out
+    device = bench_device(arguments.part, arguments.device)
     check_folder_output(out)
     check_outputs([out], [*arguments.inputs, arguments.head, arguments.tracking])
     try:
@@ -29,7 +35,22 @@ def run_bench(arguments: Namespace) -> int:
         arguments.head,
         arguments.tracking,
         arguments.frame_offset,
+        str(device),
     )
     # Only the part that is asked for is imported.
     import_module(PARTS[arguments.part].module).run(request)
     return OK
+
+
+def bench_device(part: str, name: str | None) -> torch.device:
+    """Where a part is measured. Raises UserError for a GPU that is asked for where only the CPU is measured."""
+    if PARTS[part].on_gpu:
+        return choose_device(name or "auto", print)
+    check_device(name or "auto")
+    if name not in (None, "auto", "cpu"):
+        measured = ", ".join(each for each in PARTS if PARTS[each].on_gpu)
+        raise UserError(
+            f"bench {part} measures the CPU only; on a GPU {measured} are measured, and the parts of a step by "
+            "scripts/measure_gpu.py"
+        )
+    return CPU

@@ -118,6 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_run(refine)
     add_folder(refine)
     refine.add_argument("--out", type=Path, metavar="SUBJECT", help="a new tracked folder (default: RUN/refined/NAME)")
+    add_device(refine)
 
     report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
     add_run(report)
@@ -206,6 +207,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_tracking(bench)
     add_head(bench)
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
+    add_device(bench)
     extent = bench.add_mutually_exclusive_group()
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
     extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")
@@ -256,6 +258,7 @@ def add_export(export: argparse.ArgumentParser) -> None:
 def add_view(view: argparse.ArgumentParser) -> None:
     add_avatar(view)
     add_folder(view)
+    add_device(view)
     view.add_argument("--drive", type=Path, action="append", default=[], metavar="FILE", help="a motion to play, too")
     view.add_argument("--size", type=int, metavar="N", help="width of the picture in pixels (default: as in training)")
     view.add_argument(

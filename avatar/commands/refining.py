@@ -12,6 +12,7 @@ import torch
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import open_run
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.compute.choose import choose_device
 from avatar.data.refinement import Refinement, Round
 from avatar.refine.record import frames_csv, sheet, summary
 from avatar.refine.refine import fingerprint, refine_subject
@@ -26,15 +27,16 @@ def run_refine(arguments: Namespace) -> int:
     target: Path = arguments.out or arguments.run / REFINED_FOLDER / run.subject.name
     check_folder_output(target)
     check_outputs([target], [Path(run.subject.manifest.source)])
-    status = refine_run(run, target)
+    status = refine_run(run, target, arguments.device or "auto")
     if status == OK:
         print(f"Next         avatar train {target} --out ANOTHER_RUN")
     return status
 
 
-def refine_run(run: Run, target: Path) -> int:
-    """Write the run's subject with refined tracking to `target`."""
+def refine_run(run: Run, target: Path, device: str | None = None) -> int:
+    """Write the run's subject with refined tracking to `target`; `device` stands in for the configuration's."""
     check_target(target)
+    run.avatar.to(choose_device(device or run.config.device, print))
     subject, config = run.subject, run.config
     background = torch.tensor(config.data.background)
     print(

@@ -35,7 +35,7 @@ def run_sweep(arguments: Namespace) -> int:
     if arguments.retry_failed:
         reopen_failed(folder, spec)
     options = EngineOptions(arguments.workers, arguments.address, arguments.partition)
-    engine = make_engine(arguments.engine, spec.resources, folder, options)
+    engine = make_engine(arguments.engine, spec, folder, options)
     print(f"{len(spec.jobs)} jobs on {engine.name}; their files are in {folder / 'jobs'}")
     try:
         with closing(engine):

@@ -16,6 +16,7 @@ from torch import Tensor
 from avatar.commands import OK
 from avatar.commands.driving import head_of
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_run, open_trained
+from avatar.compute.choose import choose_device
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.motion.drive_file import read_drive
@@ -48,6 +49,7 @@ def run_view(arguments: Namespace) -> int:
     if arguments.host not in LOCAL:
         token = token or secrets.token_urlsafe(16)
     motions = clips(trained, arguments.drive)
+    trained.avatar.to(choose_device(arguments.device or "auto", print))
     stage = Stage(trained, None if run is None else truth_of(run))
     live = open_live(arguments, trained)
     try:

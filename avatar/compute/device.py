@@ -25,6 +25,13 @@ def on_gpu(tensor: Tensor) -> bool:
     return kind in ("cuda", "meta") or (kind == "cpu" and interpreted())
 
 
+def visible_gpus() -> list[str]:
+    """The GPUs that torch sees, as CUDA_VISIBLE_DEVICES names them for another process."""
+    count, named = torch.cuda.device_count(), os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = map(str, range(count)) if named is None else (name.strip() for name in named.split(","))
+    return [name for name in names if name][:count]
+
+
 def brought(tensor: Tensor, device: torch.device) -> Tensor:
     """The tensor on `device`; to a GPU the copy is made while the program goes on."""
     if tensor.device == device:

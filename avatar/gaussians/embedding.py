@@ -40,7 +40,9 @@ class Embedding:
         """Bring it to where the vertices are to be. The texels stay: they are for people."""
         if self.corners.device != device:
             self.corners, self.barycentric = self.corners.to(device), self.barycentric.to(device)
-            self._flat_corners, self._touching = self.corners.reshape(-1), None
+            self._flat_corners = self.corners.reshape(-1)
+            if self._touching is not None:
+                self._touching = Touching(*(part.to(device) for part in self._touching))
 
 
 def knn_scales(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, " N"]:

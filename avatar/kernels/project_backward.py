@@ -21,7 +21,7 @@ from avatar.kernels.geometry import (
     unit_quaternion,
     view_direction,
 )
-from avatar.kernels.harmonics import colour, colour_backward
+from avatar.kernels.harmonics import colour_backward
 from avatar.kernels.rows import load3, store3, store4
 
 HALF_LOG2E = tl.constexpr(0.72134752044448170368)
@@ -92,13 +92,9 @@ def colour_of_backward(
     shown = here & ((m_red != 0.0) | (m_green != 0.0) | (m_blue != 0.0))
     mean_x, mean_y, mean_z = load3(means, i, shown)
     d_x, d_y, d_z, inv_distance = view_direction(view, mean_x, mean_y, mean_z)
-    coefficients = sh + 3 * STORED * i
-    red, green, blue = colour(coefficients, d_x, d_y, d_z, degree, STORED, shown)
-    by_red = tl.where(red > 0.0, m_red, 0.0).to(tl.float32)
-    by_green = tl.where(green > 0.0, m_green, 0.0).to(tl.float32)
-    by_blue = tl.where(blue > 0.0, m_blue, 0.0).to(tl.float32)
+    at = 3 * STORED * i
     by_dx, by_dy, by_dz = colour_backward(
-        coefficients, grad_sh + 3 * STORED * i, d_x, d_y, d_z, by_red, by_green, by_blue, degree, STORED, here
+        sh + at, grad_sh + at, d_x, d_y, d_z, m_red, m_green, m_blue, degree, STORED, shown, here
     )
     by_dx, by_dy, by_dz = by_dx.to(tl.float64), by_dy.to(tl.float64), by_dz.to(tl.float64)
     along = by_dx * d_x + by_dy * d_y + by_dz * d_z

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from avatar.compute.device import on_gpu
 from avatar.refine.freedom import Freedom
 from avatar.refine.likeness import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, Likeness, Target
 from avatar.refine.motion import HeadPose
@@ -42,7 +43,7 @@ class Problem:
 def curvature(likeness: Likeness, problem: Problem, level: int) -> Float[Tensor, "F F"]:
     """J^T J of the misfit in the frame's moves at the given tracking, each pixel weighted as the Huber loss weights it."""
     target, freedom = problem.targets[level], problem.freedom
-    moves = torch.zeros(len(freedom.index))
+    moves = torch.zeros(len(freedom.index), device=freedom.unit.device)
 
     def picture(moves: Tensor) -> Tensor:
         return likeness.picture(freedom.values(problem.frame, moves), problem.given, target)
@@ -72,7 +73,8 @@ def descend(
     factors   lower Cholesky factors of the curvature with the prior's, by level
     steps     of each level at most; the coarsest, which is the last, comes first
     """
-    found = Descent(torch.zeros(len(problem.freedom.index)), problem.targets[0].picture)
+    still = torch.zeros(len(problem.freedom.index), device=problem.freedom.unit.device)
+    found = Descent(still, problem.targets[0].picture)
     for level in reversed(range(len(problem.targets))):
         found = _descend_level(likeness, problem, level, found.moves, factors[level], steps[level])
     return found
@@ -84,42 +86,79 @@ def _descend_level(
     low, high = problem.freedom.bounds(problem.frame)
     target, unit, index = problem.targets[level], problem.freedom.unit, problem.freedom.index
 
-    def evaluate(moves: Tensor) -> tuple[float, Tensor, Tensor]:
+    def evaluate(moves: Tensor) -> _Point:
         fit = likeness.fit(problem.freedom.values(problem.frame, moves), problem.given, target)
-        return fit.misfit + 0.5 * float(moves @ moves), fit.gradient[index] * unit + moves, fit.picture
+        value = fit.misfit.double() + 0.5 * (moves @ moves).double()
+        return _Point(moves, value, fit.gradient[index] * unit + moves, fit.picture)
 
-    memory: deque[tuple[Tensor, Tensor]] = deque(maxlen=MEMORY)
-    value, gradient, picture = evaluate(moves)
-    length = 1.0
+    decide = _Decisions(on_gpu(moves))
+    memory: deque[_Curved] = deque(maxlen=MEMORY)
+    best = evaluate(moves)
+    length, ended = best.value.new_ones(()), torch.zeros_like(best.value, dtype=torch.bool)
     for _ in range(steps):
-        trial = torch.minimum(torch.maximum(moves - length * _quasi_newton(gradient, memory, factor), low), high)
-        new_value, new_gradient, new_picture = evaluate(trial)
-        step, change = trial - moves, new_gradient - gradient
-        if float(step @ change) > 1e-8 * float(step @ step):
-            memory.append((step, change))
-        if not new_value < value:
-            length *= SHRINK
-            continue
-        gain = value - new_value
-        moves, value, gradient, picture, length = trial, new_value, new_gradient, new_picture, 1.0
-        if gain < (COARSE_ENOUGH if level else ENOUGH) * new_value:
+        direction = _quasi_newton(best.gradient, memory, factor)
+        trial = evaluate(torch.minimum(torch.maximum(best.moves - length.to(direction) * direction, low), high))
+        step, change = trial.moves - best.moves, trial.gradient - best.gradient
+        curved = (step @ change).double() > 1e-8 * (step @ step).double()
+        if decide.may(curved):
+            memory.append(_Curved(step, change, curved if decide.later else None))
+        better = (trial.value < best.value) & ~ended
+        gain = best.value - trial.value
+        length = decide.choose(better, torch.ones_like(length), length * SHRINK)
+        ended = ended | (better & (gain < (COARSE_ENOUGH if level else ENOUGH) * trial.value))
+        best = _Point(*(decide.choose(better, new, old) for new, old in zip(trial, best, strict=True)))
+        if decide.is_sure(ended):
             break
-    return Descent(moves, picture)
+    return Descent(best.moves, best.picture)
+
+
+class _Point(NamedTuple):
+    moves: Float[Tensor, " F"]
+    value: Float[Tensor, ""]  # float64
+    gradient: Float[Tensor, " F"]
+    picture: Float[Tensor, "h w 3"]
+
+
+class _Curved(NamedTuple):
+    """A step, what it changed of the gradient, and whether it counts; None: it does."""
+
+    step: Float[Tensor, " F"]
+    change: Float[Tensor, " F"]
+    counts: Bool[Tensor, ""] | None
+
+
+class _Decisions(NamedTuple):
+    """Of numbers that are at hand, or, on a GPU, by the GPU itself when it gets there: nobody waits for it."""
+
+    later: bool
+
+    def may(self, condition: Bool[Tensor, ""]) -> bool:
+        return self.later or bool(condition)
+
+    def is_sure(self, condition: Bool[Tensor, ""]) -> bool:
+        return not self.later and bool(condition)
+
+    def choose(self, condition: Bool[Tensor, ""], new: Tensor, old: Tensor) -> Tensor:
+        if self.later:
+            return torch.where(condition, new, old)
+        return new if bool(condition) else old
 
 
 def _quasi_newton(
-    gradient: Float[Tensor, " F"], memory: Sequence[tuple[Tensor, Tensor]], factor: Float[Tensor, "F F"]
+    gradient: Float[Tensor, " F"], memory: Sequence[_Curved], factor: Float[Tensor, "F F"]
 ) -> Float[Tensor, " F"]:
     """The inverse curvature times the gradient: the common curvature, scaled and corrected by the frame's own steps."""
     shares = []
-    for step, change in reversed(memory):
+    for step, change, counts in reversed(memory):
         share = (step @ gradient) / (step @ change)
-        shares.append(share)
-        gradient = gradient - share * change
+        shares.append(share if counts is None else torch.where(counts, share, 0.0))
+        gradient = gradient - shares[-1] * change
     direction = torch.cholesky_solve(gradient[:, None], factor)[:, 0]
-    if memory:
-        step, change = memory[-1]
-        direction = direction * (step @ change) / (change @ torch.cholesky_solve(change[:, None], factor)[:, 0])
-    for (step, change), share in zip(memory, reversed(shares), strict=True):
-        direction = direction + step * (share - (change @ direction) / (step @ change))
+    unscaled = direction
+    for step, change, counts in memory if memory and memory[-1].counts is not None else list(memory)[-1:]:
+        scaled = unscaled * (step @ change) / (change @ torch.cholesky_solve(change[:, None], factor)[:, 0])
+        direction = scaled if counts is None else torch.where(counts, scaled, direction)
+    for (step, change, counts), share in zip(memory, reversed(shares), strict=True):
+        share = share - (change @ direction) / (step @ change)
+        direction = direction + step * (share if counts is None else torch.where(counts, share, 0.0))
     return direction

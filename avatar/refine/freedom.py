@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -41,6 +41,9 @@ class Freedom:
     unit: Float[Tensor, " F"]  # one standard deviation of the error that is expected
     acceleration: Float[Tensor, "T F"]  # second differences of the given motion, float64, units
     calm: Float[Tensor, " F"]  # weight of a squared acceleration of one unit
+
+    def on(self, device: torch.device) -> Freedom:
+        return Freedom(*(getattr(self, field.name).to(device) for field in fields(self)))
 
     def values(self, frame: int, moves: Float[Tensor, " F"]) -> Float[Tensor, " P"]:
         """Differentiable in `moves`."""

@@ -8,6 +8,7 @@ means and rotations, exactly; colours depend on the direction from which they ar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -17,9 +18,11 @@ from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor
 from torch.nn.functional import huber_loss, normalize
 
+from avatar.compute.device import brought, on_gpu
+from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.model import Avatar
-from avatar.refine.motion import HeadPose, head_params, moved_pose
+from avatar.refine.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.splat import splat
 from avatar.splat.sh import C0, sh_colours
 from avatar.types import Camera, Frame, Gaussians
@@ -41,6 +44,11 @@ class Target(NamedTuple):
     mask: Float[Tensor, "h w"]  # of the head
     area: float  # of the head, pixels
     blur: float  # for the splatter: as much of the scene as the full size's
+
+    def on(self, device: torch.device, given: HeadPose) -> Target:
+        """There, but for the camera, which takes the given pose of the head (on the CPU)."""
+        camera = replace(self.camera, R_cam_world=given.R, t_cam_world=given.t)
+        return self._replace(camera=camera, picture=brought(self.picture, device), mask=brought(self.mask, device))
 
 
 def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Target] | None:
@@ -79,9 +87,9 @@ def _resized(image: Tensor, width: int, height: int) -> Tensor:
     return torch.from_numpy(cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA))
 
 
-def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> float:
-    """Of the head alone, dB."""
-    return float(psnr(picture.clamp(0.0, 1.0), target.picture, target.mask))
+def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
+    """Of the head alone, dB, float64."""
+    return psnr(picture.clamp(0.0, 1.0), target.picture, target.mask)
 
 
 class Measure(NamedTuple):
@@ -94,14 +102,17 @@ class Measure(NamedTuple):
 class Fit(NamedTuple):
     """Of one frame at one tracking."""
 
-    misfit: float
+    misfit: Float[Tensor, ""]
     gradient: Float[Tensor, " P"]  # of the misfit in the frame's values
     picture: Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """An avatar that is not trained any more, over a background. Any number of threads may use it."""
+    """An avatar that is not trained any more, over a background; all where the avatar is. Any number of threads may use it.
+
+    On a GPU nothing is read back: what the methods give is there, but for what `measure` gives.
+    """
 
     avatar: Avatar
     background: Float[Tensor, 3]
@@ -110,18 +121,29 @@ class Likeness:
     def picture(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, "h w 3"]:
         """The avatar in the target's box; without a gradient."""
         with torch.no_grad():
-            pose = moved_pose(values, given, self.centre)
             gaussians = self.avatar(head_params(values))
-            return self._draw(gaussians, pose, gaussians.sh, target)
+            if on_gpu(values):
+                return self._draw_moved(gaussians, values, given, target)
+            return self._draw(gaussians, moved_pose(values, given, self.centre), gaussians.sh, target)
 
     def measure(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Measure:
         """Without a gradient."""
+        return Measure(*self.figures(values, given, target).tolist())
+
+    def figures(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, 2]:
+        """What `measure` gives, where the avatar is, float64."""
         picture = self.picture(values, given, target)
-        return Measure(float(misfit(picture, target)), head_psnr(picture, target))
+        return torch.stack((misfit(picture, target).double(), head_psnr(picture, target)))
 
     def fit(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Fit:
         """How far the avatar's picture is from the target's, and how that changes with the values."""
         values = values.detach().requires_grad_()
+        if on_gpu(values):
+            gaussians = self.avatar(params := head_params(values), self._head.vertices(params))
+            picture = self._draw_moved(gaussians, values, given, target)
+            error = misfit(picture, target)
+            (gradient,) = torch.autograd.grad(error, values)
+            return Fit(error.detach(), gradient, picture.detach())
         pose = moved_pose(values, given, self.centre)
         eye = -(pose.R.T @ pose.t)  # where the camera is, in the head's space
         gaussians = self.avatar(head_params(values))
@@ -138,12 +160,37 @@ class Likeness:
         by_values, by_means, by_quats, by_eye = torch.autograd.grad(error, sources)
         by_pose = camera_gradient(drawn, camera, by_means, by_quats)
         (through_pose,) = torch.autograd.grad((*pose, eye), values, (*by_pose, by_eye))
-        return Fit(error.item(), by_values + through_pose, picture.detach())
+        return Fit(error.detach(), by_values + through_pose, picture.detach())
+
+    @cached_property
+    def _head(self) -> HeadModel:
+        return self.avatar.head.on(self.centre.device)
+
+    def _draw_moved(
+        self, gaussians: Gaussians, values: Tensor, given: HeadPose, target: Target
+    ) -> Float[Tensor, "h w 3"]:
+        """Moves the head before the target's own camera, which has the given pose: a GPU would have to hand a moved camera
+        back. Differentiable by autograd alone."""
+        pose = moved_pose(values, given, self.centre)
+        directions = normalize(gaussians.means + (pose.R.T @ pose.t), dim=-1)
+        colours = sh_colours(gaussians.sh, directions, self.avatar.config.sh_degree)
+        means = (gaussians.means @ pose.R.T + (pose.t - given.t)) @ given.R
+        quats = turned(quaternion(given.R.T @ values[TURN]), gaussians.quats)
+        moved = gaussians._replace(means=means, quats=quats, sh=((colours - 0.5) / C0)[:, None])
+        drawing = splat(moved, target.camera, self.background, region=target.box, blur=target.blur)
+        return drawing.image[target.box]
 
     def _draw(self, gaussians: Gaussians, pose: HeadPose, sh: Tensor, target: Target) -> Float[Tensor, "h w 3"]:
         camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)
         drawing = splat(gaussians._replace(sh=sh), camera, self.background, region=target.box, blur=target.blur)
         return drawing.image[target.box]
+
+
+def turned(by: Float[Tensor, 4], quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
+    """The product of a quaternion with each of others, (w, x, y, z)."""
+    w, x, y, z = by
+    product = torch.stack((w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w)).reshape(4, 4)
+    return quats @ product.T
 
 
 def misfit(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle, vector_to_skew_symmetric_matrix
 from torch import Tensor
 
+from avatar.compute.device import on_gpu
 from avatar.head.model import matrix_from_6d
 from avatar.types import HeadParams
 
@@ -44,7 +46,23 @@ class HeadPose(NamedTuple):
 def rotation(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     """Rotation vectors -> matrices; smooth everywhere, at zero too."""
     skew = vector_to_skew_symmetric_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape, 3)
-    return torch.linalg.matrix_exp(skew)
+    if not on_gpu(vectors):
+        return torch.linalg.matrix_exp(skew)
+    # torch's exponential waits for a GPU to say how many terms it takes. Rodrigues' formula:
+    angle = _angle(vectors)[..., None]
+    sine, cosine = torch.sinc(angle / math.pi), 0.5 * torch.sinc(angle / (2.0 * math.pi)).square()
+    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + sine * skew + cosine * (skew @ skew)
+
+
+def quaternion(vector: Float[Tensor, 3]) -> Float[Tensor, 4]:
+    """Rotation vector -> unit quaternion (w, x, y, z); smooth everywhere."""
+    angle = _angle(vector)
+    return torch.cat((torch.cos(0.5 * angle), 0.5 * torch.sinc(angle / (2.0 * math.pi)) * vector))
+
+
+def _angle(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 1"]:
+    """Lengths whose derivative at zero is a number: what they go into is even."""
+    return (vectors.square().sum(dim=-1, keepdim=True) + 1e-20).sqrt()
 
 
 def six_d(matrices: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 6"]:

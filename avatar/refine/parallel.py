@@ -1,4 +1,4 @@
-"""Independent work side by side: each piece by one thread, results in order."""
+"""Independent work side by side, results in order: each piece by one thread, or one after the other on a GPU."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import TypeVar
 
+from torch import Tensor
+
 from avatar.compute.native import thread_count
 from avatar.compute.workers import single_threaded_workers
-from avatar.render import AHEAD_PER_WORKER
+from avatar.render import AHEAD_ON_GPU, AHEAD_PER_WORKER
+from avatar.splat.capacity import CAPACITIES
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -34,3 +37,27 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Itera
         finally:
             for future in pending:
                 future.cancel()
+
+
+def read_later(begin: Callable[[Item], Tensor | None], items: Iterable[Item]) -> Iterator[Tensor | None]:
+    """begin(item) for every item, brought to the CPU a few items later: a GPU has work while somebody waits for it.
+
+    What comes back with a NaN was drawn into buffers that were too small; it is begun again with room.
+    """
+    pending: deque[tuple[Item, Tensor | None]] = deque()
+
+    def arrived() -> Tensor | None:
+        item, begun = pending.popleft()
+        found = None if begun is None else begun.cpu()
+        if found is not None and bool(found.isnan().any()):
+            CAPACITIES.forget()
+            again = begin(item)
+            found = None if again is None else again.cpu()
+        return found
+
+    for item in items:
+        pending.append((item, begin(item)))
+        if len(pending) > AHEAD_ON_GPU:
+            yield arrived()
+    while pending:
+        yield arrived()

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from avatar.files.video import error_map, side_by_side
 from avatar.model import Avatar
 from avatar.refine.refine import Refined
 from avatar.render import Renderer
+from avatar.splat.capacity import with_room
 
 COLUMNS = ("frame", "name", "part", "psnr_before", "psnr_after", "turn_degrees", "shift_mm")
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
@@ -76,7 +78,7 @@ def sheet(
         truth = frame.composite(background)
         weight = frame.head_mask[..., None]
         renders = [
-            renderer.render(recording.params(index), recording.camera(index, size)).image
+            with_room(partial(renderer.render, recording.params(index), recording.camera(index, size))).image.cpu()
             for recording in (subject.recording, after)
         ]
         errors = [error_map(render * weight, truth * weight, ERROR_SCALE) for render in renders]

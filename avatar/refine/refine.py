@@ -7,6 +7,7 @@ interruption loses a few seconds. What is found does not depend on the number of
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -22,16 +23,17 @@ from safetensors.torch import save as serialize
 from torch import Tensor
 from tqdm import tqdm
 
+from avatar.compute.device import brought, on_gpu
 from avatar.compute.native import thread_count
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
-from avatar.refine.descent import Problem, curvature, descend
+from avatar.refine.descent import Descent, Problem, curvature, descend
 from avatar.refine.freedom import Freedom, find_freedom
 from avatar.refine.likeness import Likeness, Measure, Target, head_psnr, targets
 from avatar.refine.motion import HeadPose, moved_tracks
-from avatar.refine.parallel import in_order
+from avatar.refine.parallel import in_order, read_later
 from avatar.refine.smoothing import smoothed
 from avatar.train.interruption import interruption
 
@@ -79,10 +81,11 @@ def refine_subject(
         moves, figures = _read_progress(progress, key, len(work.freedom.index))
         if len(moves):
             say(f"going on after {len(moves)} of {len(subject)} frames ({progress})")
-        factors = [torch.linalg.cholesky(matrix) for matrix in work.curvatures()]
+        matrices = work.curvatures()
+        factors = work.factors(matrices)
         todo = range(len(moves), len(subject))
         with tqdm(total=len(subject), initial=len(moves), desc="refine", unit="frame", dynamic_ncols=True) as bar:
-            for found in in_order(lambda frame: work.refine(frame, factors), todo):
+            for found in work.refined(todo, factors):
                 moves.append(found.moves)
                 figures.append((*found.before, found.psnr))
                 bar.update(1)
@@ -91,7 +94,8 @@ def refine_subject(
                     _write_progress(progress, key, moves, figures)
                 if interrupted():
                     return None
-        result = work.finish(torch.stack(moves), factors[0] @ factors[0].T, np.array(figures)[:, :2])
+        first = torch.linalg.cholesky(matrices[0])
+        result = work.finish(torch.stack(moves), first @ first.T, np.array(figures)[:, :2])
     with suppress(OSError):
         progress.unlink()
     return result
@@ -107,10 +111,10 @@ def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, backgr
         work = _Work(avatar, subject, size, background)
         frames = work.samples(max(TIMED_FRAMES, workers))
         begin = time.perf_counter()
-        factors = [torch.linalg.cholesky(matrix) for matrix in work.curvatures(workers)]
+        factors = work.factors(work.curvatures(workers))
         middle = time.perf_counter()
-        list(in_order(lambda frame: work.refine(frame, factors), frames))
-        list(in_order(lambda frame: work.measure(frame, work.freedom.given[frame]), frames))
+        list(work.refined(frames, factors))
+        list(work.measured(frames, work.freedom.given))
         end = time.perf_counter()
     return (middle - begin) * SAMPLES / workers + (end - middle) * len(subject) / len(frames)
 
@@ -139,25 +143,36 @@ class _Work:
     """An avatar and a subject, with what refining any of its frames needs."""
 
     def __init__(self, avatar: Avatar, subject: Subject, size: int | None, background: Tensor) -> None:
-        self.subject, self.size = subject, size
-        centre = avatar.head.neutral_vertices().mean(dim=0)
-        self.likeness = Likeness(avatar, background, centre)
+        self.subject, self.size, self.background = subject, size, background
+        self.centre = avatar.head.neutral_vertices().mean(dim=0)
+        self.device, self.waits = avatar.code.device, not on_gpu(avatar.code)
+        self.likeness = Likeness(avatar, brought(background, self.device), brought(self.centre, self.device))
         self.tracks = subject.recording.tracks
-        self.freedom: Freedom = find_freedom(self.tracks, subject.split.train, centre)
+        self.freedom: Freedom = find_freedom(self.tracks, subject.split.train, self.centre)
+        self.there = self.freedom if self.waits else self.freedom.on(self.device)
         width = subject.image_size(size)[0]
         self.levels = 1 + sum(width >> level >= COARSEST for level in range(1, 16))
 
     def key(self) -> str:
         """Changes with everything that the result depends on."""
-        avatar, background = fingerprint(self.likeness.avatar), self.likeness.background.tolist()
+        avatar, background = fingerprint(self.likeness.avatar), self.background.tolist()
         choices = (PROGRESS_FORMAT, avatar, self.subject.data_hash, self.size, background)
         return hashlib.sha256(repr(choices).encode()).hexdigest()
 
     def pose(self, frame: int) -> HeadPose:
+        return HeadPose(*(brought(part, self.device) for part in self.given(frame)))
+
+    def given(self, frame: int) -> HeadPose:
+        """On the CPU, where cameras are."""
         return HeadPose(self.tracks["R"][frame], self.tracks["t"][frame])
 
     def targets(self, frame: int, levels: int) -> list[Target] | None:
-        return targets(self.subject.frame(frame, self.size), self.likeness.background, levels)
+        made = targets(self.subject.frame(frame, self.size), self.background, levels)
+        return made if made is None else [target.on(self.device, self.given(frame)) for target in made]
+
+    def factors(self, matrices: Sequence[Float[Tensor, "F F"]]) -> list[Float[Tensor, "F F"]]:
+        """Lower Cholesky factors, where the avatar is."""
+        return [brought(torch.linalg.cholesky(matrix), self.device) for matrix in matrices]
 
     def samples(self, count: int) -> list[int]:
         """Training frames, evenly spread; fewer where there are fewer."""
@@ -166,7 +181,9 @@ class _Work:
 
     def curvatures(self, count: int = SAMPLES) -> list[Float[Tensor, "F F"]]:
         """By level: the mean over a few training frames, with the prior's, which is one."""
-        sampled = [found for found in in_order(self._curvatures, self.samples(count)) if found is not None]
+        frames = self.samples(count)
+        made = in_order(self._curvatures, frames) if self.waits else read_later(self._stacked_curvatures, frames)
+        sampled = [found for found in made if found is not None]
         if not sampled:
             raise UserError(
                 f"no head is to be seen in the training frames of {self.subject.recording.name}: look at its masks"
@@ -178,33 +195,78 @@ class _Work:
         made = self.targets(frame, self.levels)
         if made is None:
             return None
-        problem = Problem(self.pose(frame), made, frame, self.freedom)
+        problem = Problem(self.pose(frame), made, frame, self.there)
         return [curvature(self.likeness, problem, level) for level in range(self.levels)]
+
+    def _stacked_curvatures(self, frame: int) -> Float[Tensor, "levels F F"] | None:
+        made = self._curvatures(frame)
+        return made if made is None else torch.stack(made)
+
+    def refined(self, frames: Sequence[int], factors: Sequence[Float[Tensor, "F F"]]) -> Iterator[_Found]:
+        """In order. Raises UserError for a frame that cannot be read, or drawn."""
+        if self.waits:
+            yield from in_order(lambda frame: self.refine(frame, factors), frames)
+            return
+        unseen = _Found(torch.zeros(len(self.freedom.index)), UNSEEN, UNSEEN.psnr)
+        for frame, found in zip(frames, read_later(lambda frame: self.begin(frame, factors), frames), strict=True):
+            if found is None:
+                yield unseen
+                continue
+            *before, psnr = found[-3:].tolist()
+            if math.isnan(psnr):
+                raise UserError(f"frame {frame} cannot be drawn: the avatar's training has gone wrong, train it again")
+            yield _Found(found[:-3].float(), Measure(*before), psnr)
+
+    def begin(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> Float[Tensor, " F+3"] | None:
+        """What `refine` gives as one vector where the avatar is, float64: moves, misfit and PSNR before, PSNR after."""
+        made = self.targets(frame, self.levels)
+        if made is None:
+            return None
+        problem = Problem(self.pose(frame), made, frame, self.there)
+        found = self.descended(problem, factors)
+        before = self.likeness.figures(self.there.given[frame], problem.given, made[0])
+        return torch.cat((found.moves.double(), before, head_psnr(found.picture, made[0])[None]))
+
+    def descended(self, problem: Problem, factors: Sequence[Float[Tensor, "F F"]]) -> Descent:
+        return descend(self.likeness, problem, factors, [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)])
 
     def refine(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> _Found:
         made = self.targets(frame, self.levels)
         if made is None:
             return _Found(torch.zeros(len(self.freedom.index)), UNSEEN, UNSEEN.psnr)
         problem = Problem(self.pose(frame), made, frame, self.freedom)
-        steps = [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)]
-        found = descend(self.likeness, problem, factors, steps)
+        found = self.descended(problem, factors)
         before = self.likeness.measure(self.freedom.given[frame], problem.given, made[0])
-        return _Found(found.moves, before, head_psnr(found.picture, made[0]))
+        return _Found(found.moves, before, float(head_psnr(found.picture, made[0])))
 
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, and keep the given tracking of frames that then fit no better than with it."""
         freedom, numbers = self.freedom, [record.tracking for record in self.subject.manifest.frames]
         moves = smoothed(moves, matrix, freedom.acceleration, freedom.calm, numbers)
         values = freedom.all_values(moves)
-        after = np.array(list(in_order(lambda frame: self.measure(frame, values[frame]), range(len(values)))))
+        after = np.array(list(self.measured(range(len(values)), values)))
         kept = ~(after[:, 0] <= before[:, 0])
         after[kept] = before[kept]
-        tracks = moved_tracks(self.tracks, values, freedom.changed(), self.likeness.centre)
+        tracks = moved_tracks(self.tracks, values, freedom.changed(), self.centre)
         keep = torch.from_numpy(kept)
         for name, given in self.tracks.items():
             if name != "shape":
                 tracks[name] = torch.where(keep.reshape(-1, *[1] * (given.ndim - 1)), given, tracks[name])
         return Refined(tracks, before[:, 1], after[:, 1], kept)
+
+    def measured(self, frames: Sequence[int], values: Float[Tensor, "T P"]) -> Iterator[Measure]:
+        """In order, each frame with its row of `values`."""
+        if self.waits:
+            yield from in_order(lambda frame: self.measure(frame, values[frame]), frames)
+            return
+        there = brought(values, self.device)
+
+        def begin(frame: int) -> Float[Tensor, 2] | None:
+            made = self.targets(frame, 1)
+            return None if made is None else self.likeness.figures(there[frame], self.pose(frame), made[0])
+
+        for found in read_later(begin, frames):
+            yield UNSEEN if found is None else Measure(*found.tolist())
 
     def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:
         made = self.targets(frame, 1)

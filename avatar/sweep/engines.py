@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 from collections.abc import Sequence
@@ -9,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from avatar.compute.device import visible_gpus
 from avatar.compute.memory import available_bytes
 from avatar.errors import UserError
 from avatar.sweep.job import last_words, start_worker, work_until_done
-from avatar.sweep.spec import Resources
+from avatar.sweep.spec import Resources, Spec
 
 ENGINES = ("local", "ray", "slurm")
 LONGEST_MINUTES = 24 * 60
@@ -48,14 +50,18 @@ class EngineOptions:
     minutes: int = LONGEST_MINUTES  # of a SLURM job; training goes on in the next one
 
 
-def make_engine(name: str, resources: Resources, folder: Path, options: EngineOptions) -> Engine:
-    """Raises UserError when the engine's package is missing or its cluster cannot be reached."""
+def make_engine(name: str, spec: Spec, folder: Path, options: EngineOptions) -> Engine:
+    """Raises UserError when the engine's package is missing, its cluster cannot be reached, or a job takes more GPUs than
+    this machine has."""
+    resources = spec.resources
     if name == "local":
-        return LocalProcesses(resources, options.workers)
+        names = visible_gpus()
+        return LocalProcesses(resources, options.workers, gpu_places(names, spec.gpus_of_a_job(bool(names))))
+    gpus = spec.gpus_of_a_job(False)
     if name == "ray":
-        return RayCluster(resources, options.address, options.workers)
+        return RayCluster(resources, gpus, options.address, options.workers)
     if name == "slurm":
-        return SlurmCluster(resources, folder / "slurm", options)
+        return SlurmCluster(resources, gpus, folder / "slurm", options)
     raise UserError(f"--engine must be one of {', '.join(ENGINES)}, not {name!r}")
 
 
@@ -66,13 +72,33 @@ def workers_that_fit(resources: Resources) -> int:
     return max(1, min(by_cores, by_memory))
 
 
+def gpu_places(names: Sequence[str], each: float) -> list[str]:
+    """What the jobs that run at a time may use of these GPUs, a text for CUDA_VISIBLE_DEVICES each, in turns.
+
+    each    GPUs of a job; a part of one: so many share it
+    None where there are none, or jobs take none. Raises UserError where one takes more than there are.
+    """
+    if not names or each == 0:
+        return []
+    if each > len(names):
+        raise UserError(f"a job takes {each:g} GPUs, and this machine has {len(names)}: lower gpus in the sweep's file")
+    if each < 1:
+        return [name for _ in range(math.floor(1 / each + 1e-9)) for name in names]
+    together = math.ceil(each)
+    return [",".join(names[i : i + together]) for i in range(0, len(names) - together + 1, together)]
+
+
 class LocalProcesses:
-    """Processes of this machine."""
+    """Processes of this machine. A job sees the GPUs of the place that it has, and no others."""
 
     name = "local"
 
-    def __init__(self, resources: Resources, workers: int | None) -> None:
+    def __init__(self, resources: Resources, workers: int | None, places: Sequence[str] = ()) -> None:
         self.workers = workers or workers_that_fit(resources)
+        if places:
+            self.workers = min(self.workers, len(places))
+        self._places = list(places)[: self.workers] or [""] * self.workers
+        self._taken: dict[Path, str] = {}
         self._threads = resources.threads
         self._waiting: list[Path] = []
         self._running: dict[Path, subprocess.Popen[bytes]] = {}
@@ -88,6 +114,7 @@ class LocalProcesses:
             return None
         _, said = process.communicate()
         del self._running[handle]
+        self._places.append(self._taken.pop(handle))
         self._start()
         return last_words(process.returncode, said)
 
@@ -104,7 +131,8 @@ class LocalProcesses:
     def _start(self) -> None:
         while self._waiting and len(self._running) < self.workers:
             folder = self._waiting.pop(0)
-            self._running[folder] = start_worker(folder, self._threads)
+            self._taken[folder] = self._places.pop(0)
+            self._running[folder] = start_worker(folder, self._threads, self._taken[folder])
 
 
 class RayCluster:
@@ -115,7 +143,7 @@ class RayCluster:
 
     name = "ray"
 
-    def __init__(self, resources: Resources, address: str | None, workers: int | None) -> None:
+    def __init__(self, resources: Resources, gpus: float, address: str | None, workers: int | None) -> None:
         ray = _import("ray", "ray")
         try:
             ray.init(address=address, num_cpus=None if address else workers, log_to_driver=False, logging_level="error")
@@ -124,8 +152,8 @@ class RayCluster:
             raise UserError(f"no Ray cluster answers {place} ({str(error).splitlines()[0]})") from None
         self._ray = ray
         needs: dict[str, Any] = {"num_cpus": resources.threads, "memory": int(resources.memory_gb * 2**30)}
-        if resources.gpus:
-            needs["num_gpus"] = resources.gpus
+        if gpus:
+            needs["num_gpus"] = gpus  # Ray shows a worker its own, and no others
         # What is tried again is decided in one place, from the job's files.
         self._work = ray.remote(max_retries=0, **needs)(work_until_done)
         self._threads = resources.threads
@@ -155,7 +183,7 @@ class SlurmCluster:
 
     name = "slurm"
 
-    def __init__(self, resources: Resources, folder: Path, options: EngineOptions) -> None:
+    def __init__(self, resources: Resources, gpus: float, folder: Path, options: EngineOptions) -> None:
         submitit = _import("submitit", "slurm")
         try:
             self._executor = submitit.AutoExecutor(folder=folder, cluster=options.address)
@@ -165,7 +193,7 @@ class SlurmCluster:
             name="avatar-sweep",
             cpus_per_task=resources.threads,
             mem_gb=resources.memory_gb,
-            gpus_per_node=round(resources.gpus),
+            gpus_per_node=math.ceil(gpus),
             timeout_min=options.minutes,
             **({"slurm_partition": options.partition} if options.partition else {}),
             **({"slurm_array_parallelism": options.workers} if options.workers else {}),

@@ -121,9 +121,14 @@ def heart(folder: Path) -> Iterator[None]:
         thread.join()
 
 
-def start_worker(folder: Path, threads: int) -> subprocess.Popen[bytes]:
-    """A process that does the job of `folder`; what it says beside its log is its last words."""
+def start_worker(folder: Path, threads: int, gpus: str | None = None) -> subprocess.Popen[bytes]:
+    """A process that does the job of `folder`; what it says beside its log is its last words.
+
+    gpus   those that it may use, as CUDA_VISIBLE_DEVICES names them; None: as this process
+    """
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "AVATAR_THREADS": str(threads)}
+    if gpus is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = gpus
     words = [sys.executable, "-m", "avatar.sweep.job", str(folder)]
     return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 

@@ -8,7 +8,7 @@ seeds: [0, 1, 2]
 protocols: [hypergaussians]                    # none: all of them
 threads: 2                                     # of a job
 memory_gb: 3
-gpus: 0
+gpus: 1                                        # of a job; 0.5 lets two share one. Default: see Spec.gpus_of_a_job
 retries: 2                                     # after a kill or a crash; a sentence is an answer, and not tried again
 """
 
@@ -18,7 +18,7 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ class Resources:
 
     threads: int = 2
     memory_gb: float = 3.0
-    gpus: float = 0.0
+    gpus: float | None = None  # None: one where a job may use it, see `gpus_of_a_job`
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,16 @@ class Spec:
     jobs: tuple[Job, ...]
     resources: Resources
     retries: int
+
+    def gpus_of_a_job(self, are_there: bool) -> float:
+        """How many GPUs a job is given: what the file says; else one where GPUs `are_there` and a job may use one.
+
+        Where nobody knows, as for a cluster's machines, only jobs that ask for a GPU by name get one.
+        """
+        if self.resources.gpus is not None:
+            return self.resources.gpus
+        wanted = {_device(job.overrides) for job in self.jobs}
+        return 1.0 if "cuda" in wanted or (are_there and "auto" in wanted) else 0.0
 
 
 def read_spec(path: Path) -> Spec:
@@ -121,7 +131,7 @@ def read_spec(path: Path) -> Spec:
     resources = Resources(
         threads=int(_number(path, raw, "threads", Resources.threads, 1, 1024)),
         memory_gb=_number(path, raw, "memory_gb", Resources.memory_gb, 0.1, 10_000),
-        gpus=_number(path, raw, "gpus", Resources.gpus, 0, 64),
+        gpus=_number(path, raw, "gpus", 0, 0, 64) if "gpus" in raw else None,
     )
     return Spec(tuple(jobs), resources, int(_number(path, raw, "retries", 2, 0, 100)))
 
@@ -183,6 +193,15 @@ def _check_overrides(path: Path, variant: str, overrides: list[str]) -> None:
         load_config(overrides)
     except UserError as error:
         raise UserError(f"{path}: variant {variant}: {error}") from None
+    if ":" in _device(overrides):
+        raise UserError(
+            f"{path}: variant {variant}: a sweep hands out the GPUs itself; say device=cuda, without a number"
+        )
+
+
+def _device(overrides: Sequence[str]) -> str:
+    """auto, cpu, cuda or cuda:N."""
+    return next((word.partition("=")[2] for word in reversed(overrides) if word.startswith("device=")), "auto")
 
 
 def _words(path: Path, key: str, value: Any) -> list[str]:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from avatar.compute.device import brought
 from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.controls import ExpressionControl, expression_controls, joint_ranges, posed
@@ -19,8 +20,9 @@ from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.report.pictures import UNCERTAINTY_GAIN
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat import splat
+from avatar.splat.capacity import with_room
 from avatar.splat.sh import C0
-from avatar.types import Camera, HeadParams
+from avatar.types import Camera, HeadParams, Rendering
 
 Overlay = Literal["none", "mesh", "uncertainty", "error"]
 OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "uncertainty", "error")
@@ -117,25 +119,30 @@ class Stage:
         own = frame[1].resized(width, max(1, round(width * frame[1].height / frame[1].width)))
         look, _ = self.within(setting.look)
         camera = orbited(own, look.yaw, look.pitch, look.zoom)
-        gaussians = self.trained.gaussians(params)
-        if setting.overlay == "uncertainty" and self._uncertainty is not None:
-            gaussians = gaussians._replace(sh=self._uncertainty)
-        picture = to_bytes(splat(gaussians, camera, self.trained.background).image)
+        picture = to_bytes(with_room(lambda: self.rendered(params, camera, setting.overlay)).image)
         if setting.overlay == "mesh":
-            _draw_mesh(picture, self.trained.renderer.vertices(params), self.trained.assets.faces, camera)
+            _draw_mesh(picture, self.trained.renderer.vertices(params).cpu(), self.trained.assets.faces, camera)
         beside = [picture]
         if self.truth is not None and recorded is not None and (setting.with_truth or setting.overlay == "error"):
             truth = self.truth(recorded, width)
             if setting.with_truth:
                 beside.append(to_bytes(truth))
             if setting.overlay == "error":  # of the recorded view, whatever the camera
-                drawn = splat(self.trained.gaussians(frame[0]), own, self.trained.background).image
+                drawn = with_room(lambda: self.rendered(frame[0], own)).image.cpu()
                 beside.append(to_bytes(error_map(drawn, truth, ERROR_SCALE)))
         return np.concatenate(beside, axis=1)
 
+    @torch.no_grad()
+    def rendered(self, params: HeadParams, camera: Camera, overlay: Overlay = "none") -> Rendering:
+        """The avatar alone, where it computes; nothing is read back."""
+        gaussians = self.trained.gaussians(params)
+        if overlay == "uncertainty" and self._uncertainty is not None:
+            gaussians = gaussians._replace(sh=self._uncertainty)
+        return splat(gaussians, camera, self.trained.renderer.background)
+
 
 def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def _uncertainty_colours(trained: TrainedAvatar) -> Float[Tensor, "N 1 3"] | None:
@@ -144,9 +151,9 @@ def _uncertainty_colours(trained: TrainedAvatar) -> Float[Tensor, "N 1 3"] | Non
         return None
     with torch.no_grad():
         values = torch.sigmoid(UNCERTAINTY_GAIN * trained.avatar.hyper.uncertainty())
-    levels = (values * 255).round().byte().numpy()[:, None]
+    levels = (values * 255).round().byte().cpu().numpy()[:, None]
     colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)[:, 0]
-    return ((torch.from_numpy(colours.copy()).float() / 255 - 0.5) / C0)[:, None]
+    return brought(((torch.from_numpy(colours.copy()).float() / 255 - 0.5) / C0)[:, None], values.device)
 
 
 def _draw_mesh(picture: np.ndarray, vertices: Float[Tensor, "V 3"], faces: Tensor, camera: Camera) -> None:

@@ -120,6 +120,16 @@ def test_a_gpu_that_is_asked_for_by_name_is_used_or_refused(
     assert newest_checkpoint(begun).step == 8 and not list((begun.parent / "new").rglob("*.safetensors"))
 
 
+@pytest.mark.parametrize(
+    "command", ["eval {}", "refine {} --out {}-refined", "view {}", "bench render {} --out {}-bench"]
+)
+def test_other_commands_too_use_or_refuse_a_gpu(command: str, begun: Path) -> None:
+    before = sorted(begun.rglob("*"))
+    output = avatar(*command.replace("{}", str(begun)).split(), "--device", "cuda:99", status=1)
+    assert "\navatar: " in f"\n{output}" and "Traceback" not in output
+    assert sorted(begun.rglob("*")) == before and not list(begun.parent.glob(f"{begun.name}-*"))
+
+
 def test_two_trainings_into_one_folder_are_one_too_many(own_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = [sys.executable, "-m", "avatar.cli", "train", str(own_folder), "--out", str(run), *OPTIONS]

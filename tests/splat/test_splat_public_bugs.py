@@ -140,7 +140,8 @@ def test_a_splat_just_beyond_the_near_plane_agrees() -> None:
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_tiny_scales_do_not_underflow_to_nan(scale: float, antialiased: bool, backend: str) -> None:
     g = random_gaussians(100)._replace(scales=scale * torch.tensor([[0.7, 1.0, 2.0]]).repeat(100, 1))
-    scene = Scene(g, camera(64, 64), options={"alpha_min": 0.0, "antialiased": antialiased})
+    size = 64 if backend == "cpu" else 32  # every splat is in every tile, and the interpreter takes seconds
+    scene = Scene(g, camera(size, size), options={"alpha_min": 0.0, "antialiased": antialiased})
     assert_agrees(scene, backend)
 
 

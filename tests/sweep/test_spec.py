@@ -35,7 +35,7 @@ def test_a_sweep_is_every_subject_with_every_variant_and_seed(tmp_path: Path) ->
     assert first.overrides == ("data.size=64", "trainer.seed=0") and first.protocols == ("strict",)
     assert last.source == {"folder": "/data/carla", "head": str(tmp_path / "models/flame"), "frame_offset": 1}
     assert last.overrides == ("data.size=64", "model.latent_dim=32", "trainer.seed=5")
-    assert (spec.resources.threads, spec.resources.gpus, spec.retries) == (1, 0, 2)
+    assert (spec.resources.threads, spec.resources.gpus, spec.retries) == (1, None, 2)
 
 
 def test_a_product_is_every_combination(tmp_path: Path) -> None:

@@ -1,0 +1,137 @@
+"""Refinement of a tracking on the GPU's path: the CPU's misfit, gradient and way down, and nothing that is read back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import deepcopy
+from typing import cast
+
+import pytest
+import torch
+from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, wrongly_tracked
+from interpreter import DEVICE, error, the_cpus_way
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+from avatar.data.subject import Subject
+from avatar.model import Avatar
+from avatar.refine import refine as refine_module
+from avatar.refine.motion import head_params, quaternion, rotation
+from avatar.refine.parallel import read_later
+from avatar.refine.refine import _Work, frozen
+from avatar.splat.capacity import fixed_capacity
+
+FRAME = 1
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Avatar]:
+    with the_cpus_way():
+        avatar = patterned_avatar(tmp_path_factory.mktemp("head"), "model.uv_size=24")
+    with frozen(avatar):
+        yield avatar
+
+
+@pytest.fixture(scope="module")
+def clip(avatar: Avatar) -> Clip:
+    with the_cpus_way():
+        return wrongly_tracked(drawn_clip(avatar, frames=4, train=3))
+
+
+def work_on(avatar: Avatar, clip: Clip) -> _Work:
+    return _Work(avatar, cast(Subject, clip), SIZE, BACKGROUND)
+
+
+@pytest.fixture
+def on_cpu(avatar: Avatar, clip: Clip) -> _Work:
+    with the_cpus_way():
+        return work_on(avatar.to("cpu"), clip)
+
+
+def test_picture_misfit_and_gradient_are_those_of_the_cpu(avatar: Avatar, clip: Clip, on_cpu: _Work) -> None:
+    moves = 0.3 * torch.randn(len(on_cpu.freedom.index), generator=torch.Generator().manual_seed(0))
+    with the_cpus_way():
+        made = on_cpu.targets(FRAME, 1)
+        assert made is not None
+        values = on_cpu.freedom.values(FRAME, moves)
+        expected = on_cpu.likeness.fit(values, on_cpu.pose(FRAME), made[0])
+        figures = on_cpu.likeness.figures(values, on_cpu.pose(FRAME), made[0])
+        picture = on_cpu.likeness.picture(values, on_cpu.pose(FRAME), made[0])
+    work = work_on(avatar.to(DEVICE), clip)
+    found_targets = work.targets(FRAME, 1)
+    assert not work.waits and found_targets is not None
+    values = work.there.values(FRAME, moves.to(DEVICE))
+    found = work.likeness.fit(values, work.pose(FRAME), found_targets[0])
+    assert float(found.misfit) == pytest.approx(float(expected.misfit), rel=1e-4)
+    assert error(found.gradient, expected.gradient) < 1e-3
+    assert (found.picture.cpu() - expected.picture).abs().mean() < 1e-5
+    seen = work.likeness.picture(values, work.pose(FRAME), found_targets[0])
+    assert (seen.cpu() - picture).abs().mean() < 1e-5
+    own = work.likeness.figures(values, work.pose(FRAME), found_targets[0])
+    assert own.tolist() == pytest.approx(figures.tolist(), rel=1e-4)
+
+
+def test_the_way_down_is_that_of_the_cpu(
+    avatar: Avatar, clip: Clip, on_cpu: _Work, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A curvature that is too small: the first step goes too far and is not taken, the others are."""
+    monkeypatch.setattr(refine_module, "FINE_STEPS", 3)
+    factor = 0.5 * torch.eye(len(on_cpu.freedom.index))
+    with the_cpus_way():
+        expected = on_cpu.refine(FRAME, [factor])
+    (found,) = work_on(avatar.to(DEVICE), clip).refined([FRAME], [factor.to(DEVICE)])
+    assert expected.psnr > expected.before.psnr + 1.0, "there was something to find"
+    assert error(found.moves, expected.moves) < 2e-3
+    assert (*found.before, found.psnr) == pytest.approx((*expected.before, expected.psnr), rel=1e-3)
+
+
+@pytest.mark.without_kernels
+def test_a_frame_reads_nothing_back(avatar: Avatar, clip: Clip) -> None:
+    """On the meta device there is nothing to read."""
+    avatar = deepcopy(avatar).to("cpu")
+    avatar.embedding.touching(avatar.head.assets.num_vertices)  # counted once, on the CPU: only numbers can be counted
+    work = work_on(avatar.to("meta"), clip)
+    work.levels = 2
+    factor = torch.eye(len(work.freedom.index), device="meta")
+    with fixed_capacity(10_000):
+        begun = work.begin(FRAME, [factor, factor])
+        curvatures = work._stacked_curvatures(FRAME)
+    assert begun is not None and begun.is_meta and begun.shape == (len(factor) + 3,)
+    assert curvatures is not None and curvatures.is_meta and curvatures.shape == (2, *factor.shape)
+
+
+@pytest.mark.without_kernels
+def test_turns_are_the_same_without_an_exponential(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    vectors = torch.tensor([[0.0, 0.0, 0.0], [1e-4, 0.0, -2e-4], [0.3, -0.2, 0.9], [2.0, 1.0, -2.0]]).double()
+    expected = rotation(vectors)
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    torch.testing.assert_close(rotation(vectors), expected, rtol=0, atol=1e-12)
+    derivative = torch.autograd.functional.jacobian(rotation, torch.zeros(3).double())
+    assert derivative[1, 0, 2] == 1.0 and derivative[0, 1, 2] == -1.0 and bool(derivative.isfinite().all())
+    for vector, matrix in zip(vectors, expected, strict=True):
+        w, x, y, z = quaternion(vector).tolist()
+        assert w**2 + x**2 + y**2 + z**2 == pytest.approx(1.0)
+        assert matrix[2, 1] == pytest.approx(2 * (y * z + w * x), abs=1e-12)
+        assert matrix[0, 0] == pytest.approx(1 - 2 * (y**2 + z**2), abs=1e-12)
+
+
+@pytest.mark.without_kernels
+def test_what_was_drawn_without_room_is_begun_again_in_its_turn() -> None:
+    tries: list[int] = []
+
+    def begin(item: int) -> Tensor | None:
+        tries.append(item)
+        return None if item == 3 else torch.tensor([torch.nan if tries.count(item) == 1 and item == 2 else item])
+
+    found = list(read_later(begin, range(6)))
+    assert [None if one is None else float(one) for one in found] == [0, 1, 2, None, 4, 5]
+    assert sorted(tries) == [0, 1, 2, 2, 3, 4, 5]
+
+
+def test_the_head_poses_on_the_device_as_on_the_cpu(avatar: Avatar, clip: Clip) -> None:
+    values = 0.1 * torch.randn(20 + 6, generator=torch.Generator().manual_seed(1))
+    with the_cpus_way():
+        expected = avatar.head.vertices(head_params(values))
+    assert error(avatar.head.on(DEVICE).vertices(head_params(values.to(DEVICE))), expected) < 1e-6
