@@ -22,7 +22,7 @@ demo: setup ## make a subject, train an avatar on it, evaluate it and let anothe
 
 # A worker for each core, with one thread: most tests have work for one.
 test: setup ## run all tests
-	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress

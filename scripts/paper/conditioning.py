@@ -12,6 +12,7 @@ Leaves conditioning.md, conditioning.csv and conditioning.png in --out.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import gc
 import json
 import os
@@ -156,6 +157,8 @@ def say_peaks(asked: str) -> None:
 
 def peak_bytes(way: Way, leaves: Leaves) -> int:
     gc.collect()
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # glibc's
+        trim(0)  # else what was freed before, and is still the process's, would hide what is taken
     RESET.write_text("5")
     before = high_water()
     one_pass(way, leaves)
