@@ -33,8 +33,22 @@ def own_folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def begun(own_folder: Path, tmp_path: Path) -> Path:
     """A run of 12 steps, with its checkpoints of steps 4 and 8 and the video beside it."""
-    run = tmp_path / "run"
-    avatar("train", own_folder, "--out", run, *OPTIONS)
+    return train_and_stop(own_folder, tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def kept_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tracked_folder(tmp_path_factory.mktemp("kept") / "someone", frames=12, size=48)
+
+
+@pytest.fixture(scope="module")
+def kept(kept_folder: Path) -> Path:
+    """The same for tests that are refused, so that it stays as it is."""
+    return train_and_stop(kept_folder, kept_folder.parent / "run")
+
+
+def train_and_stop(folder: Path, run: Path) -> Path:
+    avatar("train", folder, "--out", run, *OPTIONS)
     list_checkpoints(run / "checkpoints")[-1].unlink()
     return run
 
@@ -85,10 +99,10 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_what_a_resumed_run_cannot_change_is_refused(name: str, begun: Path, own_folder: Path) -> None:
+def test_what_a_resumed_run_cannot_change_is_refused(name: str, kept: Path, kept_folder: Path) -> None:
     options, sentence = CHANGES[name]
-    assert sentence in avatar("train", own_folder, "--out", begun, "--resume", *options, status=1)
-    assert newest_checkpoint(begun).step == 8
+    assert sentence in avatar("train", kept_folder, "--out", kept, "--resume", *options, status=1)
+    assert newest_checkpoint(kept).step == 8
 
 
 def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:
@@ -109,25 +123,25 @@ def test_a_run_may_go_on_on_another_device_and_says_so(way: tuple[str, ...], beg
 
 @pytest.mark.parametrize("way", [("--device", "cuda:99"), ("device=cuda:99",)])
 def test_a_gpu_that_is_asked_for_by_name_is_used_or_refused(
-    way: tuple[str, ...], begun: Path, own_folder: Path
+    way: tuple[str, ...], kept: Path, kept_folder: Path
 ) -> None:
     for command in (
-        ("train", own_folder, "--out", begun, "--resume"),
-        ("train", own_folder, "--out", begun.parent / "new"),
+        ("train", kept_folder, "--out", kept, "--resume"),
+        ("train", kept_folder, "--out", kept.parent / "new"),
     ):
         output = avatar(*command, *way, status=1)
         assert "\navatar: " in f"\n{output}" and "Resuming" not in output
-    assert newest_checkpoint(begun).step == 8 and not list((begun.parent / "new").rglob("*.safetensors"))
+    assert newest_checkpoint(kept).step == 8 and not list((kept.parent / "new").rglob("*.safetensors"))
 
 
 @pytest.mark.parametrize(
     "command", ["eval {}", "refine {} --out {}-refined", "view {}", "bench render {} --out {}-bench"]
 )
-def test_other_commands_too_use_or_refuse_a_gpu(command: str, begun: Path) -> None:
-    before = sorted(begun.rglob("*"))
-    output = avatar(*command.replace("{}", str(begun)).split(), "--device", "cuda:99", status=1)
+def test_other_commands_too_use_or_refuse_a_gpu(command: str, kept: Path) -> None:
+    before = sorted(kept.rglob("*"))
+    output = avatar(*command.replace("{}", str(kept)).split(), "--device", "cuda:99", status=1)
     assert "\navatar: " in f"\n{output}" and "Traceback" not in output
-    assert sorted(begun.rglob("*")) == before and not list(begun.parent.glob(f"{begun.name}-*"))
+    assert sorted(kept.rglob("*")) == before and not list(kept.parent.glob(f"{kept.name}-*"))
 
 
 def test_two_trainings_into_one_folder_are_one_too_many(own_folder: Path, tmp_path: Path) -> None:

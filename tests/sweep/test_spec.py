@@ -76,7 +76,10 @@ MISTAKES = {
         "variants or product, not both",
     ),
     "an empty product": ("subjects: [a]\nproduct: {preset: []}", "product must hold a list of values for each key"),
-    "too many": (f"subjects: [a]\nseeds: {list(range(100_001))}", "more than 100,000 jobs"),
+    "too many": (
+        f"subjects: [a]\nseeds: {list(range(318))}\nproduct: {{trainer.huber_delta: {list(range(1, 316))}}}",  # 100,170
+        "more than 100,000 jobs",
+    ),
     "threads that are none": ("subjects: [a]\nthreads: many", "threads is 'many'; it must lie between 1 and 1024"),
 }
 
