@@ -27,8 +27,10 @@ test: setup ## run all tests
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress
 
+# The page's avatar files and a socket's packets get half as many each.
 fuzz: setup ## give every reader damaged and hostile files (FUZZ_CASES=20000 in all)
 	AVATAR_FUZZ_CASES=$(FUZZ_CASES) AVATAR_FUZZ_TABLE=docs/bench/fuzz.md $(BIN)/python -m pytest --timeout=0 -rP tests/fuzz
+	AVATAR_FUZZ_CASES=$(FUZZ_CASES) $(BIN)/python -m pytest --timeout=0 -k damaged tests/view/test_stream.py tests/export/test_web_core.py
 
 sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh
