@@ -9,13 +9,15 @@ export function connectCamera(view, makeWorker, putBack) {
   const find = (id) => document.getElementById(id);
   const [button, neutral, mirror, small, video, said, figures, chooser, file] = [
     "camera", "neutral", "mirror", "small", "video", "camera-said", "camera-figures", "chooser", "pack",
-  ].map(find);
+  ].map(find), card = find("camera-card"), choices = find("camera-choices");
   let camera = null;
 
   const show = () => {
     const isOn = camera.state !== "off", isFollowing = camera.state === "following";
     button.textContent = isOn ? "Stop the camera" : "Drive with your camera";
+    button.classList.toggle("main", !isOn);
     Object.assign(said, { textContent: camera.sentence || (isFollowing ? "The avatar follows you." : ""), hidden: !isOn && !camera.sentence });
+    choices.hidden = !isOn;
     neutral.disabled = !isFollowing;
     video.hidden = !isOn || !small.checked || !video.srcObject;
     video.classList.toggle("mirror", mirror.checked);
@@ -32,7 +34,7 @@ export function connectCamera(view, makeWorker, putBack) {
     camera.start(source).catch(() => {}); // its sentence is shown
   };
 
-  find("camera-card").hidden = false;
+  card.hidden = false;
   button.addEventListener("click", () => (camera && camera.state !== "off" ? camera.stop() : start()));
   neutral.addEventListener("click", () => camera?.calibrate());
   mirror.addEventListener("change", () => camera && (camera.mirror(mirror.checked), show()));
@@ -40,6 +42,11 @@ export function connectCamera(view, makeWorker, putBack) {
   file.addEventListener("change", () => {
     if (file.files[0]) start(file.files[0]);
     file.value = "";
+  });
+  card.addEventListener("dragover", (e) => e.preventDefault());
+  card.addEventListener("drop", (e) => {
+    e.preventDefault();
+    if (e.dataTransfer.files[0]) start(e.dataTransfer.files[0]);
   });
   file.accept = ".js,text/javascript";
   chooser.querySelector("span").textContent = `Choose ${PACK}`;

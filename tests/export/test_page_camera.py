@@ -183,6 +183,14 @@ def test_a_page_without_its_landmarker_takes_a_chosen_one(open_page: Callable[..
         page.locator("#pack").set_input_files(folder / name)
         says(page, sentence)
         assert is_off(page)
+    drop = """(text) => {
+      const carried = new DataTransfer();
+      carried.items.add(new File([text], "dropped.js"));
+      const drop = new DragEvent("drop", { dataTransfer: carried, cancelable: true });
+      document.getElementById("camera-card").dispatchEvent(drop);
+    }"""
+    page.evaluate(drop, "dropped")
+    says(page, f"dropped.js is not {PACK}")
     page.locator("#pack").set_input_files(folder / "elsewhere.js")
     says(page, FOLLOWS)
     assert not page.locator("#chooser").is_visible()
