@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
+import hashlib
+import io
 import json
 import re
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +20,10 @@ from pages import says, until
 from videos import encode
 
 from avatar.demo.raw_video import filmed
+from avatar.export import landmarker_pack
 from avatar.export.landmarker_pack import PACK, encode_pack, make_pack
 from avatar.export.web_page import write_page
-from avatar.files.third_party import FACE_LANDMARKER, FOLDER_VARIABLE, TASKS_VISION, find
+from avatar.files.third_party import FACE_LANDMARKER, FOLDER_VARIABLE, TASKS_VISION, find, sha256_of
 
 FPS = 10
 NOTE = """() => {
@@ -38,6 +44,46 @@ def test_the_command_writes_the_landmarker_beside(
     assert not (tmp_path / "x.html").exists()
     refused = avatar("export", run, "--webcam", "--out", tmp_path / "x.ply", status=1)
     assert "--webcam belongs to --format web or web-avatar" in refused
+
+
+@pytest.fixture
+def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package and a model of that name, with their hashes taken for the published ones."""
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (folder / FACE_LANDMARKER.name).write_bytes(b"model")
+    with tarfile.open(folder / TASKS_VISION.name, "w:gz") as archive:
+        for name in (*landmarker_pack.MEMBERS, "wasm/vision_wasm_nosimd_internal.wasm"):
+            member = tarfile.TarInfo(f"package/{name}")
+            member.size = len(name)
+            archive.addfile(member, io.BytesIO(name.encode()))
+    for known in ("TASKS_VISION", "FACE_LANDMARKER"):
+        file = getattr(landmarker_pack, known)
+        monkeypatch.setattr(landmarker_pack, known, file._replace(sha256=sha256_of(folder / file.name)))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".html", ".avatar"])
+def test_the_command_takes_the_publishers_files(
+    suffix: str, published: Path, tracked_folder: Path, tmp_path: Path
+) -> None:
+    run, out = lively_run(tracked_folder, tmp_path / "run", "model.uv_size=12"), tmp_path / f"x{suffix}"
+    said = avatar("export", run, "--webcam", "--out", out)
+    data = (tmp_path / PACK).read_bytes()
+    assert hashlib.sha256(data).hexdigest() in said and landmarker_pack.NOTICE in said and out.is_file()
+    files = json.loads(data[data.rindex(b"avatarLandmarker(") + 17 : -3])["files"]
+    found = {name: gzip.decompress(base64.b64decode(text)) for name, text in files.items()}
+    assert found == {
+        "vision_bundle.mjs": b"vision_bundle.mjs",
+        "vision_wasm_internal.js": b"wasm/vision_wasm_internal.js",
+        "vision_wasm_internal.wasm": b"wasm/vision_wasm_internal.wasm",
+        "face_landmarker.task": b"model",
+    }
+    (published / TASKS_VISION.name).write_bytes(b"another")
+    (tmp_path / PACK).unlink()
+    assert "is not the published file or is damaged" in avatar("export", run, "--webcam", "--out", out, status=1)
+    assert not (tmp_path / PACK).exists()
 
 
 def test_the_pack_is_a_licence_and_a_call() -> None:
