@@ -2,6 +2,7 @@
 import { multiply, places, rotation, sixD } from "./motion.js";
 
 const LIDS = ["eyeBlinkLeft", "eyeBlinkRight"];
+const CALM_SHARE = 0.25;
 const BEYOND = 10; // degrees by which the head may turn beyond what the training video shows
 const INSIDE = 0.25; // the head's middle stays so far from the picture's edges, as a share of its width and height
 const FAR = [0.7, 1.5]; // of the distance at rest
@@ -40,13 +41,18 @@ export function mirrored({ scores, matrix }) {
   };
 }
 
-/** The calm face of several: the median of each score, and the pose of the one that is nearest to that. */
+/**
+ * The calm face of several, some of which may speak or blink: the median of each score over the CALM_SHARE of them that does
+ * least, and the pose of the one that is nearest to that.
+ */
 export function calmFace(faces) {
   const names = Object.keys(faces[0].scores), of = (face, name) => face.scores[name] ?? 0;
-  const median = (name) => faces.map((face) => of(face, name)).sort((a, b) => a - b)[faces.length >> 1];
+  const away = (face, from) => names.reduce((sum, name) => sum + (of(face, name) - (from[name] ?? 0)) ** 2, 0);
+  const ranked = faces.map((face) => ({ face, does: away(face, {}) })).sort((a, b) => a.does - b.does);
+  const calm = ranked.slice(0, Math.ceil(CALM_SHARE * faces.length)).map(({ face }) => face);
+  const median = (name) => calm.map((face) => of(face, name)).sort((a, b) => a - b)[calm.length >> 1];
   const scores = Object.fromEntries(names.map((name) => [name, median(name)]));
-  const away = (face) => names.reduce((sum, name) => sum + (of(face, name) - scores[name]) ** 2, 0);
-  const nearest = faces.reduce((best, face) => (away(face) < away(best) ? face : best));
+  const nearest = calm.reduce((best, face) => (away(face, scores) < away(best, scores) ? face : best));
   return { scores, matrix: nearest.matrix };
 }
 
@@ -111,9 +117,10 @@ export class FaceDriver {
 }
 
 /**
- * How a head has moved since it was at `neutral`: roll, pitch and yaw in radians about its own axes, and the shift in the
- * camera's as a share of its distance. `R` is the avatar's head to its camera at rest; the matrices are 4x4, by columns, in
- * OpenGL's axes, as the landmarker gives them.
+ * How a head has moved since it was at `neutral`: roll, pitch and yaw in radians about its own axes, the shift to the right and
+ * down in metres, and its distance as a share of that at first, because the landmarker assumes a lens and so a distance, but
+ * knows how large heads are. `R` is the avatar's head to its camera at rest; the matrices are 4x4, by columns, in OpenGL's axes
+ * and centimetres, as the landmarker gives them.
  */
 function headPose(R, neutral, matrix) {
   const turned = (a, b) => { // b after a^-1, in OpenCV's axes
@@ -122,20 +129,20 @@ function headPose(R, neutral, matrix) {
   };
   const T = multiply(transposed(R), multiply(turned(neutral, matrix), R)); // in the head's own axes
   const angles = [Math.atan2(-T[1], T[4]), Math.asin(clamp(T[7], [-1, 1])), Math.atan2(-T[6], T[8])];
-  const depth = Math.abs(neutral[14]) || 1;
-  return [...angles, ...[1, -1, -1].map((sign, i) => (sign * (matrix[12 + i] - neutral[12 + i])) / depth)];
+  const shift = [matrix[12] - neutral[12], neutral[13] - matrix[13]].map((centimetres) => centimetres / 100);
+  return [...angles, ...shift, matrix[14] / (neutral[14] || 1)];
 }
 
-/** `moved_camera` of avatar/view/webcam.py, turned no farther than training has shown and inside of the picture. */
-function placed({ camera, orbit }, [roll, pitch, yaw, x, y, z]) {
+/** The avatar's camera with its head turned, no farther than training has shown, and moved, inside of the picture. */
+function placed({ camera, orbit }, [roll, pitch, yaw, x, y, far]) {
   const degrees = Math.PI / 180, within = ([low, high]) => [(low - BEYOND) * degrees, (high + BEYOND) * degrees];
   const turn = multiply(
     rotation([0, 0, roll]),
     multiply(rotation([clamp(pitch, within(orbit.pitch)), 0, 0]), rotation([0, clamp(yaw, within(orbit.yaw)), 0])),
   );
-  const [tx, ty, tz] = camera.translation, depth = tz * clamp(1 + z, FAR);
+  const [tx, ty, tz] = camera.translation, depth = tz * clamp(far, FAR);
   const inside = (t, shift, f, c, length) => {
-    const place = (f * (t + shift * tz)) / depth + c, own = (f * t) / tz + c;
+    const place = (f * (t + shift)) / depth + c, own = (f * t) / tz + c;
     return ((clamp(place, [Math.min(INSIDE * length, own), Math.max((1 - INSIDE) * length, own)]) - c) * depth) / f;
   };
   const { fx, fy, cx, cy, aspect } = camera;
