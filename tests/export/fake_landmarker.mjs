@@ -16,6 +16,8 @@ export class FaceLandmarker {
   detectForVideo(picture, milliseconds) {
     if (!(milliseconds > this.#last)) throw new Error("times must rise");
     this.#last = milliseconds;
+    const longest = Math.max(picture.width, picture.height);
+    if (longest !== 320) throw new Error(`${longest} pixels in software, not 320`);
     this.#context.drawImage(picture, 0, 0, 8, 8);
     const pixels = this.#context.getImageData(0, 0, 8, 8).data, light = pixels[4 * 36 + 1] / 255;
     if (light < 0.15) return { faceBlendshapes: [], facialTransformationMatrixes: [], faceLandmarks: [] };

@@ -28,16 +28,16 @@ FAKE = {
     "vision_wasm_internal.wasm": b"binary",
     "face_landmarker.task": b"model",
 }
-FPS, SIZE = 10, 64
+FPS, WIDTH, HEIGHT = 10, 352, 64
 CALM, BRIGHT, DARK = 80, 230, 20  # luminances of the film: a calm face, a wide mouth, nobody
 FOLLOWS, NOBODY = "The avatar follows you.", "There is no face in the picture."
 
 
 def film(path: Path, levels: list[int]) -> Path:
     """A .y4m of grey pictures."""
-    header = f"YUV4MPEG2 W{SIZE} H{SIZE} F{FPS}:1 Ip A1:1 C420jpeg\n".encode()
-    chroma = bytes([128]) * (SIZE * SIZE // 2)
-    path.write_bytes(header + b"".join(b"FRAME\n" + bytes([level]) * (SIZE * SIZE) + chroma for level in levels))
+    header = f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F{FPS}:1 Ip A1:1 C420jpeg\n".encode()
+    chroma = bytes([128]) * (WIDTH * HEIGHT // 2)
+    path.write_bytes(header + b"".join(b"FRAME\n" + bytes([level]) * (WIDTH * HEIGHT) + chroma for level in levels))
     return path
 
 
