@@ -10,13 +10,15 @@ export function connectCamera(view, makeWorker, putBack) {
   const [button, neutral, mirror, small, video, said, figures, chooser, file] = [
     "camera", "neutral", "mirror", "small", "video", "camera-said", "camera-figures", "chooser", "pack",
   ].map(find), card = find("camera-card"), choices = find("camera-choices");
+  const { drive, sizes } = view.header, isNamed = Object.values(drive.blendshapes).flat().some(([place]) => place < sizes.expressions);
+  const follows = `The avatar follows you.${isNamed ? "" : " Its head model names no expressions: jaw, lids, gaze and head do."}`;
   let camera = null;
 
   const show = () => {
     const isOn = camera.state !== "off", isFollowing = camera.state === "following";
     button.textContent = isOn ? "Stop the camera" : "Drive with your camera";
     button.classList.toggle("main", !isOn);
-    Object.assign(said, { textContent: camera.sentence || (isFollowing ? "The avatar follows you." : ""), hidden: !isOn && !camera.sentence });
+    Object.assign(said, { textContent: camera.sentence || (isFollowing ? follows : ""), hidden: !isOn && !camera.sentence });
     choices.hidden = !isOn;
     neutral.disabled = !isFollowing;
     video.hidden = !isOn || !small.checked || !video.srcObject;

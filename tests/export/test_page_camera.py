@@ -116,7 +116,7 @@ def test_a_face_drives_the_page_from_a_file(open_page: Callable[..., Any], folde
     says(page, "Look into the camera for a moment, calmly")
     assert page.locator("#video").is_visible() and page.get_by_role("button", name="Stop the camera").is_visible()
     assert page.locator("#neutral").is_disabled()
-    says(page, FOLLOWS)
+    says(page, f"{FOLLOWS} Its head model names no expressions")
     assert page.evaluate("avatar.motion") in ("driven", "rest")
     assert psnr(shown(page), before) > 35, "a calm face is the neutral one"
     assert page.evaluate("avatar.header.drive.high[avatar.header.sizes.expressions]") > 0.02, "training opened the jaw"
