@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +32,39 @@ def node(script: Path, *arguments: object, timeout: float = 120.0) -> Any:
     return json.loads(done.stdout)
 
 
-@contextlib.contextmanager
-def chromium() -> Iterator[Any]:
-    """A headless browser of Playwright's."""
+def chromium_path() -> str:
     path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("Chromium is not installed (Debian: apt install chromium), nor named by $CHROMIUM")
+    return path
+
+
+@contextlib.contextmanager
+def chromium(*flags: str) -> Iterator[Any]:
+    """A headless browser of Playwright's, with more flags than `FLAGS`."""
+    path = chromium_path()
     playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=list(FLAGS))
-        try:
-            yield browser
-        finally:
-            browser.close()
+    with playwright.sync_playwright() as started, launched(started.chromium, path, flags) as browser:
+        yield browser
+
+
+@contextlib.contextmanager
+def launched(kind: Any, path: str, flags: Sequence[str]) -> Iterator[Any]:
+    """A browser of a kind that Playwright has started."""
+    browser = kind.launch(executable_path=path, args=[*FLAGS, *flags])
+    try:
+        yield browser
+    finally:
+        browser.close()
+
+
+def camera_flags(film: Path) -> tuple[str, ...]:
+    """A camera that plays a .y4m or .mjpeg again and again, and that every page may use."""
+    return (
+        "--use-fake-device-for-media-stream",
+        "--use-fake-ui-for-media-stream",
+        f"--use-file-for-fake-video-capture={film}",
+    )
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,7 @@ from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_traine
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
+from avatar.export.landmarker_pack import NOTICE, PACK, make_pack
 from avatar.export.licence import MESH, NOTHING, SKINNING, WHOLE, licence_of
 from avatar.export.movie import write_movie
 from avatar.export.ply import encode_ply
@@ -35,7 +37,8 @@ def run_export(arguments: Namespace) -> int:
     out: Path = arguments.out or Path(f"{trained.name}{SUFFIXES[format]}")
     check_file(out, [SUFFIXES[format]], f"--format {format}")
     motion = Path(arguments.motion) if arguments.motion else None
-    check_outputs([out], [arguments.run, trained.source, arguments.head, motion])
+    written = [out, out.with_name(PACK)] if arguments.webcam else [out]
+    check_outputs(written, [arguments.run, trained.source, arguments.head, motion])
     WRITERS[format](trained, out, arguments)
     return OK
 
@@ -66,17 +69,32 @@ def check_options(arguments: Namespace, format: str) -> None:
 
 
 def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    pack = make_pack() if arguments.webcam else None
     page = write_page(trained, out, arguments.precision or "small")
     print(f"Page     {out} ({page.bytes / MIB:.1f} MiB): opens in any browser, without a network")
     if page.note:
         print(f"Note     {page.note}")
     print(f"Licence  {licence_of(SKINNING)}")
+    if pack is not None:
+        keep_pack(pack, out)
+
+
+def keep_pack(pack: bytes, out: Path) -> None:
+    """Write the face landmarker beside a page or an avatar."""
+    path = out.with_name(PACK)
+    write_atomically(path, pack)
+    digest = hashlib.sha256(pack).hexdigest()
+    print(f"Camera   {path} ({len(pack) / MIB:.1f} MiB, SHA-256 {digest}): beside {out.name}, a camera drives it")
+    print(f"Licence  {NOTICE}")
 
 
 def write_web_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    pack = make_pack() if arguments.webcam else None
     size = write_web_avatar(trained, out, arguments.precision or "small")
     print(f'Avatar   {out} ({size / MIB:.1f} MiB), for <avatar-view src="{out.name}">')
     print(f"Licence  {licence_of(SKINNING)}")
+    if pack is not None:
+        keep_pack(pack, out)
 
 
 def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
@@ -169,6 +187,7 @@ WRITERS: dict[str, Callable[[TrainedAvatar, Path, Namespace], None]] = {
 }
 OPTIONS = {
     "precision": ("web", "web-avatar"),
+    "webcam": ("web", "web-avatar"),
     "with_head": ("avatar",),
     "frame": ("ply", "glb"),
     "motion": ("ply", "video"),

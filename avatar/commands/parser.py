@@ -243,6 +243,11 @@ def add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument(
         "--precision", choices=("small", "float"), help="web, web-avatar: of the parameters (default: small)"
     )
+    export.add_argument(
+        "--webcam",
+        action="store_true",
+        help="web, web-avatar: write the face landmarker beside it, for the reader's camera",
+    )
     export.add_argument("--with-head", action="store_true", help="avatar: pack the head model in; mind its licence")
     export.add_argument("--frame", type=int, metavar="N", help="ply, glb: of its video (default: the neutral face)")
     export.add_argument(
@@ -277,3 +282,4 @@ def add_view(view: argparse.ArgumentParser) -> None:
         metavar="N|VIDEO",
         help="follow your face: a camera's number (default: 0), or a video",
     )
+    view.add_argument("--fov", type=float, metavar="DEG", help="--webcam: field of view across its width, if known")

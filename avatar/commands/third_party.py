@@ -9,6 +9,7 @@ from avatar.commands import OK
 from avatar.errors import UserError
 from avatar.files.third_party import (
     LPIPS_FILES,
+    PAGE_FILES,
     TRACKING_FILES,
     ThirdPartyFile,
     check_sha256,
@@ -31,7 +32,9 @@ def run_models(arguments: Namespace, say: Callable[[str], object] = print) -> in
         fetch_missing(say)
     folders = ", ".join(map(str, search_folders()))
     say(f"Looked for in {folders}; LPIPS also in {lpips_folder()}")
-    states = [describe(file, say) for file in TRACKING_FILES] + [describe_lpips(net, say) for net in NETS]
+    states = [describe(file, say) for file in (*TRACKING_FILES, *PAGE_FILES)] + [
+        describe_lpips(net, say) for net in NETS
+    ]
     return OK if all(states) else MISSING
 
 
@@ -73,7 +76,7 @@ def describe_lpips(net: Net, say: Callable[[str], object]) -> bool:
 
 def fetch_missing(say: Callable[[str], object]) -> None:
     """Download what is not there. Raises UserError, with where to put the file by other means, when that fails."""
-    for file in TRACKING_FILES:
+    for file in (*TRACKING_FILES, *PAGE_FILES):
         if find(file) is None:
             say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download(file)

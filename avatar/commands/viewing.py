@@ -43,6 +43,8 @@ def run_view(arguments: Namespace) -> int:
     if arguments.size is not None and not WIDTHS[0] <= arguments.size <= WIDTHS[1]:
         raise UserError(f"--size must be from {WIDTHS[0]} to {WIDTHS[1]}, not {arguments.size}")
     width = arguments.size or min(trained.recording.image_size(trained.config.data.size)[0], WIDTHS[1])
+    if arguments.fov is not None and arguments.webcam is None:
+        raise UserError("--fov belongs to --webcam: it is the field of view of that camera")
     token = arguments.token
     if token is not None and not re.fullmatch(r"[A-Za-z0-9_-]{8,200}", token):
         raise UserError("--token must be at least 8 letters, digits, - or _")
@@ -88,7 +90,7 @@ def open_live(arguments: Namespace, trained: TrainedAvatar) -> Receiver | Webcam
     source = open_source(arguments.webcam)
     say(f"{source.name}, {source.size[0]} x {source.size[1]} pixels")
     try:
-        follower = FaceFollower(source, trained.assets, head_of(arguments, trained), say)
+        follower = FaceFollower(source, trained.assets, head_of(arguments, trained), say, arguments.fov)
     except BaseException:
         source.close()
         raise

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from avatar.export.drawing import ARRAYS, Drawing, reduce_avatar
+from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
 from avatar.motion.controls import expression_controls, joint_ranges
 from avatar.motion.orbit import orbit_limits
@@ -143,6 +144,7 @@ def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
             }
             for control in controls
         ],
+        "drive": face_map(trained, kept),
         "joints": joint_ranges([params for _, params in frames]),
         "orbit": orbit_limits((camera, rest), frames)._asdict(),
         "rest": torch.cat((rest.expression[kept], rest.jaw, rest.eyes, rest.eyelids, rest.neck)).tolist(),

@@ -17,8 +17,12 @@ from avatar.runs.trained import TrainedAvatar
 
 WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
-PAGE_MODULES = ("core.js", "motion.js", "webgl.js", "view.js", "steer.js", "controls.js", "page.js")
+PAGE_MODULES = (
+    *("core.js", "motion.js", "webgl.js", "drive.js", "view.js", "steer.js"),
+    *("landmarker.js", "camera.js", "controls.js", "panel.js", "page.js"),
+)
 WORKER_MODULES = ("core.js", "worker.js")
+WATCHER_MODULES = ("watcher.js",)
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
         "style": read("page.css"),
         "script": f"(() => {{\n{bundle(PAGE_MODULES)}\n}})();",
         "worker": script_text(json.dumps(bundle(WORKER_MODULES))),
+        "watcher": script_text(json.dumps(bundle(WATCHER_MODULES))),
         "module": base64.b64encode((WEB / "avatar.wasm").read_bytes()).decode(),
         "data": base64.b64encode(encoded.data).decode(),
     }

@@ -38,7 +38,7 @@ FACE_LANDMARKER = ThirdPartyFile(
     "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff",
     3.8,
     "Apache-2.0, Google",
-    "face landmarks (track)",
+    "face landmarks (track, view --webcam, export --webcam)",
 )
 SELFIE_SEGMENTATION = ThirdPartyFile(
     "selfie_segmentation.tflite",
@@ -57,6 +57,18 @@ SELFIE_MULTICLASS = ThirdPartyFile(
     "better mattes (track)",
     is_optional=True,
 )
+TASKS_VISION_VERSION = "0.10.21"
+TASKS_VISION = ThirdPartyFile(
+    f"mediapipe-tasks-vision-{TASKS_VISION_VERSION}.tgz",
+    f"https://registry.npmjs.org/@mediapipe/tasks-vision/-/tasks-vision-{TASKS_VISION_VERSION}.tgz",
+    "343736570f433c0100ffc360dbe70f09cc502a5fc573f5cd95954692edc9cfde",
+    6.2,
+    "Apache-2.0, Google",
+    "pages that a camera drives (export --webcam)",
+    is_optional=True,
+)
+"""For browsers. Later versions (1.1.0) report their use to their maker."""
+PAGE_FILES = (TASKS_VISION,)
 TRACKING_FILES = (FACE_LANDMARKER, SELFIE_SEGMENTATION, SELFIE_MULTICLASS)
 
 _TORCHVISION = "https://download.pytorch.org/models/"

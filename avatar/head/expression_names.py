@@ -16,6 +16,7 @@ import json
 import math
 import re
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,14 @@ class ExpressionNames:
         """What `parse_expression_names` reads."""
         return {"names": list(self.names), "arkit": self.arkit}
 
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        """The first coefficient of each plain name; a stream asks for a hundred names for every frame."""
+        return {plain(name): i for i, name in reversed(list(enumerate(self.names))) if name is not None}
+
     def index(self, name: str) -> int | None:
         """The coefficient of a name, whatever its style of writing."""
-        wanted = plain(name)
-        return next((i for i, own in enumerate(self.names) if own is not None and plain(own) == wanted), None)
+        return self._places.get(plain(name))
 
     def targets(self, blendshape: str) -> dict[int | str, float]:
         """Coefficients (by number) and jaw axes that one of ARKit's blendshapes moves; nothing where none does."""

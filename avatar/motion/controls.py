@@ -55,7 +55,7 @@ def expression_controls(
         labels = name_components(directions, head)
     controls = []
     for direction, (part, name, sign) in zip(directions, labels, strict=True):
-        low, high = _range((away @ (sign * direction)).numpy())
+        low, high = shown_range((away @ (sign * direction)).numpy())
         controls.append(ExpressionControl(part, name, (sign * direction).float(), low, high))
     return controls
 
@@ -83,7 +83,7 @@ def joint_ranges(training: Sequence[HeadParams]) -> dict[str, tuple[float, float
         "nod": _about_x(stacked["neck"]),
         "turn": _about_y(stacked["neck"]),
     }
-    ranges = {name: _range(value.double().numpy()) for name, value in values.items()}
+    ranges = {name: shown_range(value.double().numpy()) for name, value in values.items()}
     return {name: (low, high) for name, (low, high) in ranges.items() if high - low > LEAST_RANGE}
 
 
@@ -122,7 +122,7 @@ def _part(name: str) -> str:
     return next((part for part, pattern in PARTS if re.search(pattern, name, re.IGNORECASE)), "Face")
 
 
-def _range(values: np.ndarray) -> tuple[float, float]:
+def shown_range(values: np.ndarray) -> tuple[float, float]:
     """Nearly all of the values, and 0."""
     low, high = np.percentile(values, [EDGE, 100 - EDGE])
     return min(float(low), 0.0), max(float(high), 0.0)

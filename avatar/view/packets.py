@@ -42,6 +42,7 @@ LIVE_LINK = (
     *("NoseSneerLeft", "NoseSneerRight", "TongueOut", "HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw"),
     *("LeftEyePitch", "LeftEyeRoll", "RightEyeYaw", "RightEyePitch", "RightEyeRoll"),
 )
+BLENDSHAPES = LIVE_LINK[: LIVE_LINK.index("TongueOut") + 1]  # without the head's and the eyes' angles
 _SHAPES = frozenset(plain(name) for name in LIVE_LINK)
 
 

@@ -87,6 +87,10 @@ function check(header, arrays) {
   need(isJoints && Object.values(header.joints).every((range) => finite(range, 2)), "its limits are missing");
   const isControl = (c) => texts([c?.group, c?.name]) && finite(c?.values, E) && finite(c?.range, 2);
   need(Array.isArray(header.controls) && header.controls.every(isControl), "its controls are missing");
+  const d = header.drive, P = E + 11, isPlaced = (pair) => finite(pair, 2) && Number.isInteger(pair[0]) && pair[0] >= 0 && pair[0] < P;
+  const shapes = d?.blendshapes && typeof d.blendshapes === "object" ? Object.values(d.blendshapes) : [null];
+  need(shapes.every((pairs) => Array.isArray(pairs) && pairs.every(isPlaced)), "what a camera moves is missing");
+  need(finite(d.low, P) && finite(d.high, P), "its limits are missing");
   const c = header.camera;
   need(c && finite(c.rotation, 9) && finite(c.translation, 3), "the camera is missing");
   need(finite(["fx", "fy", "cx", "cy", "aspect"].map((k) => c[k]), 5) && c.aspect > 0.1 && c.aspect < 10, "the camera is missing");

@@ -9,6 +9,11 @@ export interface Header {
   controls: { group: string; name: string; values: number[]; range: Range }[]; // directions among them
   joints: Partial<Record<"jaw" | "look_down" | "look_left" | "left_lid" | "right_lid" | "nod" | "turn", Range>>;
   orbit: { yaw: Range; pitch: Range }; // what the training video shows
+  drive: { // what a face moves: places are expression, jaw 3, eyes 6 and eyelids 2, as departures from the neutral face
+    blendshapes: Record<string, [place: number, weight: number][]>; // by ARKit's names: mouthSmileLeft
+    low: number[]; // of each place, as far as training showed
+    high: number[];
+  };
   rest: number[]; // the neutral face: expression, jaw 6, eyes 12, eyelids 2, neck 6
 }
 export interface Pose {
@@ -19,9 +24,14 @@ export interface Pose {
   head?: [yaw: number, pitch: number];
 }
 export type Motion = "idle" | "recorded" | "rest";
+/** As MediaPipe's face landmarker gives them: scores by ARKit's names; the head's pose, 4x4 by columns, OpenGL's axes. */
+export interface Face {
+  scores: Record<string, number>;
+  matrix: ArrayLike<number> | null;
+}
 /** A sentence for people. */
 export class AvatarError extends Error {}
-/** Events: "drawn", "motion", "view", and "failed", whose detail is a sentence. */
+/** Events: "drawn" (detail: { taken }, of a face that drives), "motion", "view", and "failed", whose detail is a sentence. */
 export class AvatarView extends EventTarget {
   constructor(
     canvas: HTMLCanvasElement,
@@ -32,6 +42,7 @@ export class AvatarView extends EventTarget {
   readonly header: Header;
   readonly renderer: "wasm" | "webgl";
   readonly time: number; // seconds into the recorded motion
+  readonly motion: Motion | "driven";
   readonly isPlaying: boolean;
   readonly isBusy: boolean; // whether a picture is being drawn
   readonly isSupported: boolean; // whether the camera is where the training video was
@@ -43,6 +54,9 @@ export class AvatarView extends EventTarget {
   setExpression(values: Record<string, number>): string[];
   setPose(pose: Pose): void;
   setParameters(values: ArrayLike<number> | null): void; // in the order of header.rest
+  /** Show a face; `taken` in milliseconds of performance.now(), of its picture. Faces depart from the neutral one. */
+  drive(scores: Face["scores"], matrix?: Face["matrix"], taken?: number): void;
+  calibrate(face?: Face): void; // the neutral one; by default the newest
   release(): void; // lets go of all that was set
   play(kind?: Motion, options?: { from?: number }): void;
   pause(): void;
@@ -51,6 +65,18 @@ export class AvatarView extends EventTarget {
   resize(width: number): void;
   screenshot(): Promise<Blob>;
   close(): void;
+}
+/** A camera that drives a view, once. Event: "state". `worker` is of watcher.js, a classic one. Nothing leaves the page. */
+export class FaceCamera extends EventTarget {
+  constructor(view: AvatarView, worker: Worker, video?: HTMLVideoElement);
+  readonly video: HTMLVideoElement; // the camera's picture
+  readonly state: "off" | "starting" | "calibrating" | "following";
+  readonly sentence: string; // for people: what to do, or what is wrong
+  readonly statistics: { latency: number; framesPerSecond: number; landmarks: number }; // latency, landmarks: milliseconds
+  start(landmarker?: string | URL | Blob): Promise<void>; // the file that avatar export --webcam writes, or its address
+  stop(): void;
+  mirror(isMirror: boolean): void; // left is right, as at first
+  calibrate(): void;
 }
 /** Pointer, touch, wheel and keys on an element turn and zoom a view, until the function that is returned is called. */
 export function steer(view: AvatarView, element: HTMLElement): () => void;
@@ -62,4 +88,7 @@ export class AvatarViewElement extends HTMLElement {
   setPose(pose: Pose): void;
   play(kind?: Motion, options?: { from?: number }): void;
   pause(): void;
+  drive(scores: Face["scores"], matrix?: Face["matrix"], taken?: number): void;
+  startCamera(landmarker?: string | URL | Blob): Promise<FaceCamera>; // asks for permission: call it on a click
+  stopCamera(): void;
 }

@@ -1,9 +1,10 @@
 // <avatar-view src="anna.avatar">: an avatar in any page. README.md and index.d.ts describe the whole interface.
+import { FaceCamera } from "./camera.js";
 import { AvatarError } from "./core.js";
 import { steer } from "./steer.js";
 import { AvatarView } from "./view.js";
 
-export { AvatarError, AvatarView, steer };
+export { AvatarError, AvatarView, FaceCamera, steer };
 
 const BASE = new URL(".", import.meta.url);
 const INSIDE = `<style>:host{display:inline-block;width:256px;max-width:100%}
@@ -21,6 +22,7 @@ export class AvatarViewElement extends HTMLElement {
   static observedAttributes = ["src"];
   #view;
   #letGo;
+  #camera;
   #loads = 0; // so that the last of several wins
   #isHere = false;
 
@@ -55,6 +57,7 @@ export class AvatarViewElement extends HTMLElement {
   }
 
   #close() {
+    this.#camera?.stop();
     this.#letGo?.();
     this.#view?.close();
     this.#view = this.#letGo = undefined;
@@ -112,6 +115,26 @@ export class AvatarViewElement extends HTMLElement {
 
   pause() {
     this.#loaded.pause();
+  }
+
+  drive(scores, matrix, taken) {
+    this.#loaded.drive(scores, matrix, taken);
+  }
+
+  /**
+   * Drive with the reader's camera, whose permission the browser asks for: call it on a click. `source` is the landmarker's
+   * file or its address, by default face-landmarker.js beside the page. Resolves with the FaceCamera, else ends with a sentence.
+   */
+  async startCamera(source) {
+    this.#loaded; // throws
+    this.#camera?.stop();
+    const camera = (this.#camera = new FaceCamera(this.#view, new Worker(new URL("watcher.js", BASE))));
+    await camera.start(source);
+    return camera;
+  }
+
+  stopCamera() {
+    this.#camera?.stop();
   }
 
   get #loaded() {

@@ -1,5 +1,6 @@
 // The page around a view: sliders, the recorded motion, pictures. Works from a file, without a network.
 import { makeSliders } from "./controls.js";
+import { connectCamera } from "./panel.js";
 import { steer } from "./steer.js";
 import { AvatarView } from "./view.js";
 
@@ -9,9 +10,8 @@ const find = (id) => document.getElementById(id);
 const wantsStillness = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 async function start() {
-  const script = URL.createObjectURL(new Blob([JSON.parse(find("worker").textContent)], { type: "text/javascript" }));
   const asked = new URLSearchParams(location.search), options = { still: wantsStillness(), renderer: asked.get("renderer") ?? "auto" };
-  const parts = { worker: new Worker(script), wasm: decoded("module"), file: decoded("data") };
+  const parts = { worker: makeWorker("worker"), wasm: decoded("module"), file: decoded("data") };
   const view = new AvatarView(find("canvas"), parts, options);
   window.avatar = view; // for the curious, and for tests
   view.addEventListener("failed", ({ detail }) => say(detail));
@@ -22,9 +22,16 @@ async function start() {
   view.addEventListener("drawn", () => say(""), { once: true });
   view.addEventListener("view", () => (find("guess").hidden = view.isSupported));
   connectBar(view, header, putBack);
+  connectCamera(view, () => makeWorker("watcher"), putBack);
   const width = Number(asked.get("width"));
   if (width > 0) view.resize(width);
   else fitSize(view, header);
+}
+
+/** A worker of the script that an element holds. */
+function makeWorker(id) {
+  const script = new Blob([JSON.parse(find(id).textContent)], { type: "text/javascript" });
+  return new Worker(URL.createObjectURL(script));
 }
 
 /** Bytes of an element's base64 text, which is let go of. */

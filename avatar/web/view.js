@@ -1,6 +1,7 @@
 // An avatar on a canvas: loads it and draws it whenever it has changed. No interface of its own; <avatar-view> and the page
 // are built on this.
 import { AvatarError } from "./core.js";
+import { FaceDriver } from "./drive.js";
 import { idle, mix, multiply, orbit, places, recorded, rotation, sixD } from "./motion.js";
 import { WebglRenderer, hasRealGpu } from "./webgl.js";
 
@@ -37,6 +38,7 @@ export class AvatarView extends EventTarget {
   #context;
   #core; // { header, motion, poses }
   #source = { kind: "idle", since: 0, first: 0, frame: 0, paused: false };
+  #driver;
   #previous; // the pose that a new motion blends from
   #pose;
   #pinned = new Map(); // parameter index -> value that a caller has set
@@ -59,6 +61,11 @@ export class AvatarView extends EventTarget {
   /** Seconds into the recorded motion. */
   get time() {
     return this.#source.kind === "recorded" ? this.#source.frame / this.header.fps : 0;
+  }
+
+  /** "idle", "recorded", "rest" or, while faces come, "driven". */
+  get motion() {
+    return this.#source.kind;
   }
 
   get isPlaying() {
@@ -125,6 +132,26 @@ export class AvatarView extends EventTarget {
     const frame = kind === "recorded" ? this.#clampFrame((from ?? this.time) * this.header.fps) : 0;
     this.#source = { kind, since: performance.now(), first: frame, frame, paused: false };
     this.#tell("motion");
+  }
+
+  /**
+   * Show a face: ARKit's blendshape scores by name (mouthSmileLeft), and the head's pose, 4x4 by columns in OpenGL's axes, both
+   * as MediaPipe's face landmarker gives them. `taken`: when its picture was, in milliseconds of performance.now().
+   */
+  drive(scores, matrix = null, taken = performance.now()) {
+    const numbers = [...Object.values(scores), ...(matrix ?? [])];
+    if (!numbers.every(Number.isFinite) || (matrix && matrix.length !== 16))
+      throw new AvatarError("A face is scores by name and 16 numbers of its pose.");
+    const before = this.#source.kind === "driven" ? null : this.#pose && { pose: this.#pose, since: performance.now() };
+    const pose = this.#driver.next({ scores, matrix }, taken / 1000);
+    if (before) this.#previous = before;
+    this.#source = { kind: "driven", since: 0, first: 0, frame: 0, paused: false, pose, taken };
+    if (before) this.#tell("motion");
+  }
+
+  /** Take a face { scores, matrix }, by default the newest, for the driver's neutral one. */
+  calibrate(face) {
+    this.#driver.calibrate(face);
   }
 
   pause() {
@@ -199,11 +226,12 @@ export class AvatarView extends EventTarget {
       this.#context.putImageData(new ImageData(data.values, width, height), 0, 0);
     }
     this.#count(data.milliseconds);
-    this.#tell("drawn");
+    this.dispatchEvent(new CustomEvent("drawn", { detail: { taken: this.#shown.taken } }));
   }
 
   #start({ header, motion, poses }) {
     this.#core = { header, motion, poses };
+    this.#driver = new FaceDriver(header);
     this.#size ||= header.size;
     if (this.#wantsGpu) {
       try {
@@ -232,7 +260,7 @@ export class AvatarView extends EventTarget {
     const camera = orbit(base, this.view, width);
     const key = JSON.stringify([Array.from(pose.parameters), camera, width]);
     if (key === this.#shown?.key) return; // nothing has changed
-    this.#shown = { camera, width, height, key };
+    this.#shown = { camera, width, height, key, taken: this.#source.taken };
     this.#inFlight = true;
     this.#worker.postMessage({
       type: "frame", parameters: pose.parameters, camera, width, height, background: header.background,
@@ -246,6 +274,8 @@ export class AvatarView extends EventTarget {
     if (source.kind === "recorded") {
       if (!source.paused) source.frame = Math.round(source.first + seconds * header.fps) % this.frameCount;
       pose = recorded(this.#core, source.frame);
+    } else if (source.kind === "driven") {
+      pose = source.pose;
     } else {
       pose = idle(header, seconds, source.kind === "rest" || source.paused);
     }

@@ -28,6 +28,7 @@ from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
 
 CALIBRATION_SECONDS = 4.0
 FEWEST, MOST = 20, 60  # pictures with the face that calibration is made from
+_NO_FACES = np.zeros((0, 478, 3), np.float32)
 _SAME_PERSON = 0.1  # overlap (IoU) with the last place of the face
 
 
@@ -50,8 +51,21 @@ class Calibration:
 class FaceFollower:
     """A face in the newest pictures of a source. Use from one thread, but for `close`."""
 
-    def __init__(self, source: Source, assets: HeadAssets, head_path: Path, say: Callable[[str], object]) -> None:
-        """Raises UserError where MediaPipe or its model is missing. The head model's landmarks may take 30 s, once."""
+    def __init__(
+        self,
+        source: Source,
+        assets: HeadAssets,
+        head_path: Path,
+        say: Callable[[str], object],
+        field_of_view: float | None = None,
+    ) -> None:
+        """`field_of_view` in degrees across the pictures' width, where it is known.
+
+        Raises UserError where MediaPipe or its model is missing, or no camera has that field of view. The head model's
+        landmarks may take 30 s, once.
+        """
+        choose_focal(*source.size, _NO_FACES, field_of_view=field_of_view)
+        self._field_of_view = field_of_view
         self._assets, self._embedding = assets, find_embedding(head_path, assets, say)
         self._detector = FaceDetector()
         self.pictures = Newest(source)
@@ -150,7 +164,8 @@ class FaceFollower:
             size,
             (len(found) - 1) / (times[-1] - times[0]),
         )
-        focal = choose_focal(*size, points, equivalent=self.pictures.source.equivalent_focal).pixels
+        equivalent = self.pictures.source.equivalent_focal
+        focal = choose_focal(*size, points, field_of_view=self._field_of_view, equivalent=equivalent).pixels
         camera = Pinhole(focal, focal, size[0] / 2, size[1] / 2)
         fit = fit_landmarks(self._assets, self._assets.names, self._embedding, landmarks, camera)
         self._fit = FrameFit(self._assets, self._assets.names, self._embedding, fit, camera, size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,15 @@ def test_every_source_of_the_web_core_is_recorded() -> None:
     recorded = (WEB / "avatar.wasm.sha256").read_text()
     for path in (WEB.parent / "csrc" / "web").iterdir():
         assert f"avatar/csrc/web/{path.name}" in recorded
+
+
+def test_the_package_lists_every_module_that_it_needs() -> None:
+    listed = set(json.loads((WEB / "package.json").read_text())["files"])
+    needed, found = ["index.js"], set()
+    while needed:
+        name = needed.pop()
+        found.add(name)
+        text = (WEB / name).read_text()
+        named = re.findall(r'from "\./([\w.]+)"|new URL\("([\w.]+)", BASE\)', text)
+        needed += [a or b for a, b in named if (a or b).endswith(".js") and (a or b) not in found]
+    assert found | {"avatar.wasm", "index.d.ts"} == listed and {"camera.js", "watcher.js", "worker.js"} <= found

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import re
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
-import numpy as np
 import pytest
 import torch
 from browsers import WEB, chromium, served
 from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
+from pages import shown, until
 
 from avatar.export.web_page import bundle, script_text, write_page, write_web_avatar
 from avatar.motion.controls import expression_controls, joint_ranges, posed
@@ -68,20 +66,6 @@ def opened(browser: Any, page_file: Path) -> Iterator[Any]:
     yield page
     assert not [words for words in wrong if "GPU stall" not in words]  # a note of the software renderer
     context.close()
-
-
-def shown(page: Any) -> torch.Tensor:
-    """The canvas as values in [0, 1]."""
-    data = page.evaluate("avatar.screenshot().then(b => b.arrayBuffer()).then(b => Array.from(new Uint8Array(b)))")
-    return torch.from_numpy(iio.imread(io.BytesIO(bytes(data)))[..., :3].astype(np.float32) / 255)
-
-
-def until(page: Any, expression: str, seconds: float = 20.0) -> None:
-    """Playwright's own waiting evaluates text inside the page, which the page's security policy forbids."""
-    end = time.monotonic() + seconds
-    while not page.evaluate(expression):
-        assert time.monotonic() < end, f"never: {expression}"
-        page.wait_for_timeout(20)
 
 
 def after(page: Any, script: str) -> torch.Tensor:

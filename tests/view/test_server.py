@@ -161,4 +161,5 @@ def test_what_cannot_be_shown_is_said(tracked_folder: Path, tmp_path: Path) -> N
     assert "gone.mp4 does not exist" in avatar("view", run, "--webcam", "gone.mp4", "--port", 0, status=1)
     assert "camera 97 gives no picture" in avatar("view", run, "--webcam", "97", "--port", 0, status=1)
     assert "not allowed with argument" in avatar("view", run, "--webcam", "--stream", 0, status=2)
+    assert "--fov belongs to --webcam" in avatar("view", run, "--fov", 60, "--port", 0, status=1)
     assert "--token must be at least 8" in avatar("view", run, "--token", "short", status=1)

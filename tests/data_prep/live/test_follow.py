@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import subprocess
 import sys
@@ -64,6 +65,19 @@ def test_the_mouth_is_followed(video: Path, head: Path, monkeypatch: pytest.Monk
     truth = perform(SEED, FRAMES, "speech").jaw[frames]
     assert np.abs(np.array(opened) - truth).mean() < 0.06
     assert 0 < follower.milliseconds["fit"] < 1000 and follower.dropped()[1] == FRAMES
+
+
+def test_the_field_of_view_says_how_far_the_face_is(video: Path, head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(follow, "CALIBRATION_SECONDS", 1.0)
+    assets, distances = load_head_assets(head), []
+    for degrees in (15.0, 30.0):
+        with contextlib.closing(FaceFollower(open_source(str(video)), assets, head, print, degrees)) as follower:
+            faces = follower.calibrate(lambda _: None).faces
+        distances.append(float(np.median([float(face.t_cam_head[2]) for face in faces])))
+    expected = math.tan(math.radians(15.0)) / math.tan(math.radians(7.5))
+    assert distances[0] / distances[1] == pytest.approx(expected, rel=0.1)
+    with pytest.raises(UserError, match="--fov must be from 1 to 150 degrees"):
+        FaceFollower(open_source(str(video)), assets, head, print, 180.0)
 
 
 def test_a_video_that_is_too_short_to_calibrate(video: Path, head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
