@@ -71,6 +71,7 @@ class TrainerConfig:
     """The optimisation."""
 
     iterations: int
+    passes: int | None
     seed: int
     learning_rates: LearningRates
     lr_warmup: int
@@ -134,6 +135,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "model.sh_degree": (0, 3),
     "model.initial_opacity": (1e-6, 1 - 1e-6),
     "trainer.iterations": (1, MOST_STEPS),
+    "trainer.passes": (1, MOST_STEPS),
     "trainer.seed": (0, 2**31 - 1),
     "trainer.lr_warmup": (0, MOST_STEPS),
     "trainer.lr_final": (0, 1),

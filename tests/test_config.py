@@ -66,6 +66,7 @@ def test_the_best_recipe_is_the_default_with_its_kept_ingredients() -> None:
     assert {key: value for key, value in ours.items() if value != default[key]} == {
         "model.uv_detail": 2,
         "trainer.iterations": 5000,
+        "trainer.passes": 10,
         "trainer.dssim_early": 0.1,
         "trainer.dssim_weight": 0.2,
     }

@@ -28,6 +28,7 @@ from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.footprint import training_needs
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
+from avatar.train.order import within_passes
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
 from data_prep.open import open_subject
@@ -79,11 +80,20 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
         chosen = choose_device(device or config.device, print)
         subject, assets = open_subject(source, split_sizes(config))
         check_divided(subject.split)
+        config = on_subject(config, subject)
         size = subject.image_size(config.data.size)
         perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
         avatar = new_avatar(assets, subject, config, perceptual.name, chosen)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
         return finish_training(avatar, subject, config, run, perceptual, chosen)
+
+
+def on_subject(config: Config, subject: Subject) -> Config:
+    """With the steps that `trainer.passes` leaves on this subject; says so where they are fewer."""
+    trainer = within_passes(config.trainer, len(subject.split.train))
+    if trainer.iterations < config.trainer.iterations:
+        print(f"{trainer.passes} passes over the training frames are {trainer.iterations:,} steps (trainer.passes)")
+    return replace(config, trainer=trainer)
 
 
 def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, device: str | None = None) -> int:
@@ -176,8 +186,12 @@ def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: li
     if overrides:
         recorded = {**flatten(info.config.to_dict()), **info.options}
         asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
+        limited = (
+            recorded["trainer.passes"] is not None and asked["trainer.iterations"] > recorded["trainer.iterations"]
+        )
+        free = {"device", *(["trainer.iterations"] if limited else [])}  # what was asked for is not recorded
         for key in (override.partition("=")[0] for override in overrides):
-            if key != "device" and recorded[key] != asked[key]:
+            if key not in free and recorded[key] != asked[key]:
                 raise UserError(
                     f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
                     "start a new run"

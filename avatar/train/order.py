@@ -1,10 +1,20 @@
-"""Which training frame each step sees."""
+"""How many steps there are, and which training frame each of them sees."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
+
+from avatar.config import TrainerConfig
+
+
+def within_passes(config: TrainerConfig, frames: int) -> TrainerConfig:
+    """The same with no more iterations than `passes` passes over so many training frames take."""
+    if config.passes is None:
+        return config
+    return replace(config, iterations=min(config.iterations, config.passes * frames))
 
 
 def frame_order(frames: Sequence[int], seed: int, start: int, stop: int) -> Iterator[int]:

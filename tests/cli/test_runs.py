@@ -110,6 +110,21 @@ def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder
     assert "at step 8 of 12" in avatar("train", own_folder, "--out", begun, "--resume", *same)
 
 
+def test_a_run_of_few_frames_ends_with_its_passes_and_is_resumed_by_the_same_command(
+    own_folder: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    command = ("train", own_folder, "--out", run, *OPTIONS, "data.test_frames=8", "trainer.passes=2")
+    output = avatar(*command)
+    assert "2 passes over the training frames are 8 steps" in output and "8 held out, 8 steps" in output
+    assert [path.stem[-2:] for path in list_checkpoints(run / "checkpoints")] == ["04", "08"]
+    assert read_run_info(run).config.trainer.iterations == newest_checkpoint(run).step == 8
+    list_checkpoints(run / "checkpoints")[-1].unlink()
+    assert "at step 4 of 8" in avatar(*command, "--resume")
+    fewer = avatar(*command, "trainer.iterations=7", "--resume", status=1)
+    assert "began with trainer.iterations=8, not 7" in fewer
+
+
 @pytest.mark.parametrize("way", [("--device", "cpu"), ("device=cpu",)])
 def test_a_run_may_go_on_on_another_device_and_says_so(way: tuple[str, ...], begun: Path, own_folder: Path) -> None:
     newest = newest_checkpoint(begun)

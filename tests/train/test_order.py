@@ -1,9 +1,21 @@
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from itertools import islice
 
-from avatar.train.order import frame_order
+import pytest
+from small_runs import small_config
+
+from avatar.train.order import frame_order, within_passes
+
+
+@pytest.mark.parametrize(("passes", "steps"), [(None, 12), (1, 5), (2, 10), (3, 12)])
+def test_passes_limit_the_steps_where_frames_are_few(passes: int | None, steps: int) -> None:
+    asked = small_config(f"trainer.passes={'null' if passes is None else passes}").trainer
+    given = within_passes(asked, frames=5)
+    assert given.iterations == steps
+    assert dataclasses.replace(given, iterations=12) == asked
 
 
 def test_every_pass_sees_every_frame_once_in_a_new_order() -> None:
