@@ -28,7 +28,6 @@ _ALL_HEAD = 0.75  # above, inside the matte
 _DIVIDED = 1.0  # below: the rest needs no division
 _MARGIN_IN, _MARGIN_OUT = 7, 5  # pixels of SIDE by which the mesh may be wrong
 _NEAR = 1.5  # pixels of SIDE
-_BORDER = 1  # times the band of a matte's edge
 _ITERATIONS = 1  # of GrabCut: three gain 0.0001 of IoU on demo people and take half as long again
 _NOWHERE = (255, 0, 255)  # a colour that no person has, in the place of the background
 
@@ -106,7 +105,7 @@ def _nearer_to(
 
 def _divided_border(image: np.ndarray, head: np.ndarray, person: np.ndarray) -> UInt8[np.ndarray, "H W"]:
     """The head's mask with the colours' share of each pixel where it borders on clothes."""
-    reach = 2 * _BORDER * band_radius(*head.shape) + 1
+    reach = 2 * band_radius(*head.shape) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     is_head = (head > 127).astype(np.uint8)
     is_clothes = ((person > 127) & (is_head == 0)).astype(np.uint8)

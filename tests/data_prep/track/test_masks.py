@@ -47,7 +47,11 @@ def test_the_head_without_its_clothes(seed: int, shift: int) -> None:
             screen = camera.project(model.vertices(params)).numpy()
         made = head_mask(picture.image, picture.alpha, screen + np.array([shift, 0, 0]), faces, ring)
         assert iou(made.mask > 0, picture.head > 127) > 0.97
-        assert set(np.unique(made.mask)) <= {0, 255} and made.overlap > (0.99 if shift == 0 else 0.9)
+        assert made.overlap > (0.99 if shift == 0 else 0.9)
+        # Shares only where the head borders on clothes.
+        shares = (made.mask > 0) & (made.mask < 255)
+        clothes = cv2.dilate(((picture.alpha > 127) & (picture.head < 128)).astype(np.uint8), np.ones((9, 9))) > 0
+        assert shares.any() and (shift or not (shares & ~clothes).any())
         # A matte that is empty, and a mesh that is elsewhere, make no mask and no noise.
         assert not head_mask(picture.image, 0 * picture.alpha, screen, faces, ring).mask.any()
         assert head_mask(picture.image, picture.alpha, screen + np.array([2000.0, 0, 0]), faces, ring).overlap == 0.0
