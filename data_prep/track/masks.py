@@ -109,7 +109,7 @@ def _divided_border(image: np.ndarray, head: np.ndarray, person: np.ndarray) -> 
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     is_head = (head > 127).astype(np.uint8)
     is_clothes = ((person > 127) & (is_head == 0)).astype(np.uint8)
-    band = (cv2.dilate(is_head, disc) & cv2.dilate(is_clothes, disc)) > 0
+    band = (cv2.dilate(is_head, disc) > 0) & (cv2.dilate(is_clothes, disc) > 0)
     return np.rint(closed_form(image, is_head.astype(np.float32), band) * 255.0).astype(np.uint8)
 
 
