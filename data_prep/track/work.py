@@ -12,6 +12,7 @@ import numpy as np
 
 from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
 from data_prep.track.fit.fitting import fit_tracks
@@ -23,6 +24,7 @@ from data_prep.track.frames import FrameImages, FrameMattes, in_view, write_fram
 from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matte import open_matter, sharpened
+from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.stages import Stages
 
@@ -142,9 +144,15 @@ class Work:
             project = fit.projector(self._head)
             overlaps: dict[int, float] = {}
 
+            def zones(number: int) -> Zones:
+                row = rows[number]
+                return zones_of(images[row], mattes[row], project(number), self._faces, ring)  # type: ignore[arg-type]
+
+            colours = learn_colours(map(zones, numbers[:: -(-len(numbers) // CLIP_FRAMES)]))
+
             def one(number: int) -> np.ndarray:
                 row = rows[number]
-                made = head_mask(images[row], mattes[row], project(number), self._faces, ring)  # type: ignore[arg-type]
+                made = head_mask(images[row], mattes[row], zones(number), colours)
                 overlaps[number] = made.overlap
                 return made.mask
 
