@@ -152,7 +152,7 @@ class Work:
 
             def one(number: int) -> np.ndarray:
                 row = rows[number]
-                made = head_mask(images[row], mattes[row], zones(number), colours)
+                made = head_mask(images[row], mattes[row], zones(number), colours)  # type: ignore[arg-type]
                 overlaps[number] = made.overlap
                 return made.mask
 
