@@ -1,7 +1,8 @@
 """Head and mouth masks from the matte and the posed mesh.
 
 The matte has clothes on it; where the neck ends is found by GrabCut inside the matte (Rother, Kolmogorov, Blake 2004), with
-the mesh to say what is surely head and what is surely not. Everything is measured in heights above the mesh's neck ring.
+the mesh to say what is surely head and what is surely not, the clip's colours to begin from, and along that border
+closed-form matting. Everything is measured in heights above the mesh's neck ring.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from avatar.errors import UserError
-from data_prep.projection import silhouette
+from data_prep.track.clothes import Colours
 from data_prep.track.faces.landmark_groups import OUTER_LIPS
+from data_prep.track.matting import band_radius, closed_form, within_limits
+from data_prep.track.neck_zones import SIDE, Zones
 
-SIDE = 256  # pixels of the picture that is divided; the division is enlarged
 # Heights above the neck ring; 1 is the middle of the head.
 _SURELY_CLOTHES = -0.15  # below
 _CLOTHES_BESIDE = 0.10  # below and outside the mesh
@@ -24,13 +26,17 @@ _MAYBE_BESIDE = 0.50  # below and outside: shoulders, or hair that falls on them
 _SURELY_HEAD = 0.30  # above and well inside the mesh
 _ALL_HEAD = 0.75  # above, inside the matte
 _DIVIDED = 1.0  # below: the rest needs no division
-_MARGIN_IN, _MARGIN_OUT = 7, 5  # pixels of SIDE by which the mesh may be wrong
+_COLLAR, _MIDDLE = (
+    0.45,
+    0.12,
+)  # below, and so far from the head's axis: clothes on the mesh reach as high, where the colours say so
+_NEAR = 1.5  # pixels of SIDE
 _ITERATIONS = 1  # of GrabCut: three gain 0.0001 of IoU on demo people and take half as long again
 _NOWHERE = (255, 0, 255)  # a colour that no person has, in the place of the background
 
 
 class HeadMask(NamedTuple):
-    mask: UInt8[np.ndarray, "H W"]  # 0 or 255
+    mask: UInt8[np.ndarray, "H W"]  # 0 or 255, and shares between where head and clothes meet
     overlap: float  # share of the mesh (above the ring) that lies on the matte
 
 
@@ -53,33 +59,31 @@ def neck_ring(template: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
 
 
 def head_mask(
-    image: UInt8[np.ndarray, "H W 3"],
-    matte: UInt8[np.ndarray, "H W"],
-    screen: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    ring: Int[np.ndarray, " R"],
+    image: UInt8[np.ndarray, "H W 3"], matte: UInt8[np.ndarray, "H W"], zones: Zones, colours: Colours | None = None
 ) -> HeadMask:
-    """Head and neck of the person in `matte`; `screen` are the posed vertices in pixels of the image (centres at +0.5)."""
+    """Head and neck of the person in `matte`; `zones` are the image's, `colours` its clip's where they are known."""
     height, width = matte.shape
-    small_screen = screen * np.array([SIDE / width, SIDE / height, 1.0])
-    points, body = small_screen[:, :2], silhouette(small_screen, faces, SIDE, SIDE)
-    inside = cv2.erode(body, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_MARGIN_IN, _MARGIN_IN))) > 0
-    outside = cv2.dilate(body, np.ones((_MARGIN_OUT, _MARGIN_OUT), np.uint8)) == 0
-    level = _level(points, ring)
-    person = cv2.resize(matte, (SIDE, SIDE), interpolation=cv2.INTER_AREA) > 127
+    person, inside, outside, level = zones.person, zones.inside, zones.outside, zones.level
     labels = np.full((SIDE, SIDE), cv2.GC_PR_FGD, np.uint8)
     labels[outside & (level < _MAYBE_BESIDE)] = cv2.GC_PR_BGD
     labels[(level < _SURELY_CLOTHES) | (outside & (level < _CLOTHES_BESIDE))] = cv2.GC_BGD
     labels[(inside & (level > _SURELY_HEAD)) | (level > _ALL_HEAD)] = cv2.GC_FGD
+    if colours is not None:
+        unsure = (
+            ~outside & (level >= _SURELY_CLOTHES) & (level < np.where(zones.aside < _MIDDLE, _SURELY_HEAD, _COLLAR))
+        )
+        labels[unsure] = np.where(colours.are_clothes(zones.image, unsure)[unsure], cv2.GC_PR_BGD, cv2.GC_PR_FGD)
     labels[~person] = cv2.GC_BGD
-    small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    small = zones.image.copy()
     small[~person] = _NOWHERE
     _divide(small, labels, level)
     head = _with_face((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), inside & (level > _ALL_HEAD))
-    above = (body > 0) & (level > _SURELY_HEAD)
+    above = zones.body & (level > _SURELY_HEAD)
     overlap = float(person[above].mean()) if above.any() else 0.0
-    large = cv2.resize(head.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
-    return HeadMask((large & (matte > 127)).astype(np.uint8) * 255, overlap)
+    person_large = np.where(matte > 127, np.uint8(255), np.uint8(0))
+    large = np.where(_nearer_to(head, person & ~head, width, height), person_large, np.uint8(0))
+    mask = within_limits(_divided_border, image, large, person_large)
+    return HeadMask(np.minimum(mask, person_large), overlap)
 
 
 def mouth_mask(points: Float32[np.ndarray, "478 3"], width: int, height: int) -> UInt8[np.ndarray, "H W"]:
@@ -90,13 +94,22 @@ def mouth_mask(points: Float32[np.ndarray, "478 3"], width: int, height: int) ->
     return cv2.fillPoly(mask, [corners], 255, shift=4)
 
 
-def _level(points: np.ndarray, ring: np.ndarray) -> Float[np.ndarray, "S S"]:
-    """Height of every pixel's centre above the ring along the head's axis; 1 is the middle of the head."""
-    base = points[ring].mean(0)
-    axis = points.mean(0) - base
-    axis = axis / max(float(axis @ axis), 1e-9)
-    rows, columns = np.mgrid[0:SIDE, 0:SIDE] + 0.5
-    return (columns - base[0]) * axis[0] + (rows - base[1]) * axis[1]
+def _nearer_to(
+    head: Bool[np.ndarray, "S S"], clothes: Bool[np.ndarray, "S S"], width: int, height: int
+) -> Bool[np.ndarray, "H W"]:
+    """Where the head is nearer than clothes are: the finer matte has pixels that neither covers."""
+    difference = cv2.GaussianBlur(head.astype(np.float32) - clothes.astype(np.float32), (0, 0), _NEAR)
+    return cv2.resize(difference, (width, height), interpolation=cv2.INTER_LINEAR) > 0
+
+
+def _divided_border(image: np.ndarray, head: np.ndarray, person: np.ndarray) -> UInt8[np.ndarray, "H W"]:
+    """The head's mask with the colours' share of each pixel where it borders on clothes."""
+    reach = 2 * band_radius(*head.shape) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    is_head = (head > 127).astype(np.uint8)
+    is_clothes = ((person > 127) & (is_head == 0)).astype(np.uint8)
+    band = (cv2.dilate(is_head, disc) > 0) & (cv2.dilate(is_clothes, disc) > 0)
+    return np.rint(closed_form(image, is_head.astype(np.float32), band) * 255.0).astype(np.uint8)
 
 
 def _divide(image: np.ndarray, labels: np.ndarray, level: np.ndarray) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
 from data_prep.track.fit.fitting import fit_tracks
@@ -19,10 +20,11 @@ from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Box, Footage, Span, View
-from data_prep.track.frames import FrameImages, FrameMattes, write_frames, write_given_mattes, write_masks
+from data_prep.track.frames import FrameImages, FrameMattes, in_view, write_frames, write_given_mattes, write_masks
 from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
-from data_prep.track.matte import open_matter
+from data_prep.track.matte import open_matter, sharpened
+from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.stages import Stages
 
@@ -94,13 +96,15 @@ class Work:
                 write_given_mattes(folder, given, view, self._choices.span, look, size, self._progress)
                 return {}
             images = FrameImages(self._folder / FRAMES, numbers)
+            points = in_view(look.landmarks, view).points[:, :, :2]
             rows = {number: row for row, number in enumerate(numbers)}
             own = threading.local()  # a network is for one thread
 
             def one(number: int) -> np.ndarray:
                 if not hasattr(own, "matter"):
                     own.matter, _ = open_matter()
-                return own.matter(images[rows[number]])
+                image = images[rows[number]]
+                return sharpened(image, own.matter(image), points[number])  # type: ignore[arg-type]
 
             write_masks(folder, numbers, one, self._progress, "making mattes")
             return {}
@@ -140,9 +144,15 @@ class Work:
             project = fit.projector(self._head)
             overlaps: dict[int, float] = {}
 
+            def zones(number: int) -> Zones:
+                row = rows[number]
+                return zones_of(images[row], mattes[row], project(number), self._faces, ring)  # type: ignore[arg-type]
+
+            colours = learn_colours(map(zones, numbers[:: -(-len(numbers) // CLIP_FRAMES)]))
+
             def one(number: int) -> np.ndarray:
                 row = rows[number]
-                made = head_mask(images[row], mattes[row], project(number), self._faces, ring)  # type: ignore[arg-type]
+                made = head_mask(images[row], mattes[row], zones(number), colours)  # type: ignore[arg-type]
                 overlaps[number] = made.overlap
                 return made.mask
 
