@@ -7,6 +7,7 @@ Within that, around the head, closed-form matting says what the colours say (nei
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 import cv2
@@ -21,6 +22,7 @@ SIDE = 256  # of the networks' pictures
 _SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network
 # How far hair, ears and neck reach beyond the landmarks' box, of its longer side: above, beside, below.
 _ABOVE, _BESIDE, _BELOW = 0.75, 0.5, 0.6
+_LOADING = threading.Lock()  # two loads at once find operators unsupported: OpenCV's table of them is filled by the first
 Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
 
 
@@ -76,7 +78,8 @@ def _with_mirrored(matter: Matter) -> Matter:
 def _segmentation() -> Matter:
     file = require(SELFIE_SEGMENTATION)
     try:
-        net = cv2.dnn.readNetFromTFLite(str(file))
+        with _LOADING:
+            net = cv2.dnn.readNetFromTFLite(str(file))
     except cv2.error as error:
         raise UserError(f"OpenCV cannot load {file} ({error.err}); fetch {SELFIE_SEGMENTATION.url} again") from None
 
