@@ -16,6 +16,8 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from playwright.sync_api import sync_playwright
 
 from avatar.commands.opening import open_trained
@@ -72,6 +74,28 @@ def speed(page: Any) -> tuple[float, float]:
     return 1000 * drawn / (end - begin), page.evaluate("avatar.statistics.milliseconds")
 
 
+def quad_pixels(trained: TrainedAvatar, width: int) -> float:
+    """Pixels that a GPU shades for a picture: those of the boxes that avatar/web/webgl.js draws, inside the picture."""
+    counts = []
+    for index in list(trained.recording.split.test)[:FRAMES]:
+        camera = trained.recording.camera(index, width)
+        means, quats, scales, opacities, _ = trained.gaussians(trained.recording.params(index))
+        seen = opacities >= 1 / 255
+        axes = quaternion_to_rotation_matrix(quats[seen]) * scales[seen, None]
+        p = means[seen] @ camera.R_cam_world.T + camera.t_cam_world
+        x, y, z = p.unbind(-1)
+        zero = torch.zeros_like(z)
+        rows = [camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2]
+        J = torch.stack(rows, -1).unflatten(-1, (2, 3))
+        variances = (J @ camera.R_cam_world @ axes).square().sum(-1) + 0.3
+        half = (2 * (255 * opacities[seen]).log()[:, None] * variances).sqrt() + 1
+        size = torch.tensor([camera.width, camera.height])
+        centre = camera.project(means[seen])[:, :2]
+        corners = [(centre + sign * half).clamp(min=torch.zeros(2), max=size) for sign in (-1, 1)]
+        counts.append(float((corners[1] - corners[0]).prod(-1).sum()))
+    return statistics.mean(counts)
+
+
 def measure_viewer(trained: TrainedAvatar) -> None:
     stage = Stage(trained)
     frames = list(trained.recording.split.test)[:40]
@@ -92,6 +116,8 @@ def main() -> None:
     trained = open_trained(arguments.run, arguments.head)
     print(f"avatar   {len(trained.avatar):,} Gaussians")
     measure_viewer(trained)
+    for width in (SIZE, 2 * SIZE):
+        print(f"webgl    {width}x{width}: {quad_pixels(trained, width) / 1e6:.2f} million pixels of quads a picture")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
         for precision in ("small", "float"):
