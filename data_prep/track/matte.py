@@ -22,7 +22,8 @@ SIDE = 256  # of the networks' pictures
 _SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network
 # How far hair, ears and neck reach beyond the landmarks' box, of its longer side: above, beside, below.
 _ABOVE, _BESIDE, _BELOW = 0.75, 0.5, 0.6
-_LOADING = threading.Lock()  # two loads at once find operators unsupported: OpenCV's table of them is filled by the first
+_LOADING = threading.Lock()
+"""Two loads at once find operators unsupported, or crash: OpenCV's table of them is filled by the first."""
 Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
 
 
