@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from avatar.errors import UserError
 from avatar.types import Camera, Frame, HeadParams
 
 FAINTEST_MATTE = 10  # of 255: below it a JPEG matte is noise, not foreground
+_LONGEST_SHOWN = 1000  # characters of a path in a sentence
 
 
 def head_of_matte(matte: np.ndarray) -> np.ndarray:
@@ -130,8 +132,9 @@ class Subject:
         record = self.manifest.frames[self.recording.checked(index)]
         source = Path(self.manifest.source)
         shape = (self.height, self.width)
-        if not source.is_dir():
-            raise UserError(f"the subject's frames are gone: {source} does not exist; prepare the subject again")
+        if not os.path.isdir(source):  # noqa: PTH112 (Path.is_dir raises where a name is too long for the system)
+            shown = str(source) if len(str(source)) <= _LONGEST_SHOWN else f"...{str(source)[-_LONGEST_SHOWN:]}"
+            raise UserError(f"the subject's frames are gone: {shown} does not exist; prepare the subject again")
         image = self._same_size(read_image(source / record.image), source / record.image)
         alpha = np.full(shape, 255, np.uint8)
         if record.alpha is not None:

@@ -155,6 +155,14 @@ def test_images_that_change_after_preparation(name: str, broken: Path) -> None:
         subject.frame(2)
 
 
+@pytest.mark.parametrize("source", ["/" + "so/" * 2000, "/" + 300 * "a", "~\0~"], ids=["a path", "a name", "no name"])
+def test_a_source_that_no_system_could_hold_is_a_source_that_is_gone(source: str, broken: Path) -> None:
+    edit_manifest(broken, source=source)
+    with pytest.raises(UserError, match=r"the subject's frames are gone: \S+ does not exist; prepare") as refused:
+        Subject.open(broken).frame(2)
+    assert len(str(refused.value)) < 1200
+
+
 def test_frames_at_their_own_size(prepared: Path) -> None:
     subject = Subject.open(prepared)
     frame = subject.frame(4)
