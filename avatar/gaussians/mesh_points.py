@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.gaussians.compose import quaternion_product
+from avatar.head.normals import vertex_normals
 
 MOST_CROSSINGS = 8  # of edges at once; a place that is then outside still is set on the rim of its triangle
 LEAST_HEIGHT = 1e-7  # metres, of a triangle: a degenerate one takes part as one of this height
@@ -166,14 +167,6 @@ def unfolding(
     middle, there_middle = (start + stop) / 2, (there_start + there_stop) / 2
     shift = there_middle - torch.einsum("eij,ej->ei", turn, middle)
     return across, turn.reshape(F, 3, 2, 2), shift.reshape(F, 3, 2)
-
-
-def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
-    """Unit normals, the triangles' weighted by their areas."""
-    a, b, c = vertices[faces].unbind(dim=1)
-    of_faces = torch.linalg.cross(b - a, c - a)
-    total = torch.zeros_like(vertices).index_add(0, faces.reshape(-1), of_faces.repeat_interleave(3, dim=0))
-    return normalize(total, dim=-1)
 
 
 def frame_quats(corners: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 4"]:

@@ -9,7 +9,8 @@ import torch
 from heads import grid_head
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-from avatar.gaussians.mesh_points import MeshPoints, frame_quats, vertex_normals
+from avatar.gaussians.mesh_points import MeshPoints, frame_quats
+from avatar.head.normals import vertex_normals
 
 SQUARE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
 HALVES = torch.tensor([[0, 1, 2], [2, 3, 0]])

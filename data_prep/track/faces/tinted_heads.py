@@ -10,6 +10,7 @@ import torch
 
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE, HeadModel
+from avatar.head.normals import vertex_normals
 from avatar.head.rasterize import rasterize_mesh
 from avatar.types import HeadParams
 from data_prep.track.fit.expression_kind import is_statistical, used_expressions
@@ -139,7 +140,7 @@ class _Paint:
 
 def _open_sky(points: np.ndarray, faces: np.ndarray, unit: float) -> np.ndarray:
     """How much of the light from all sides arrives at each vertex [V]: 1 on open ground, dark in nostrils and folds."""
-    normals = _vertex_normals(points, faces)
+    normals = _normals(points, faces)
     span = 2.2 * np.ptp(points, axis=0).max() / 2
     arrived, possible = np.zeros(len(points)), np.full(len(points), 1e-9)
     golden = np.pi * (3.0 - np.sqrt(5.0))
@@ -172,16 +173,11 @@ def _hair(p: np.ndarray) -> np.ndarray:
 
 def _raised(vertices: np.ndarray, faces: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Vertices moved along their normals, metres."""
-    return vertices + height[:, None] * _vertex_normals(vertices, faces)
+    return vertices + height[:, None] * _normals(vertices, faces)
 
 
-def _vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    corners = points[faces]
-    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], of_faces)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    return vertex_normals(torch.from_numpy(points), torch.from_numpy(faces)).numpy()
 
 
 def _shade(
@@ -191,7 +187,7 @@ def _shade(
     raster = rasterize_mesh(screen, faces, SIZE, SIZE)
     # With depth in the scale of the pixels, the picture's own space is near enough to a Euclidean one for the light.
     in_pixels = screen * np.array([1.0, 1.0, EYE_DISTANCE * CAMERA_DISTANCE / np.median(screen[:, 2])])
-    normals = _vertex_normals(in_pixels, faces)
+    normals = _normals(in_pixels, faces)
     light = np.array([rng.uniform(-0.7, 0.7), rng.uniform(-0.6, 0.5), -1.0])  # towards the light; y points down, z away
     light /= np.linalg.norm(light)
     lit = np.clip(normals @ light, 0.0, 1.0) * sky

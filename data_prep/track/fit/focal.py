@@ -13,7 +13,8 @@ from avatar.errors import UserError
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres; "equivalent" focal lengths compare diagonals (CIPA DCG-001)
 ASSUMED_EQUIVALENT = 28.0  # millimetres: telephones and webcams have 23 to 32
 PUPIL_DISTANCE = 0.063  # metres, of adults
-NEAREST = 0.6  # metres: a face that seems nearer than an arm is long is a part of a larger picture
+NEAREST = 0.6  # metres: a face that seems nearer than an arm is long is a part of a larger picture,
+CROPPED = 0.9  # and was filmed from 0.6 to 1.5 metres away, or farther
 _LEFT_IRIS, _RIGHT_IRIS = 473, 468
 
 
@@ -34,8 +35,8 @@ def choose_focal(
     """The focal length in pixels of pictures of `width` x `height`, in which the face has these landmarks.
 
     `given` pixels or `field_of_view` degrees across the width win over the metadata's `equivalent` millimetres; without
-    any, that of a telephone is assumed, or the one at which the face is `NEAREST` away where it would seem nearer: such a
-    video was cut out of a larger one. Raises UserError for values that no camera has.
+    any, that of a telephone is assumed, or the one at which the face is `CROPPED` away where it would seem nearer than
+    `NEAREST`: such a video was cut out of a larger one. Raises UserError for values that no camera has.
     """
     diagonal = math.hypot(width, height)
     if given is not None:
@@ -54,7 +55,7 @@ def choose_focal(
     if len(points):
         # Turned heads show their eyes closer together; the widest tenth is seen from the front.
         eyes = np.linalg.norm(points[:, _LEFT_IRIS, :2] - points[:, _RIGHT_IRIS, :2], axis=1)
-        distant = NEAREST * float(np.percentile(eyes, 90)) / PUPIL_DISTANCE
-        if distant > pixels:
-            pixels, words = distant, f"assumed: the face is {NEAREST:g} m away"
+        per_metre = float(np.percentile(eyes, 90)) / PUPIL_DISTANCE  # pixels of focal length, for a metre of distance
+        if NEAREST * per_metre > pixels:
+            pixels, words = CROPPED * per_metre, f"assumed: the face is {CROPPED:g} m away"
     return Focal(pixels, words, True)

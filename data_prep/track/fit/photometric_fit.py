@@ -1,4 +1,4 @@
-"""The motion of a clip improved by its pictures: every point of the skin keeps its colour.
+"""The motion of a clip improved by its pictures: every point of the skin keeps its colour, in each frame's light.
 
 The texture is the mean over the clip: the pictures say how frames lie to each other, and the landmarks, with less weight,
 where on the skin the head model lies. From coarse to fine: pictures are blurred first, so that a face that is some pixels
@@ -26,16 +26,17 @@ from data_prep.track.fit.landmark_fit import POINT_SHARE, LandmarkFit, eye_dista
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import minimise
 from data_prep.track.fit.motion import Motion, at_rest
-from data_prep.track.fit.photometric_term import PhotometricTerm, mean_texture
-from data_prep.track.fit.skin_points import face_triangles, seen_weights, spread_points
+from data_prep.track.fit.photometric_term import PhotometricTerm
+from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints
+from data_prep.track.fit.texture import light_basis, lit_texture
 
 EYES_IN_CROPS = 110.0  # pixels between the eyes, at most
 BLURS = (3.0, 1.2)  # per cent of the distance between the eyes
 NEAR_LIPS = 0.25  # distances between the eyes
-ROUNDS, ITERATIONS = 2, 2  # textures for each blur, and steps for each texture
+ROUNDS, ITERATIONS = 6, 1  # textures for each blur, and steps for each texture: it lags behind the motion
 COARSE_SHARE = 2  # of the fitted points one of so many counts at the first blur, where neighbours say the same
-LANDMARK_SHARE, FEATURE_SHARE = 0.1, 0.3  # of the landmarks' weights that stay; of lips, lids, irises and distances
+LANDMARK_SHARE, FEATURE_SHARE = 0.05, 0.2  # of the landmarks' weights that stay; of lips, lids, irises and distances
 HELD_OUT = 5  # one point of so many
 # dB that the held-out points must gain. On seven demo people whose motion is known (60 frames) the error of the face's
 # vertices, without what is the same in all frames, fell to 0.45 to 0.67 of what it was, at gains from 1.3 to 2.7 dB.
@@ -61,7 +62,7 @@ def fit_pictures(
 ) -> PhotometricFit:
     """`images` and `mattes` are those of the fit's frames by row. The identity stays as it is."""
     T, motion = len(start.motion), start.motion
-    corners, barycentric = spread_points(assets, face_triangles(assets))
+    corners, barycentric = spread_points(assets, skin_triangles(assets))
     is_held = torch.arange(len(corners)) % HELD_OUT == HELD_OUT // 2
     eyes = float(start.term.unit.mean()) / POINT_SHARE  # pixels of the frames
     points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
@@ -85,15 +86,15 @@ def fit_pictures(
         assert blurred is not None
         compared, own = skin.subset(compared_at[blur]), weights[:, compared_at[blur]]
         values = compared.values(blurred, motion)
-        wanted = _wanted(values, own)[0]
+        wanted = lit_texture(values, own, compared.basis).values(compared.basis)
         own = own * torch.where(on_mouth[compared_at[blur]], 1.0, _trust(values - wanted, own))
         term = PhotometricTerm(compared.points, camera, blurred, 0, wanted, own)
         motion = minimise(
             (term, *terms), start.identity, motion, start.columns, ITERATIONS, with_identity=False, coupled=True
         ).motion
     assert blurred is not None
-    before = _psnr(held.values(blurred, start.motion), first[:, is_held])
-    after = _psnr(held.values(blurred, motion), weights[:, is_held])
+    before = _psnr(held.values(blurred, start.motion), first[:, is_held], held.basis)
+    after = _psnr(held.values(blurred, motion), weights[:, is_held], held.basis)
     done = PhotometricFit(motion, before, after)
     return done if done.is_taken else replace(done, motion=start.motion)
 
@@ -113,6 +114,7 @@ class _Skin:
         self._of = assets, camera, crops, start
         self._corners, self._barycentric = corners, barycentric
         self.points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
+        self.basis = light_basis(assets, corners, barycentric)
 
     def subset(self, chosen: Tensor) -> _Skin:
         assets, camera, crops, start = self._of
@@ -167,14 +169,9 @@ def _quieter(term: LandmarkTerm) -> LandmarkTerm:
     return replace(term, weights=term.weights * share, pair_weights=term.pair_weights * FEATURE_SHARE)
 
 
-def _wanted(values: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]) -> tuple[Tensor, Tensor]:
-    texture, gain = mean_texture(values, weights)
-    return gain[:, None] * texture, gain
-
-
-def _psnr(values: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]) -> float:
-    """Of the median point's grey values, in 0 to 1, against their mean over the clip, in dB."""
-    wanted, _ = _wanted(values, weights)
+def _psnr(values: Float[Tensor, "T N"], weights: Float[Tensor, "T N"], basis: Float[Tensor, "N B"]) -> float:
+    """Of the median point's grey values, in 0 to 1, against its texture in each frame's light, in dB."""
+    wanted = lit_texture(values, weights, basis).values(basis)
     error = _mean_squares(values - wanted, weights)[weights.sum(0) > 0].median()
     return float(-10.0 * torch.log10(error.clamp(min=1e-12)))
 

@@ -1,7 +1,7 @@
-"""How far the colours of skin points are from their mean over the clip, and the derivatives through the image.
+"""How far the colours of skin points are from what they should be, and the derivatives through the image.
 
-A point n of the head has one grey value T_n in all frames, times a gain per frame. Where the head is a little off, its
-points land on their neighbours' values; the image's gradient says in which direction to go.
+A point of the head has one grey value in all frames, in each frame's light (see `texture`). Where the head is a little off,
+its points land on their neighbours' values; the image's gradient says in which direction to go.
 """
 
 from __future__ import annotations
@@ -74,22 +74,3 @@ class PhotometricTerm:
     def _frames(self, chunk: slice) -> slice:
         """Where the images of a chunk are."""
         return slice(self.first + chunk.start, self.first + chunk.stop)
-
-
-def mean_texture(
-    values: Float[Tensor, "T N"], weights: Float[Tensor, "T N"], rounds: int = 6
-) -> tuple[Float[Tensor, " N"], Float[Tensor, " T"]]:
-    """The grey value of every point and the gain of every frame whose products are nearest to `values`.
-
-    Alternating weighted least squares, reweighted for Cauchy's loss; the gains have mean 1. Unseen points are 0.
-    """
-    gain = values.new_ones(len(values))
-    robust = weights
-    texture = values.new_zeros(values.shape[1])
-    for _ in range(rounds):
-        texture = (robust * gain[:, None] * values).sum(0) / (robust * gain[:, None] ** 2).sum(0).clamp(min=1e-9)
-        gain = (robust * values * texture).sum(1) / (robust * texture**2).sum(1).clamp(min=1e-9)
-        gain = gain / gain.mean()
-        residuals = (values - gain[:, None] * texture) / DEVIATION
-        robust = weights / (1 + (residuals / ROBUST) ** 2)
-    return texture, gain

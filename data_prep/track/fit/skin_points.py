@@ -11,20 +11,26 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from avatar.head.rasterize import rasterize_mesh
 
-COUNT = 1250
+COUNT = 1500
 _DEPTH_TOLERANCE = 2e-3  # metres
 _FACING = (0.15, 0.5)  # cosine to the line of sight: not counted below, in full above
 _DEPTH_STEP = 2  # pixels of the crop that are one of the depth buffer
 _REACH = 1.35  # of the skin around the eyes' middle, in distances between the eyes; without a region "face"
 
 
-def face_triangles(assets: HeadAssets) -> Int[np.ndarray, "F 3"]:
-    """Triangles of the face without the eyeballs: of the region "face", else those in front and near the eyes."""
+def skin_triangles(assets: HeadAssets) -> Int[np.ndarray, "F 3"]:
+    """Triangles of the face, without the eyeballs, and of the ears, which lie behind it and so tell a nod from a shift.
+
+    Those of the regions "face" and "left_ear", "right_ear" where the head model has them, else those in front and near the
+    eyes.
+    """
     faces = assets.faces.numpy()
     eyeball = (assets.weights[:, [LEFT_EYE, RIGHT_EYE]] > 0.5).any(1).numpy()
     if "face" in assets.regions:
         inside = np.zeros(assets.num_vertices, bool)
-        inside[assets.regions["face"].numpy()] = True
+        for region in ("face", "left_ear", "right_ear"):
+            if region in assets.regions:
+                inside[assets.regions[region].numpy()] = True
     else:
         eyes = (assets.joint_regressor @ assets.template).numpy()[[LEFT_EYE, RIGHT_EYE]]
         unit = np.linalg.norm(eyes[0] - eyes[1])

@@ -6,6 +6,7 @@ is ended when it falls silent; here never more than one picture is held.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import re
 import subprocess
@@ -147,6 +148,8 @@ class Decoder:
                 if shown is None:
                     raise UserError(f"{self.path}: ffmpeg gave a picture without saying which; convert the video first")
                 yield Picture(shown, pixels)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(STALL_SECONDS)  # its output is closed, and it may still say why it ended there
         finally:
             process.kill()
             process.wait()

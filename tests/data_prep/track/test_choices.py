@@ -118,8 +118,12 @@ def test_the_lens() -> None:
     assert known.pixels == pytest.approx(26 / math.hypot(36, 24) * math.hypot(1920, 1080)) and not known.is_assumed
     assumed = choose_focal(1920, 1080, far)
     assert assumed.pixels == pytest.approx(28 / math.hypot(36, 24) * math.hypot(1920, 1080)) and assumed.is_assumed
-    # A face whose eyes are 270 pixels apart seems nearer than an arm is long: the lens must be longer.
-    assert choose_focal(1920, 1080, near).pixels == pytest.approx(0.6 * 270 / 0.063)
+    # Eyes 270 pixels apart seem nearer than an arm is long: the video was cut out of a larger one, of a usual distance.
+    cropped = choose_focal(1920, 1080, near)
+    assert cropped.pixels == pytest.approx(0.9 * 270 / 0.063) and "the face is 0.9 m away" in cropped.source
+    eyes = assumed.pixels * 0.063 / 0.6  # apart, of a face at an arm's length of the assumed lens
+    at_arms_length = [choose_focal(1920, 1080, face(960, 540, width * eyes / 0.3)).pixels for width in (0.99, 1.01)]
+    assert at_arms_length == pytest.approx([assumed.pixels, 0.9 * 1.01 * eyes / 0.063])
     assert choose_focal(1920, 1080, near, given=1500.0, equivalent=26.0).pixels == 1500.0
 
 

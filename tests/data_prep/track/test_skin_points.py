@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from data_prep.track.fit.skin_points import seen_weights
+import numpy as np
+import torch
+from heads import grid_head
+
+from data_prep.track.fit.skin_points import seen_weights, skin_triangles
 
 SIZE, FOCAL = 101, 400.0  # an odd size: the depth buffer is of half of it
 # Two squares of 0.1 m that face the camera, one 0.05 m behind a half of the other; and a steep one at their right.
@@ -37,3 +41,16 @@ def test_points_in_front_count_and_hidden_and_steep_ones_do_not() -> None:
 def test_points_count_as_far_as_the_matte_has_them() -> None:
     matte = np.full((SIZE, SIZE), 51, np.uint8)
     np.testing.assert_allclose(weights(matte)[:2], 0.2)
+
+
+def test_ears_count_as_skin_where_the_head_model_knows_them() -> None:
+    head = grid_head()
+    face, ear = head.faces[:4].unique(), head.faces[-3:].unique()
+
+    def vertices(**regions: torch.Tensor) -> set[int]:
+        return set(skin_triangles(replace(head, regions=regions)).ravel().tolist())
+
+    eyeballs = set(torch.nonzero((head.weights[:, 3:] > 0.5).any(1)).ravel().tolist())
+    alone, with_ear = vertices(face=face), vertices(face=face, left_ear=ear)
+    assert alone and alone <= set(face.tolist()) - eyeballs
+    assert with_ear - alone and with_ear - alone <= set(ear.tolist()) - eyeballs

@@ -18,7 +18,7 @@ from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import Term
 from data_prep.track.fit.motion import Motion, rotations
 from data_prep.track.fit.normal_equations import NormalEquations
-from data_prep.track.fit.photometric_term import PhotometricTerm, mean_texture
+from data_prep.track.fit.photometric_term import PhotometricTerm
 from data_prep.track.fit.priors import make_priors
 from data_prep.track.fit.smoothness import make_smoothness
 from data_prep.track.fit.surface import SurfacePoints
@@ -155,16 +155,3 @@ def test_frames_that_do_not_follow_each_other_are_not_compared() -> None:
     term, motion = smoothness(), some_motion()
     jumped = replace(motion, jaw=motion.jaw + torch.tensor([0, 0, 0, 1.0, 1.0], dtype=torch.float64)[:, None])
     assert term.cost(IDENTITY, jumped) == pytest.approx(term.cost(IDENTITY, motion), rel=1e-9)
-
-
-def test_texture_and_gains_explain_what_they_made() -> None:
-    texture, gain = noise(40, seed=1).abs() + 0.2, torch.tensor([0.8, 1.0, 1.2], dtype=torch.float64)
-    values = gain[:, None] * texture
-    weights = torch.ones(3, 40, dtype=torch.float64)
-    weights[0, 5], values[0, 5] = 0.0, 9.0  # not seen
-    weights[:, 7] = 0.0
-    found, gains = mean_texture(values, weights)
-    torch.testing.assert_close(gains, gain)
-    seen = torch.arange(40) != 7
-    torch.testing.assert_close(found[seen], texture[seen])
-    assert found[7] == 0.0

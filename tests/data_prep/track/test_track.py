@@ -85,7 +85,7 @@ def test_the_quality_is_told(tracked: Path) -> None:
     assert 0 < figures["landmark error"]["value"] < 2.0
     said = (tracked.parent / "said.txt").read_text()
     assert "quality of the tracking" in said and "frames that fit worst:" in said
-    assert f"tracked {FRAMES} frames in" in said and "assumed: the face is 0.6 m away" in said
+    assert f"tracked {FRAMES} frames in" in said and "assumed: the face is 0.9 m away" in said
 
 
 def test_it_is_done_once(tracked: Path, video: Path, demo_head_model: Path, capsys: pytest.CaptureFixture[str]) -> None:

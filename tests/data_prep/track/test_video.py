@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from pathlib import Path
@@ -212,6 +213,15 @@ def test_a_silent_decoder_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(decoding, "STALL_SECONDS", 0.5)
     with pytest.raises(UserError, match="decoding does not get on"):
         list(decoder)
+
+
+def test_a_complaint_after_the_last_picture_is_heard(tmp_path: Path) -> None:
+    """The pipe with the pictures ends before the process does."""
+    late = "os.close(1); time.sleep(0.3); sys.stderr.write('[matroska @ 0x1] [error] File ended prematurely\\n')"
+    decoder = decoding.Decoder(tmp_path / "a.mkv", 0, 8, 8)
+    decoder.command = [sys.executable, "-c", f"import os, sys, time; {late}"]
+    assert list(decoder) == []
+    assert decoder.errors == ["File ended prematurely"] and decoder.error_count == 1
 
 
 REFUSED = {
