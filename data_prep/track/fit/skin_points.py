@@ -11,7 +11,9 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from avatar.head.rasterize import rasterize_mesh
 
-COUNT = 2500  # with 1,300 to 2,000 the face's error is 0.44 or 0.51 %, by how many exactly; from here on it does not fall
+# With 1,300 to 2,000 points the face's error on two demo people is 0.44 or 0.51 % of the irises' distance, by how many
+# exactly; from here on it does not fall.
+COUNT = 2500
 _DEPTH_TOLERANCE = 2e-3  # metres
 _FACING = (0.15, 0.5)  # cosine to the line of sight: not counted below, in full above
 _DEPTH_STEP = 2  # pixels of the crop that are one of the depth buffer
