@@ -17,7 +17,7 @@ help: ## show this list
 
 setup: $(VENV)/.installed ## make .venv with pinned packages and the compiled core
 
-demo: setup ## make a subject, train an avatar on it, evaluate it and let another subject drive it
+demo: setup ## make two people, train an avatar of one, evaluate it and let the other drive it
 	$(BIN)/avatar demo $(DEMO)
 
 # A worker for each core, with one thread: most tests have work for one.

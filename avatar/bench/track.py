@@ -39,7 +39,7 @@ from avatar.head.model import HeadModel
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
 from data_prep.open import open_subject
 from data_prep.track.faces.embedding import iris_embedding
-from data_prep.track.faces.landmarks import load_landmarks
+from data_prep.track.faces.landmarks import Landmarks, load_landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import as_tracks, find_embedding
 from data_prep.track.fit.landmark_fit import fit_landmarks
@@ -48,6 +48,7 @@ from data_prep.track.track import Choices, track
 
 SEEDS, ALL_SEEDS = (1,), (1, 2, 3)
 TRUE, PICTURES, AUTOMATIC, REFINED = "true", "true, video's pictures", "automatic", "automatic, refined"
+OUTER_CORNERS, IRISES = (33, 263), (468, 473)  # landmarks
 COMPARED_EVERY = 5  # frames whose masks are compared
 
 
@@ -78,6 +79,7 @@ class Result:
     seed: int
     detected: float  # share of the frames
     landmarks: float  # error of the quality report, per cent of the distance between the irises
+    corners: float  # distance between the outer corners of the eyes, as a multiple of that between the irises
     first_vertices: Placement  # of the fit to landmarks alone
     vertices: Placement
     refined_vertices: Placement
@@ -166,6 +168,7 @@ def compare(
         seed=seed,
         detected=len(own) / len(truth),
         landmarks=landmark_error,
+        corners=corners_distance(load_landmarks(tracked / LANDMARKS_FILE)),
         first_vertices=placement(assets, first, truth.recording, pairs),
         vertices=placement(assets, own.recording, truth.recording, pairs),
         refined_vertices=placement(assets, better, truth.recording, pairs),
@@ -223,6 +226,13 @@ def placement(assets: HeadAssets, own: Recording, truth: Recording, pairs: Seque
     return in_parts(100.0 * np.stack(residuals) / np.percentile(distances, 90))
 
 
+def corners_distance(landmarks: Landmarks) -> float:
+    """Between the outer corners of the eyes, which the interocular distance of 300-W is, in distances of the irises."""
+    points = landmarks.points[landmarks.detected, :, :2]
+    corners, irises = (np.linalg.norm(points[:, a] - points[:, b], axis=-1) for a, b in (OUTER_CORNERS, IRISES))
+    return float(np.percentile(corners, 90) / np.percentile(irises, 90))
+
+
 def in_parts(residuals: Float[np.ndarray, "T V 2"]) -> Placement:
     constant = residuals.mean(0)
     lengths = (np.linalg.norm(part, axis=-1).mean() for part in (residuals, constant, residuals - constant))
@@ -244,8 +254,8 @@ def report(results: Sequence[Result], scale: Scale) -> list[str]:
     lines = [
         f"{scale.frames} frames of {scale.filmed}x{scale.filmed} tracked; held-out frames at {scale.size} px, head alone, "
         f"{scale.iterations} steps, against the true pictures",
-        "Errors of the face's vertices in % of the eyes' distance: all, the same in all frames, without that; and after "
-        "refining",
+        "Errors of the face's vertices in % of the distance between the irises: all, the same in all frames, without "
+        "that; and all in % of that between the outer corners of the eyes, as in 300-W",
     ]
     for result in results:
         lines += [
@@ -255,6 +265,8 @@ def report(results: Sequence[Result], scale: Scale) -> list[str]:
             f"{result.refine_seconds:.0f} s",
             f"vertices by landmarks {_parts(result.first_vertices)}, tracked {_parts(result.vertices)}, refined "
             f"{_parts(result.refined_vertices)}",
+            f"of the outer corners' distance: by landmarks {result.first_vertices.all / result.corners:.2f}, tracked "
+            f"{result.vertices.all / result.corners:.2f}, refined {result.refined_vertices.all / result.corners:.2f}",
             f"{'avatar of the tracking':>24}{'PSNR':>8}{'gap':>7}{'SSIM':>8}{'LPIPS':>8}{'mouth':>8}",
         ]
         lines += [

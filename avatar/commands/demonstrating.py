@@ -4,21 +4,35 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
+from typing import NamedTuple
 
 from avatar.commands import OK
 from avatar.commands.opening import open_driver, open_run, open_trained
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.tracking import bar, can_track
 from avatar.commands.training import resume_run, train_new
 from avatar.data.source import Source
-from avatar.demo import make_subject, make_video
+from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
+from avatar.head.assets import load_head_assets
 from avatar.motion.reenact import reenact
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.run import RUN_FILE, read_run_info
+from data_prep.track.track import track
 
 RECIPE = ["experiment=demo"]
+SUBJECT_SIZE, VIDEO_SIZE = 192, 384  # pixels of the pictures, a side
+
+
+class Person(NamedTuple):
+    name: str
+    frames: int
+    seed: int
+
+
+ACTOR, DRIVER = Person("actor", 500, 1), Person("driver", 100, 2)
 
 
 def run_demo_data(arguments: Namespace) -> int:
@@ -37,17 +51,17 @@ def run_demo_data(arguments: Namespace) -> int:
 def run_demo(arguments: Namespace) -> int:
     """The whole program; what an interrupted one has done is not done again."""
     out: Path = arguments.out
-    actor, driver, run = out / "actor", out / "driver", out / "run"
+    actor, driver, run = out / ACTOR.name, out / DRIVER.name, out / "run"
     check_folder_output(out)
     check_outputs([out, run], [])
     begun = (run / RUN_FILE).is_file() and list_checkpoints(run / "checkpoints")
     if begun and read_run_info(run).source.folder.resolve() != actor.resolve():
         raise UserError(f"{run} is a run of another video; choose another folder for the demo")
-    if not actor.is_dir():
-        make_subject(actor, 500, 192, 1, "speech")
-    if not driver.is_dir():
-        make_subject(driver, 100, 192, 2, "speech")
-    status = resume_run(run) if begun else train_new(Source(actor, actor / "head_model"), RECIPE, run)
+    missing = [person for person in (ACTOR, DRIVER) if not (out / person.name).is_dir()]
+    make = film_and_track if missing and can_track(say_why_not) else make_tracked
+    for person in missing:
+        make(person, out)
+    status = resume_run(run) if begun else train_new(Source(actor, head_beside(actor)), RECIPE, run)
     if status != OK:
         return status
     trained = open_trained(run)
@@ -55,8 +69,34 @@ def run_demo(arguments: Namespace) -> int:
     results = evaluate(open_run(run), None, write_frames=False)
     page = write_page(trained, out / "avatar.html")
     print("\nThe demo is done. Look at")
+    if (film := out / f"{ACTOR.name}.mp4").is_file():
+        print(f"  {film}   the video that the avatar was made from")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
     print(f"  {page.path}   the avatar itself, alive in any browser: open this first")
     return OK
+
+
+def film_and_track(person: Person, out: Path) -> None:
+    """As with anybody's own video: only its pictures are known."""
+    head, video = head_beside(out / person.name), out / f"{person.name}.mp4"
+    if not head.is_dir():
+        make_head_model(head)
+    if not video.is_file():
+        make_video(video, person.frames, VIDEO_SIZE, person.seed, "speech")
+    track(video, out / person.name, head, load_head_assets(head), progress=bar)
+
+
+def make_tracked(person: Person, out: Path) -> None:
+    make_subject(out / person.name, person.frames, SUBJECT_SIZE, person.seed, "speech")
+
+
+def head_beside(folder: Path) -> Path:
+    """The head model in a subject's folder, where it has one, or the one of all that were filmed."""
+    own = folder / "head_model"
+    return own if own.is_dir() else folder.with_name("head_model")
+
+
+def say_why_not(missing: str) -> None:
+    print(f"The two people are made with their tracking, not filmed and tracked: {missing}")

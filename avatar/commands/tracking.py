@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import os
 from argparse import Namespace
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from avatar.commands import OK
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
+from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.avatar_track import read_info, recognise
 from data_prep.cache import cache_folder
 from data_prep.open import HEAD_VARIABLE
 from data_prep.track.crop import parse_crop
+from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.footage.source import Span
+from data_prep.track.progress import Item
 from data_prep.track.stages import hash_of
 from data_prep.track.track import STAGES_VERSION, Choices, track
 
@@ -71,6 +73,19 @@ def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> P
     return folder
 
 
-def bar(items: Iterable[Any], total: int | None, title: str) -> Iterable[Any]:
+def can_track(say: Callable[[str], object]) -> bool:
+    """Whether this machine has what tracking a video needs; says what is missing where it has not."""
+    try:
+        load_mediapipe()
+        for file in TRACKING_FILES:
+            if not file.is_optional:
+                require(file)
+    except UserError as error:
+        say(str(error))
+        return False
+    return True
+
+
+def bar(items: Iterable[Item], total: int | None, title: str, unit: str = "frames") -> Iterable[Item]:
     """A progress bar with a rate, which leaves its line."""
-    return tqdm(items, total=total, desc=title, unit=" frames")
+    return tqdm(items, total=total, desc=title, unit=f" {unit}")

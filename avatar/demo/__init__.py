@@ -2,6 +2,6 @@
 
 from avatar.demo.raw_video import make_video
 from avatar.demo.render import render_frame
-from avatar.demo.subject import make_subject
+from avatar.demo.subject import make_head_model, make_subject
 
-__all__ = ["make_subject", "make_video", "render_frame"]
+__all__ = ["make_head_model", "make_subject", "make_video", "render_frame"]

@@ -41,7 +41,7 @@ _ARKIT: dict[str, dict[str, float]] = {
 def write_head_model(folder: Path, head: DemoHead) -> None:
     """Write generic_model.pkl (plain numpy arrays), head_template.obj, the eyelids, FLAME_masks.pkl and the names of the
     expressions into `folder`."""
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     V = len(head.template)
     shape_dirs = np.zeros((V, 3, NUM_IDENTITY + NUM_EXPRESSION), np.float32)
     shape_dirs[:, :, : head.identity_dirs.shape[2]] = head.identity_dirs

@@ -49,9 +49,28 @@ def make_subject(
     """
     out = Path(out)
     check_arguments(frames, size, seed, motion, threads)
-    _check_place(out)
     if not 0.0 <= neutral_bias <= 1.0:
         raise UserError(f"neutral_bias must be from 0 to 1, not {neutral_bias}")
+    with _whole(out) as folder:
+        _write_subject(folder, frames, size, seed, motion, threads or os.cpu_count() or 1, progress, neutral_bias)
+    return out
+
+
+def make_head_model(out: Path) -> Path:
+    """Write the demo people's head model, which is the same for all of them, as the folder `out`, whole or not at all.
+
+    Returns `out`. Raises UserError for a folder that is not empty.
+    """
+    out = Path(out)
+    with _whole(out) as folder:
+        write_head_model(folder, demo_head())
+    return out
+
+
+@contextmanager
+def _whole(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that takes its place when nothing went wrong, and else is removed."""
+    _check_place(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
@@ -60,14 +79,13 @@ def make_subject(
             f"cannot write to {out.parent}: {error.strerror or error}; choose another output folder"
         ) from error
     try:
-        _write_subject(partial, frames, size, seed, motion, threads or os.cpu_count() or 1, progress, neutral_bias)
+        yield partial
         partial.chmod(0o755)
         partial.replace(out)
     except OSError as error:
         raise UserError(f"writing {out} failed: {error.strerror or error}; nothing was left behind") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return out
 
 
 class TrackingBias(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar, overload
@@ -17,13 +17,13 @@ from avatar.errors import UserError
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.look import Look
+from data_prep.track.progress import Progress
 
 # JPEG without subsampled colours: see docs/data.md for its size and error beside PNG's.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
 _AHEAD = 4  # frames that wait for a worker
 Made = TypeVar("Made")
-Progress = Callable[[Iterable[int], int, str], Iterable[int]]
 
 
 class FrameImages(Sequence[UInt8[np.ndarray, "H W 3"]]):

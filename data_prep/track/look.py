@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +13,9 @@ from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.faces.person import follow_one
 from data_prep.track.footage.cuts import CutFinder, Shot
-from data_prep.track.footage.source import Footage, Span, TimedPicture, check_span, stride, whole
+from data_prep.track.footage.source import Footage, Span, check_span, stride, whole
 from data_prep.track.footage.timing import regular_timing
+from data_prep.track.progress import Progress
 
 LOOKED_AT = 1920  # pixels of the longer side; the landmarks come from 256 pixels around the face
 MAX_PICTURES = 3600  # two minutes at 30 a second
@@ -24,7 +24,6 @@ _PAUSE = 1.0  # seconds without a picture that count as a cut, if they are also 
 _PAUSES = 5.0
 _SLOW = 8.0  # pictures a second
 _DARK = 12.0  # grey levels: below, a picture is called black
-Progress = Callable[[Iterable[TimedPicture], int | None, str], Iterable[TimedPicture]]
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,9 @@ overlay  the tracked mesh over the frames, for the eye
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -36,16 +35,12 @@ from data_prep.track.frames import (
     in_view,
 )
 from data_prep.track.look import Look
+from data_prep.track.progress import Progress, silent
 from data_prep.track.quality import judge
 from data_prep.track.stages import growing, hash_of
-from data_prep.track.work import Choices, Progress, Work
+from data_prep.track.work import Choices, Work
 
 STAGES_VERSION = 4  # raised when what a stage makes changes
-Item = TypeVar("Item")
-
-
-def silent(items: Iterable[Item], total: int | None, title: str) -> Iterable[Item]:
-    return items
 
 
 def track(

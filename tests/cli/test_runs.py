@@ -238,23 +238,3 @@ def test_a_moved_video_is_resumed_from_its_new_place(begun: Path, own_folder: Pa
     )
     output = avatar("train", "--out", begun, "--resume", "--folder", moved, "--head", moved / "head_model")
     assert "at step 8 of 12" in output
-
-
-def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupted in its training, it does not present the half-trained avatar the next time."""
-    from avatar.commands import demonstrating
-
-    monkeypatch.setattr(demonstrating, "RECIPE", [*SMALL, "trainer.iterations=16"])
-    for name in ("actor", "driver"):
-        write_tracked_folder(tmp_path / "demo" / name, frames=30, size=48, seed=1)
-    avatar("train", tmp_path / "demo" / "actor", "--out", tmp_path / "demo" / "run", *SMALL, "trainer.iterations=16")
-    run = tmp_path / "demo" / "run"
-    list_checkpoints(run / "checkpoints")[-1].unlink()
-    before = newest_checkpoint(run)
-    assert before.step == 12
-    output = avatar("demo", tmp_path / "demo")
-    assert "Resuming" in output and "The demo is done" in output
-    page = tmp_path / "demo" / "avatar.html"
-    assert output.rstrip().splitlines()[-1].startswith(f"  {page} ") and page.stat().st_size > 10**5
-    assert newest_checkpoint(run).step == 16
-    assert "strict" in output, "the whole avatar is measured"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.result import Clip, Fit
+from data_prep.track.progress import Progress
 from data_prep.track.quality import landmark_figures
 from data_prep.tracking import FrameTrack
 
@@ -28,7 +29,7 @@ def fit_tracks(
     clip: Clip,
     head: HeadAssets,
     head_path: Path,
-    progress: Callable[[Iterable[Any], int | None, str], Iterable[Any]],
+    progress: Progress,
 ) -> Fit:
     embedding = find_embedding(head_path, head)
     names = load_expression_names(head_path, head.num_expressions)

@@ -8,9 +8,7 @@ takes no part; what these gain decides whether the result is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +28,7 @@ from data_prep.track.fit.photometric_term import PhotometricTerm
 from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints
 from data_prep.track.fit.texture import light_basis, lit_texture
+from data_prep.track.progress import Progress
 
 EYES_IN_CROPS = 110.0  # pixels between the eyes, at most
 BLURS = (3.0, 1.2)  # per cent of the distance between the eyes
@@ -42,8 +41,6 @@ HELD_OUT = 5  # one point of so many
 # vertices, without what is the same in all frames, fell to 0.39 to 0.53 of what it was, at gains from 2.0 to 3.3 dB.
 LEAST_GAIN = 1.0
 _FRAMES_AT_ONCE = 16
-
-Progress = Callable[[Iterable[Any], int | None, str], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ def fit_pictures(
     weights = first
     levels = [blur for blur in BLURS for _ in range(ROUNDS)]
     blurred, last = None, None
-    for blur in progress(levels, len(levels), "fitting to pictures"):
+    for blur in progress(levels, len(levels), "fitting to pictures", "textures"):
         if blur != last:
             blurred, last = None, blur  # frees the memory of the level before
             blurred = BlurredCrops(crops, 0.01 * blur * eyes * crops.scale)

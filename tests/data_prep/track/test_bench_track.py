@@ -11,7 +11,17 @@ import pytest
 import torch
 
 from avatar.bench.refine import Figures
-from avatar.bench.track import Placement, Result, Scale, in_parts, paired, placement, report, truly_tracked
+from avatar.bench.track import (
+    Placement,
+    Result,
+    Scale,
+    corners_distance,
+    in_parts,
+    paired,
+    placement,
+    report,
+    truly_tracked,
+)
 from avatar.cli import main
 from avatar.data.recording import Recording
 from avatar.data.split import Split
@@ -19,6 +29,7 @@ from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.types import HeadParams
+from data_prep.track.faces.landmarks import Landmarks
 
 FRAMES, SIZE, SEED = 4, 256, 1
 
@@ -74,13 +85,22 @@ def test_what_is_the_same_in_all_frames_is_told_apart() -> None:
     assert (found.all, found.constant, found.moving) == pytest.approx((np.mean([34**0.5, 18**0.5]), 5.0, 1.0))
 
 
+def test_the_outer_corners_are_measured_where_there_is_a_face() -> None:
+    points = np.zeros((3, 478, 3), np.float32)
+    points[:2, 33, 0], points[:2, 263, 0] = 10.0, 100.0
+    points[:2, 468, 0], points[:2, 473, 0] = 25.0, 85.0
+    points[1] *= 2.0
+    landmarks = Landmarks(points, np.zeros((3, 52), np.float32), np.array([True, True, False]), (128, 128), 25.0)
+    assert corners_distance(landmarks) == pytest.approx(1.5)
+
+
 def test_the_report_has_every_figure() -> None:
     def figures(psnr: float) -> Figures:
         return Figures(psnr, 0.9, 0.05, 20.0)
 
     avatars = {"true": figures(30.0), "automatic": figures(27.75)}
     first, vertices, refined = Placement(2.3, 2.0, 1.1), Placement(2.1, 1.9, 0.6), Placement(1.8, 1.7, 0.4)
-    result = Result(2, 0.99, 0.71, first, vertices, refined, 0.98, 0.97, 50.2, 12.1, avatars)
+    result = Result(2, 0.99, 0.71, 1.5, first, vertices, refined, 0.98, 0.97, 50.2, 12.1, avatars)
     assert result.gap("automatic") == pytest.approx(2.25)
     text = "\n".join(report([result], Scale(10, 64, 32, 5)))
     for part in (
@@ -89,6 +109,7 @@ def test_the_report_has_every_figure() -> None:
         "2.30 (2.00, 1.10)",
         "2.10 (1.90, 0.60)",
         "1.80 (1.70, 0.40)",
+        "outer corners' distance: by landmarks 1.53, tracked 1.40, refined 1.20",
         "0.980",
         "0.970",
         "50 s",
@@ -104,6 +125,7 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
     (subject,) = json.loads((tmp_path / "bench_track.json").read_text())["subjects"]
     assert subject["seed"] == 1 and subject["detected"] == 1.0
     assert 0.0 < subject["landmarks"] < 2.0 and 0.0 < subject["vertices"]["moving"] < subject["vertices"]["all"] < 4.0
+    assert 1.3 < subject["corners"] < 1.5
     assert 0.0 < subject["first_vertices"]["moving"] != subject["vertices"]["moving"]
     assert subject["matte"] > 0.97 and subject["head"] > 0.95
     assert set(subject["avatars"]) == {"true", "true, video's pictures", "automatic", "automatic, refined"}
