@@ -11,7 +11,7 @@ class Part(NamedTuple):
     """`module` has run(request: Request) -> None, which prints a table and writes files into `request.out`."""
 
     module: str
-    inputs: str = ""  # what stands after the part's name: nothing, FOLDER, RUN or RUN...
+    inputs: str = ""  # what stands after the part's name: nothing, FOLDER, [FOLDER], RUN or RUN...
     on_gpu: bool = False  # whether it measures a GPU too
 
 
@@ -39,5 +39,5 @@ PARTS = {
     "quality": Part("avatar.bench.quality_report", "RUN..."),
     "stability": Part("avatar.bench.stability"),
     "refine": Part("avatar.bench.refine", "FOLDER"),
-    "track": Part("avatar.bench.track"),
+    "track": Part("avatar.bench.track", "[FOLDER]"),
 }

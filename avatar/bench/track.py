@@ -1,16 +1,18 @@
-"""What a plain video costs against the true tracking: demo subjects filmed, tracked, and made into avatars.
+"""What a plain video costs against the true tracking: a subject's pictures as a video, tracked, and made into avatars.
 
-A subject's own folder is the truth. Its pictures in a room, with noise and compression, are the video that `avatar track`
-gets, with no choice made. Avatars of one recipe: trained on the true folder, on the video's frames and masks with the true
-tracking, on what `avatar track` made, and on that refined through the third. All are measured on held-out frames against
-the true pictures in the true head masks.
+A subject's own folder is the truth. Of demo subjects the pictures in a room, with noise and compression, are the video
+that `avatar track` gets, with no choice made; of a FOLDER the pictures as they are.
+
+Avatars of one recipe: trained on the true folder, on the video's frames and masks with the true tracking, on what `avatar
+track` made, and on that refined through the third. All are measured on held-out frames against the true pictures in the
+true head masks.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,20 +26,19 @@ from avatar.bench.results import leave
 from avatar.commands.opening import split_sizes
 from avatar.commands.tracking import bar
 from avatar.config import Config, load_config
-from avatar.data.images import read_image, read_mask
 from avatar.data.recording import TRACK_SHAPES, Recording
 from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.demo.motion import FPS
 from avatar.demo.raw_video import in_room
 from avatar.demo.subject import make_subject
+from avatar.errors import UserError
 from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
-from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
-from data_prep.open import open_subject
+from data_prep.open import find_head, open_subject
 from data_prep.track.faces.embedding import iris_embedding
 from data_prep.track.faces.landmarks import Landmarks, load_landmarks
 from data_prep.track.fit.camera import Pinhole
@@ -76,7 +77,9 @@ class Placement:
 class Result:
     """Of one subject."""
 
-    seed: int
+    name: str
+    size: tuple[int, int]  # of the video, pixels
+    frames: int  # of the video
     detected: float  # share of the frames
     landmarks: float  # error of the quality report, per cent of the distance between the irises
     corners: float  # distance between the outer corners of the eyes, as a multiple of that between the irises
@@ -96,55 +99,85 @@ class Result:
 
 def run(request: Request) -> None:
     scale = QUICK if request.quick else USUAL
+    of_demo = (f"data.size={scale.size}", f"trainer.iterations={scale.iterations}")
     config = load_config(
         [
-            f"data.size={scale.size}",
-            f"trainer.iterations={scale.iterations}",
+            *(() if request.inputs and not request.quick else of_demo),
             "trainer.preview_every=1000000",
             *(("model.uv_size=24", "model.mlp_width=24") if request.quick else ()),
             *request.overrides,
         ]
     )
     results = []
-    for seed in ALL_SEEDS if request.full else SEEDS:
+    for person in request.inputs or (ALL_SEEDS if request.full else SEEDS):
         with tempfile.TemporaryDirectory(dir=request.out) as scratch:
-            results.append(measure(seed, scale, config, Path(scratch)))
-    content = {"scale": asdict(scale), "config": config.to_dict(), "subjects": [asdict(result) for result in results]}
-    leave(request.out, "bench_track", report(results, scale), content)
+            if isinstance(person, Path):
+                filmed = as_filmed(person, request, config)
+            else:
+                filmed = film(person, scale, config, Path(scratch) / f"demo-{person}")
+            results.append(measure(filmed, config, Path(scratch)))
+    content = {"config": config.to_dict(), "subjects": [asdict(result) for result in results]}
+    name = "_".join(["bench_track", *(folder.resolve().name for folder in request.inputs)])
+    leave(request.out, name, report(results, config), content)
 
 
-def measure(seed: int, scale: Scale, config: Config, scratch: Path) -> Result:
+@dataclass(frozen=True)
+class Filmed:
+    """A subject whose tracking counts as the truth, and what its video shows: a picture for each of its frames."""
+
+    truth: Subject
+    assets: HeadAssets
+    head: Path
+    pictures: Iterable[np.ndarray]  # uint8 [H, W, 3]
+
+
+def film(seed: int, scale: Scale, config: Config, folder: Path) -> Filmed:
+    """A demo person, written to `folder`."""
+    make_subject(folder, scale.frames, scale.filmed, seed)
+    head = folder / "head_model"
+    truth, assets = open_subject(Source(folder, head, frame_offset=1), split_sizes(config))
+    frames = (truth.pixels(index) for index in range(len(truth)))
+    shown = in_room(((pixels.image, pixels.alpha) for pixels in frames), scale.filmed, seed)
+    return Filmed(truth, assets, head, shown)
+
+
+def as_filmed(folder: Path, request: Request, config: Config) -> Filmed:
+    """A tracked folder. Raises UserError where its frames have an odd size, which a video's cannot be."""
+    head = find_head(folder, request.head)
+    source = Source(folder, head, request.tracking, request.frame_offset)
+    truth, assets = open_subject(source, split_sizes(config))
+    if truth.width % 2 or truth.height % 2:
+        raise UserError(f"{folder} has frames of {truth.width}x{truth.height} pixels; a video's are even both ways")
+    return Filmed(truth, assets, head, (truth.pixels(index).image for index in range(len(truth))))
+
+
+def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
     """Everything about one subject; what is written on the way lies in `scratch`."""
-    true_folder, video, tracked = scratch / "true", scratch / "video.mp4", scratch / "tracked"
-    make_subject(true_folder, scale.frames, scale.filmed, seed)
-    with video_writer(video, FPS) as add:
-        for picture in in_room(_pictures(true_folder), scale.filmed, seed):
+    video, tracked = scratch / "video.mp4", scratch / "tracked"
+    with video_writer(video, filmed.truth.recording.fps) as add:
+        for picture in filmed.pictures:
             add(picture)
-    head = true_folder / "head_model"
     begin = time.perf_counter()
     # The whole picture: it is then the true one's, pixel for pixel.
-    info = track(video, tracked, head, load_head_assets(head), Choices(crop="none"), progress=bar)
+    info = track(video, tracked, filmed.head, filmed.assets, Choices(crop="none"), progress=bar)
     seconds = time.perf_counter() - begin
-    truth, assets = open_subject(Source(true_folder, head, frame_offset=1), split_sizes(config))
-    own, _ = open_subject(Source(tracked, head), split_sizes(config), assets=assets)
-    return compare(seed, info, seconds, truth, own, assets, config, tracked, head, scratch)
+    own, _ = open_subject(Source(tracked, filmed.head), split_sizes(config), assets=filmed.assets)
+    return compare(filmed, info, seconds, own, config, tracked, scratch)
 
 
 def compare(
-    seed: int,
+    filmed: Filmed,
     info: TrackingInfo,
     track_seconds: float,
-    truth: Subject,
     own: Subject,
-    assets: HeadAssets,
     config: Config,
     tracked: Path,
-    head: Path,
     scratch: Path,
 ) -> Result:
+    truth, assets = filmed.truth, filmed.assets
     network, note = find_lpips("squeeze")
     print(f"LPIPS: {note}")
-    pairs = paired(own.recording, truth.recording)
+    pairs = paired(own.recording, len(truth))
     held_out = set(own.split.test) & {mine for mine, true in pairs if true in truth.split.test}
     shown = [pair for pair in pairs if pair[0] in held_out][::MEASURED_EVERY]
     of_truth, of_own = (Trial(subject, assets, config, network, scratch) for subject in (truth, own))
@@ -161,11 +194,13 @@ def compare(
     avatars[AUTOMATIC] = measured(avatar, own.recording, shown)
     better, refine_seconds = of_own.refined(avatar, own.recording)
     avatars[REFINED] = measured(of_own.trained(better, "refined"), better, shown)
-    first = tracked_by_landmarks(tracked, head, own.recording, assets)
+    first = tracked_by_landmarks(tracked, filmed.head, own.recording, assets)
     landmark_error = next(f["value"] for f in info.quality["figures"] if f["name"] == "landmark error")
     matte_overlap, head_overlap = mask_overlaps(own, truth, pairs[::COMPARED_EVERY])
     return Result(
-        seed=seed,
+        name=truth.name,
+        size=(truth.width, truth.height),
+        frames=len(truth),
         detected=len(own) / len(truth),
         landmarks=landmark_error,
         corners=corners_distance(load_landmarks(tracked / LANDMARKS_FILE)),
@@ -194,15 +229,9 @@ def tracked_by_landmarks(tracked: Path, head: Path, own: Recording, assets: Head
     return replace(own, tracks=tracks | {"shape": torch.from_numpy(next(iter(rows.values())).shape).float()})
 
 
-def _pictures(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    for path in sorted((folder / "imgs").iterdir()):
-        yield read_image(path), read_mask(folder / "alpha" / path.name)
-
-
-def paired(own: Recording, truth: Recording) -> list[tuple[int, int]]:
-    """Indices of the same pictures in both: those of the true folder are numbered from 1, those of the video from 0."""
-    true_index = {int(name) - 1: index for index, name in enumerate(truth.names)}
-    return [(index, true_index[int(name)]) for index, name in enumerate(own.names) if int(name) in true_index]
+def paired(own: Recording, count: int) -> list[tuple[int, int]]:
+    """Indices of the same pictures in both: the video's numbers are the places of the true folder's `count` frames."""
+    return [(index, int(name)) for index, name in enumerate(own.names) if int(name) < count]
 
 
 def truly_tracked(own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Recording:
@@ -250,19 +279,19 @@ def mask_overlaps(own: Subject, truth: Subject, pairs: Sequence[tuple[int, int]]
     return matte, head
 
 
-def report(results: Sequence[Result], scale: Scale) -> list[str]:
+def report(results: Sequence[Result], config: Config) -> list[str]:
     lines = [
-        f"{scale.frames} frames of {scale.filmed}x{scale.filmed} tracked; held-out frames at {scale.size} px, head alone, "
-        f"{scale.iterations} steps, against the true pictures",
+        f"Held-out frames at {config.data.size} px, head alone, {config.trainer.iterations} steps, against the true "
+        "pictures",
         "Errors of the face's vertices in % of the distance between the irises: all, the same in all frames, without "
         "that; and all in % of that between the outer corners of the eyes, as in 300-W",
     ]
     for result in results:
         lines += [
             "",
-            f"seed {result.seed}: {100 * result.detected:.1f} % detected, landmark error {result.landmarks:.2f} %; IoU: "
-            f"matte {result.matte:.3f}, head {result.head:.3f}; tracking {result.track_seconds:.0f} s, refining "
-            f"{result.refine_seconds:.0f} s",
+            f"{result.name}: {result.frames} frames of {result.size[0]}x{result.size[1]}, {100 * result.detected:.1f} % "
+            f"detected, landmark error {result.landmarks:.2f} %; IoU: matte {result.matte:.3f}, head {result.head:.3f}; "
+            f"tracking {result.track_seconds:.0f} s, refining {result.refine_seconds:.0f} s",
             f"vertices by landmarks {_parts(result.first_vertices)}, tracked {_parts(result.vertices)}, refined "
             f"{_parts(result.refined_vertices)}",
             f"of the outer corners' distance: by landmarks {result.first_vertices.all / result.corners:.2f}, tracked "

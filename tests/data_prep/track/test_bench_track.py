@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tracked_folder import write_tracked_folder
 
 from avatar.bench.refine import Figures
 from avatar.bench.track import (
     Placement,
     Result,
-    Scale,
     corners_distance,
     in_parts,
     paired,
@@ -23,10 +23,12 @@ from avatar.bench.track import (
     truly_tracked,
 )
 from avatar.cli import main
+from avatar.config import load_config
 from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.subject import make_subject
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.types import HeadParams
 from data_prep.track.faces.landmarks import Landmarks
@@ -55,12 +57,12 @@ def truth() -> Recording:
 
 def test_frames_are_paired_by_their_numbers(truth: Recording) -> None:
     own = replace(truth, names=("00000", "00002", "00003", "00009"))
-    assert paired(own, truth) == [(0, 0), (1, 2), (2, 3)]
+    assert paired(own, len(truth.names)) == [(0, 0), (1, 2), (2, 3)]
 
 
 def test_the_true_tracking_goes_to_the_videos_frames(truth: Recording) -> None:
     own = replace(truth, names=("00001", "00003"), intrinsics=(1.0, 1.0, 1.0, 1.0))
-    given = truly_tracked(own, truth, paired(own, truth))
+    given = truly_tracked(own, truth, paired(own, FRAMES))
     assert given.names == own.names and given.intrinsics == truth.intrinsics
     assert torch.equal(given.tracks["t"], truth.tracks["t"][[1, 3]])
     assert torch.equal(given.identity, truth.identity)
@@ -100,11 +102,12 @@ def test_the_report_has_every_figure() -> None:
 
     avatars = {"true": figures(30.0), "automatic": figures(27.75)}
     first, vertices, refined = Placement(2.3, 2.0, 1.1), Placement(2.1, 1.9, 0.6), Placement(1.8, 1.7, 0.4)
-    result = Result(2, 0.99, 0.71, 1.5, first, vertices, refined, 0.98, 0.97, 50.2, 12.1, avatars)
+    result = Result("someone", (64, 48), 10, 0.99, 0.71, 1.5, first, vertices, refined, 0.98, 0.97, 50.2, 12.1, avatars)
     assert result.gap("automatic") == pytest.approx(2.25)
-    text = "\n".join(report([result], Scale(10, 64, 32, 5)))
+    text = "\n".join(report([result], load_config(["data.size=32", "trainer.iterations=5"])))
     for part in (
-        "seed 2: 99.0 % detected",
+        "Held-out frames at 32 px, head alone, 5 steps",
+        "someone: 10 frames of 64x48, 99.0 % detected",
         "0.71 %",
         "2.30 (2.00, 1.10)",
         "2.10 (1.90, 0.60)",
@@ -123,7 +126,8 @@ def test_the_report_has_every_figure() -> None:
 def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "track", "--quick", "--out", str(tmp_path)]) == 0
     (subject,) = json.loads((tmp_path / "bench_track.json").read_text())["subjects"]
-    assert subject["seed"] == 1 and subject["detected"] == 1.0
+    assert (subject["name"], subject["frames"], subject["size"]) == ("demo-1", 20, [192, 192])
+    assert subject["detected"] == 1.0
     assert 0.0 < subject["landmarks"] < 2.0 and 0.0 < subject["vertices"]["moving"] < subject["vertices"]["all"] < 4.0
     assert 1.3 < subject["corners"] < 1.5
     assert 0.0 < subject["first_vertices"]["moving"] != subject["vertices"]["moving"]
@@ -131,3 +135,22 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
     assert set(subject["avatars"]) == {"true", "true, video's pictures", "automatic", "automatic, refined"}
     assert f"{subject['avatars']['automatic']['psnr']:.2f}" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bench_track.json", "bench_track.md"]
+
+
+@pytest.mark.slow
+def test_a_tiny_run_of_a_folder(tracking_models: None, tmp_path: Path) -> None:
+    folder = make_subject(tmp_path / "someone", 20, 192, seed=2, progress=False)
+    out = tmp_path / "out"
+    assert main(["bench", "track", str(folder), "--quick", "--out", str(out)]) == 0
+    (subject,) = json.loads((out / "bench_track_someone.json").read_text())["subjects"]
+    assert (subject["name"], subject["frames"], subject["detected"]) == ("someone", 20, 1.0)
+    assert 0.0 < subject["vertices"]["all"] < 4.0 and subject["head"] > 0.95
+
+
+def test_a_folder_must_fit_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_tracked_folder(tmp_path / "odd", frames=20, size=64, height=63)
+    assert main(["bench", "track", str(folder), "--quick", "--out", str(tmp_path / "out")]) == 1
+    assert f"{folder} has frames of 64x63 pixels; a video's are even both ways" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["bench", "track", str(folder), str(folder)])
+    assert "bench track takes [FOLDER], 2 given" in capsys.readouterr().err
