@@ -93,7 +93,10 @@ def build_parser() -> argparse.ArgumentParser:
         "--refine", type=int, metavar="N", help="first improve the tracking N times through a shorter training's avatar"
     )
     train.add_argument(
-        "--minutes", type=float, metavar="M", help="with --refine: about what all of it may take, by fewer steps"
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="with --refine: about what all of it may take, tracking included, by fewer steps",
     )
     add_device(train, "the configuration's, auto")
     train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")

@@ -93,8 +93,8 @@ def affordable_iterations(seconds: float, step: float, refinement: float, rounds
     return int((seconds - rounds * refinement) / (step * (1.0 + FIRST_SHARE * rounds)))
 
 
-def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: float | None) -> int:
-    """The configuration's steps, or as many as the minutes allow by what this machine shows on a few.
+def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: float | None, spent: float) -> int:
+    """The configuration's steps, or as many as the minutes less `spent` seconds allow by what this machine shows on a few.
 
     Raises UserError where they allow too few.
     """
@@ -108,16 +108,17 @@ def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: fl
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
     step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds
-    able = affordable_iterations(60.0 * minutes, step, refinement, rounds)
+    able = affordable_iterations(60.0 * minutes - spent, step, refinement, rounds)
     if able < min(LEAST_STEPS, asked):
-        least = rounds * refinement + min(LEAST_STEPS, asked) * step * (1.0 + FIRST_SHARE * rounds)
+        least = spent + rounds * refinement + min(LEAST_STEPS, asked) * step * (1.0 + FIRST_SHARE * rounds)
         raise UserError(
-            f"--minutes {minutes:g} is too little for --refine {rounds} of {len(subject)} frames on this machine: it takes "
-            f"about {refinement:.0f} s to refine them and {step:.3f} s a step, so give at least {least / 60:.1f}"
+            f"--minutes {minutes:g} is too little for --refine {rounds} of {len(subject)} frames on this machine: "
+            f"{spent:.0f} s are gone, it takes about {refinement:.0f} s to refine them and {step:.3f} s a step, so give at "
+            f"least {least / 60:.1f}"
         )
     chosen = min(asked, able)
     print(
-        f"Time         {minutes:g} minutes: about {refinement:.0f} s a refinement and {step:.3f} s a step allow "
-        f"{able:,} steps; {chosen:,} are taken"
+        f"Time         {minutes:g} minutes, {spent:.0f} s of them gone: about {refinement:.0f} s a refinement and "
+        f"{step:.3f} s a step allow {able:,} steps; {chosen:,} are taken"
     )
     return chosen

@@ -47,12 +47,15 @@ def run_train(arguments: Namespace) -> int:
         return training.run_train(arguments)
     if arguments.resume:
         raise UserError(f"{run} began without --refine: leave it out to resume, or start a new run")
+    begin = time.monotonic()
     check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
-    return begin_rounds(run, arguments.refine, arguments.minutes, training.tracked_source(arguments), overrides)
+    check_rounds(run, arguments.refine, arguments.minutes, overrides)
+    source = training.tracked_source(arguments)
+    return begin_rounds(run, arguments.refine, arguments.minutes, source, overrides, begin)
 
 
-def begin_rounds(run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str]) -> int:
-    """Raises UserError where the folder holds a run, or rounds, already."""
+def check_rounds(run: Path, rounds: int, minutes: float | None, overrides: list[str]) -> None:
+    """Before a video is tracked. Raises UserError for a mistake, and where the folder holds a run, or rounds, already."""
     if not 1 <= rounds <= MAX_ROUNDS:
         raise UserError(f"--refine must be from 1 to {MAX_ROUNDS}, not {rounds}")
     if minutes is not None and not 0.0 < minutes < float("inf"):
@@ -61,8 +64,13 @@ def begin_rounds(run: Path, rounds: int, minutes: float | None, source: Source, 
     refuse_trained(run)
     if plan_file(run).exists():
         raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")
-    begin = time.monotonic()
-    iterations = steps_in_time(source, overrides, rounds, minutes)
+
+
+def begin_rounds(
+    run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str], begin: float
+) -> int:
+    """The minutes are counted from `begin` on, of `time.monotonic`: they include the tracking of a video."""
+    iterations = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
     plan = Plan(rounds, source, tuple(overrides), minutes, iterations)
     with locked(run / ROUNDS_FOLDER):
         plan.save(run)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from argparse import Namespace
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
 from avatar.commands import plan, rounds
+from avatar.commands.opening import source_of
 from avatar.data.source import Source
 from avatar.refine import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
@@ -165,7 +167,7 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     output = avatar(*words, "--refine", 1, "--minutes", 0.001, status=1)
     assert "too little for --refine 1 of 14 frames" in output and not (run / "rounds").exists()
 
-    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 4.0)
+    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 3.8)
     monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.5))
     monkeypatch.setattr(plan, "LEAST_STEPS", 5)
     output = avatar(*words, "--refine", 1, "--minutes", 0.2)
@@ -174,6 +176,29 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     assert steps == [11, 4]
     assert "with --minutes 0.2, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
     assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 0.2, "--resume")
+
+
+def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a mistake is found before it."""
+    clock, run = [0.0], tmp_path / "run"
+    words = ["train", folder, "--out", run, "--frame-offset", 1, *QUICK, "trainer.iterations=1000"]
+
+    def tracked(arguments: Namespace) -> Source:
+        clock[0] += 90.0
+        return source_of(arguments)
+
+    monkeypatch.setattr(rounds, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(rounds.training, "tracked_source", tracked)
+    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 10.0)
+    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.25))
+    assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
+    assert clock == [0.0]
+    monkeypatch.setattr(rounds, "train_refined", lambda *_: 0)
+    output = avatar(*words, "--refine", 1, "--minutes", 5)
+    # 300 seconds less 90 and 10, by a quarter of a second for 1.4 steps
+    assert "5 minutes, 90 s of them gone" in output and "allow 571 steps" in output and "1.5 of 5 minutes" in output
+    refused = avatar(*words[:3], tmp_path / "other", *words[4:], "--refine", 1, "--minutes", 2, status=1)
+    assert "90 s are gone" in refused and "give at least 4.6" in refused
 
 
 def first(run: Path) -> Path:
