@@ -10,7 +10,7 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets, load_head_assets
 from data_prep import avatar_track
 from data_prep.prepare import prepare
 
@@ -31,7 +31,7 @@ def find_head(folder: Path, given: Path | None = None) -> Path:
         return Path(named)
     raise UserError(
         f"no head model for {folder}: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can be had "
-        "from https://flame.is.tue.mpg.de; put generic_model.pkl, head_template.obj and FLAME_masks.pkl into one folder"
+        "from https://flame.is.tue.mpg.de; docs/data.md says which files belong into its folder"
     )
 
 
@@ -62,4 +62,6 @@ def open_subject(
     """
     check_folder(source.folder)
     assets = assets or load_head_assets(source.head)
+    if assets.layout_is_made:
+        say(LAYOUT_IS_MADE)
     return Subject.open(prepare(source, assets, split=sizes, say=say)), assets

@@ -2,8 +2,8 @@
 
 A model file (`generic_model.pkl`, `flame2023.pkl`, ... or the same keys in an .npz) holds v_template (V, 3), f (F, 3),
 shapedirs (V, 3, 300 identity + E expression), posedirs (V, 3, 36), J_regressor (5, V), weights (V, 5) and
-kintree_table (2, 5). Beside it lie an OBJ of the same topology with UVs, `l_eyelid.npy` / `r_eyelid.npy` (V, 3) and
-region masks (`FLAME_masks.pkl` or `masks.npz`). Nothing that these files hold can execute code.
+kintree_table (2, 5). Beside it may lie an OBJ of the same topology with UVs (one is made else), `l_eyelid.npy` /
+`r_eyelid.npy` (V, 3) and region masks (`FLAME_masks.pkl` or `masks.npz`). Nothing that these files hold can execute code.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.files.pickles import load_npy, load_npz, load_pickle
 from avatar.head.expression_names import ExpressionNames, load_expression_names
+from avatar.head.unwrap import LAYOUT_METHOD, NoLayout, unwrap
 from avatar.head.uv_obj import read_uv_obj
 
 IDENTITY_COEFFICIENTS = 300  # FLAME's shapedirs: 300 identity directions, then the expression directions
 JOINT_NAMES = ("root", "neck", "jaw", "left eye", "right eye")
+LAYOUT_IS_MADE = "note: no UV layout (head_template.obj) lies beside the head model: the program makes one"
+EYES = ("left eye", "right eye")
 REQUIRED_KEYS = ("v_template", "f", "shapedirs", "J_regressor", "weights", "kintree_table")
 
 
@@ -46,6 +49,7 @@ class HeadAssets:
     regions: Mapping[str, Int[Tensor, " R"]]  # name -> vertex indices
     fingerprint: str  # SHA-256 over all of the above
     names: ExpressionNames = field(default_factory=ExpressionNames)  # of the expression coefficients
+    layout_is_made: bool = False  # whether `uvs` are the program's own, because no OBJ lay beside the model file
 
     @property
     def num_vertices(self) -> int:
@@ -100,14 +104,16 @@ def load_head_assets(path: Path) -> HeadAssets:
         if "posedirs" in raw
         else np.zeros((V, 3, 9 * (J - 1)), np.float32)
     )
-    uvs, uv_faces = read_uv_obj(find_uv_obj(folder), faces, V)
+    regressor = _array(raw, "J_regressor", model_file, (J, V))
+    obj = find_uv_obj(folder)
+    uvs, uv_faces = made_layout(folder, template, faces, regressor) if obj is None else read_uv_obj(obj, faces, V)
     tensors: dict[str, Tensor] = {
         "template": torch.from_numpy(template),
         "faces": torch.from_numpy(faces),
         "shape_dirs": torch.from_numpy(directions[:, :, :IDENTITY_COEFFICIENTS].copy()),
         "expression_dirs": torch.from_numpy(directions[:, :, IDENTITY_COEFFICIENTS:].copy()),
         "pose_dirs": torch.from_numpy(pose_dirs),
-        "joint_regressor": torch.from_numpy(_array(raw, "J_regressor", model_file, (J, V))),
+        "joint_regressor": torch.from_numpy(regressor),
         "weights": torch.from_numpy(weights),
         "eyelid_dirs": torch.from_numpy(_read_eyelids(folder, V)),
         "uvs": torch.from_numpy(uvs),
@@ -118,8 +124,9 @@ def load_head_assets(path: Path) -> HeadAssets:
         **tensors,
         parents=parents,
         regions=regions,
-        fingerprint=fingerprint_of(tensors, parents, regions),
+        fingerprint=fingerprint_of(tensors if obj else without_layout(tensors), parents, regions),
         names=load_expression_names(folder, directions.shape[2] - IDENTITY_COEFFICIENTS),
+        layout_is_made=obj is None,
     )
 
 
@@ -136,7 +143,7 @@ def find_model_file(path: Path) -> Path:
     if named:
         return named[0]
     candidates = sorted(p for p in path.iterdir() if p.suffix in (".pkl", ".npz") and "mask" not in p.name.lower())
-    candidates = [p for p in candidates if "embedding" not in p.name.lower()]
+    candidates = [p for p in candidates if not any(word in p.name.lower() for word in ("embedding", "texture"))]
     if len(candidates) == 1:
         return candidates[0]
     if not candidates:
@@ -147,8 +154,8 @@ def find_model_file(path: Path) -> Path:
     )
 
 
-def find_uv_obj(folder: Path) -> Path:
-    """The OBJ with the UV layout that lies beside the model file."""
+def find_uv_obj(folder: Path) -> Path | None:
+    """The OBJ with the UV layout that lies beside the model file, if there is one."""
     named = folder / "head_template.obj"
     if named.is_file():
         return named
@@ -156,13 +163,24 @@ def find_uv_obj(folder: Path) -> Path:
     if len(candidates) == 1:
         return candidates[0]
     if not candidates:
-        raise UserError(
-            f"no OBJ with the UV layout lies in {folder}; put head_template.obj (same topology as the model, with "
-            "vt lines; FLAME's comes with its texture space) beside the model file"
-        )
+        return None
     raise UserError(
         f"{folder} holds several OBJ files and none is called head_template.obj; rename the right one to it"
     )
+
+
+def made_layout(
+    folder: Path, template: np.ndarray, faces: np.ndarray, regressor: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A UV layout for a model without one. Raises UserError for a mesh that cannot be laid out."""
+    eyes = (regressor.astype(np.float64) @ template)[[JOINT_NAMES.index(name) for name in EYES]]
+    try:
+        return unwrap(template, faces, eyes)
+    except NoLayout as error:
+        raise UserError(
+            f"no OBJ with a UV layout lies in {folder}, and none can be made of this mesh ({error}): put head_template.obj "
+            "(same topology as the model, with vt lines) beside the model file"
+        ) from None
 
 
 def _read_arrays(file: Path) -> Mapping[str, object]:
@@ -211,6 +229,12 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
             regions[str(region)] = torch.from_numpy(index)
         return regions
     return {}
+
+
+def without_layout(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Of a layout that is made the method counts, since machines round the last digit of its coordinates differently."""
+    rest = {name: tensor for name, tensor in tensors.items() if name not in ("uvs", "uv_faces")}
+    return rest | {"layout_method": torch.tensor([LAYOUT_METHOD])}
 
 
 def fingerprint_of(tensors: Mapping[str, Tensor], parents: tuple[int, ...], regions: Mapping[str, Tensor]) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.third_party import FACE_LANDMARKER, SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find
-from avatar.head.assets import HeadAssets
+from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets
 from data_prep.avatar_track import (
     LANDMARKS_FILE,
     TrackingInfo,
@@ -63,6 +63,8 @@ def track(
     say(f"{video}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
     for note in footage.notes:
         say(f"note: {note}")
+    if head.layout_is_made:
+        say(LAYOUT_IS_MADE)
     mattes = None if choices.matte is None else open_footage(choices.matte)
     network = _matte_network()
     options = choices.to_json()

@@ -175,8 +175,10 @@ def test_files_that_are_missing_or_ambiguous(head_dir: Path, tmp_path_factory: p
     with pytest.raises(UserError, match=r"several files that could be the head model \(flame2020.pkl, flame2023.pkl\)"):
         load_head_assets(head_dir)
     (head_dir / "head_template.obj").unlink()
-    with pytest.raises(UserError, match="no OBJ with the UV layout"):
-        load_head_assets(head_dir / "flame2020.pkl")
+    (head_dir / "FLAME_texture.npz").write_bytes(b"of no use here")
+    (head_dir / "flame2023.pkl").unlink()
+    with pytest.raises(UserError, match="no OBJ with a UV layout"):  # and none can be made of a patch
+        load_head_assets(head_dir)
 
 
 @pytest.mark.parametrize(
