@@ -280,9 +280,9 @@ def mask_overlaps(own: Subject, truth: Subject, pairs: Sequence[tuple[int, int]]
 
 
 def report(results: Sequence[Result], config: Config) -> list[str]:
+    size = "the size of the video" if config.data.size is None else f"{config.data.size} px"
     lines = [
-        f"Held-out frames at {config.data.size} px, head alone, {config.trainer.iterations} steps, against the true "
-        "pictures",
+        f"Held-out frames at {size}, head alone, {config.trainer.iterations} steps, against the true pictures",
         "Errors of the face's vertices in % of the distance between the irises: all, the same in all frames, without "
         "that; and all in % of that between the outer corners of the eyes, as in 300-W",
     ]
