@@ -144,9 +144,7 @@ def _cut_open(faces: np.ndarray, cut: Int[np.ndarray, "E 2"]) -> tuple[Int[np.nd
     one, other = sides[pairs], sides[pairs + 1]
     if (one[:, 0] != other[:, 1]).any():
         raise NoLayout("neighbouring triangles turn opposite ways")
-    same = (
-        np.concatenate((one[:, [2, 3]], other[:, [3, 2]]), axis=1).reshape(-1, 2, 2).transpose(0, 2, 1).reshape(-1, 2)
-    )
+    same = np.concatenate((np.stack((one[:, 2], other[:, 3]), axis=1), np.stack((one[:, 3], other[:, 2]), axis=1)))
     count, rows = connected_components(_graph(np.ones(len(same)), same, faces.size), directed=False)
     vertex_of = np.zeros(count, np.int64)
     vertex_of[rows] = faces.ravel()
@@ -158,18 +156,18 @@ def _least_stretched(
 ) -> Float[np.ndarray, "T 2"]:
     """Every vertex but the rim's in the weighted mean of its neighbours; `gain` is how much larger its area shall be."""
     corners = points[faces]
-    area = np.maximum(
-        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1), _NOTHING
-    )
-    weights = _mean_value_weights(points, faces)
-    inside = np.setdiff1d(np.arange(len(points)), rim)
-    own_gain = gain[faces].mean(1)
-    wanted = area * own_gain
-    # The triangle in its own plane: first edge along x.
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.maximum(0.5 * np.linalg.norm(np.cross(first, second), axis=1), _NOTHING)
+    own_gain = gain[faces].mean(1)
+    wanted = csr_matrix(  # the area of each triangle, at its corners
+        (np.repeat(area * own_gain, 3), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))), (len(points), len(faces))
+    )
+    # The triangle in its own plane: first edge along x.
     base = np.maximum(np.linalg.norm(first, axis=1), _NOTHING)
     scale = np.sqrt(own_gain)
     flat = scale[:, None] * np.stack((base, (first * second).sum(1) / base, 2.0 * area / base), axis=1)
+    weights = _mean_value_weights(points, faces)
+    inside = np.setdiff1d(np.arange(len(points)), rim)
     laid = np.zeros((len(points), 2))
     laid[rim] = circle
     for _ in range(ROUNDS):
@@ -179,10 +177,7 @@ def _least_stretched(
         except RuntimeError as error:
             raise NoLayout(f"its triangles are degenerate ({error})") from None
         stretch = _squared_stretch(flat, laid[faces])
-        spread = csr_matrix(
-            (np.repeat(wanted, 3), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))), (len(points), len(faces))
-        )
-        mean = (spread @ stretch) / np.maximum(np.asarray(spread.sum(1)).ravel(), _NOTHING)
+        mean = (wanted @ stretch) / np.maximum(np.asarray(wanted.sum(1)).ravel(), _NOTHING)
         weights = weights @ diags(1.0 / np.maximum(np.sqrt(mean), _NOTHING) ** EXPONENT)
     return laid
 
