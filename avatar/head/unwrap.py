@@ -68,7 +68,7 @@ def unwrap(
     others.sort(key=lambda name: (-np.sum(part == name), points[faces[part == name]][..., 0].mean()))
     for name, (centre, radius) in zip(others, _slots(len(others)), strict=True):
         place(part == name, *_seen_from_in_front(points, faces[part == name], centre, radius))
-    if not np.isfinite(uvs).all():
+    if not ((uvs >= 0.0) & (uvs <= 1.0)).all():  # NaN is not either
         raise NoLayout("its triangles are degenerate")
     return np.round(uvs, DIGITS).astype(np.float32), uv_faces
 
@@ -80,6 +80,8 @@ def _disk(
     crown, cut = _cut_line(points, faces, frame)
     corners, vertex_of = _cut_open(faces, cut)
     loops = _loops(corners)
+    if not loops:
+        raise NoLayout("a cut does not open its largest part")
     places = points[vertex_of]
     outer = max(loops, key=lambda loop: _length(places[loop]))
     rim = np.array(outer)

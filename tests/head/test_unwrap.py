@@ -158,6 +158,32 @@ def test_what_cannot_be_laid_out() -> None:
         unwrap(*ring(), EYES)
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of values that float32 cannot hold
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_meshes_are_laid_out_or_refused(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    outcomes = []
+    for n in range(60):
+        points, faces = ball(8, 10, neck=0.6) if n % 2 else ball(6, 8)
+        if seed == 0:
+            points, faces = rng.normal(size=(20, 3)), rng.integers(0, 20, (rng.integers(1, 40), 3))
+        elif seed == 1:
+            faces = np.delete(faces, rng.integers(0, len(faces), rng.integers(1, 20)), axis=0)
+        elif seed == 2:
+            chosen = rng.integers(0, len(points), rng.integers(1, 10))
+            points[chosen] = points[rng.integers(0, len(points))] if n % 3 else points[chosen] * 1e20
+        else:
+            faces[rng.integers(0, len(faces)), rng.integers(3)] = rng.integers(0, len(points))
+        try:
+            uvs, laid = unwrap(points, faces, EYES)
+        except NoLayout:
+            outcomes.append(False)
+        else:
+            assert uvs.min() >= 0.0 and uvs.max() <= 1.0 and laid.min() >= 0 and laid.max() < len(uvs)
+            outcomes.append(True)
+    assert not all(outcomes) and (any(outcomes) or seed == 0)
+
+
 def ring(columns: int = 24) -> tuple[np.ndarray, np.ndarray]:
     """A torus: no cut along one line makes a disk of it."""
     angle = np.linspace(0.0, 2.0 * np.pi, columns, endpoint=False)
