@@ -61,7 +61,8 @@ def open_subject(
     `assets` spares reading the head model where it is known. Raises UserError as `prepare` does.
     """
     check_folder(source.folder)
-    assets = assets or load_head_assets(source.head)
-    if assets.layout_is_made:
-        say(LAYOUT_IS_MADE)
+    if assets is None:
+        assets = load_head_assets(source.head)
+        if assets.layout_is_made:
+            say(LAYOUT_IS_MADE)
     return Subject.open(prepare(source, assets, split=sizes, say=say)), assets

@@ -26,6 +26,7 @@ from avatar.head.uv_obj import read_uv_obj
 
 IDENTITY_COEFFICIENTS = 300  # FLAME's shapedirs: 300 identity directions, then the expression directions
 JOINT_NAMES = ("root", "neck", "jaw", "left eye", "right eye")
+LAYOUT_TENSOR = "layout_method"
 LAYOUT_IS_MADE = "note: no UV layout (head_template.obj) lies beside the head model: the program makes one"
 EYES = ("left eye", "right eye")
 REQUIRED_KEYS = ("v_template", "f", "shapedirs", "J_regressor", "weights", "kintree_table")
@@ -49,7 +50,11 @@ class HeadAssets:
     regions: Mapping[str, Int[Tensor, " R"]]  # name -> vertex indices
     fingerprint: str  # SHA-256 over all of the above
     names: ExpressionNames = field(default_factory=ExpressionNames)  # of the expression coefficients
-    layout_is_made: bool = False  # whether `uvs` are the program's own, because no OBJ lay beside the model file
+    layout_method: int = 0  # LAYOUT_METHOD of `uvs` that the program made because no OBJ lay beside the model file
+
+    @property
+    def layout_is_made(self) -> bool:
+        return self.layout_method != 0
 
     @property
     def num_vertices(self) -> int:
@@ -120,13 +125,14 @@ def load_head_assets(path: Path) -> HeadAssets:
         "uv_faces": torch.from_numpy(uv_faces),
     }
     regions = _read_regions(folder, V)
+    method = LAYOUT_METHOD if obj is None else 0
     return HeadAssets(
         **tensors,
         parents=parents,
         regions=regions,
-        fingerprint=fingerprint_of(tensors if obj else without_layout(tensors), parents, regions),
+        fingerprint=fingerprint_of(tensors, parents, regions, method),
         names=load_expression_names(folder, directions.shape[2] - IDENTITY_COEFFICIENTS),
-        layout_is_made=obj is None,
+        layout_method=method,
     )
 
 
@@ -231,14 +237,19 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
     return {}
 
 
-def without_layout(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Of a layout that is made the method counts, since machines round the last digit of its coordinates differently."""
-    rest = {name: tensor for name, tensor in tensors.items() if name not in ("uvs", "uv_faces")}
-    return rest | {"layout_method": torch.tensor([LAYOUT_METHOD])}
+def fingerprint_of(
+    tensors: Mapping[str, Tensor],
+    parents: tuple[int, ...],
+    regions: Mapping[str, Tensor],
+    layout_method: int = 0,
+) -> str:
+    """SHA-256 over everything that a head model consists of.
 
-
-def fingerprint_of(tensors: Mapping[str, Tensor], parents: tuple[int, ...], regions: Mapping[str, Tensor]) -> str:
-    """SHA-256 over everything that a head model consists of."""
+    Of a layout that was made, the method counts: machines round the last digit of its coordinates differently.
+    """
+    if layout_method:
+        tensors = {name: tensor for name, tensor in tensors.items() if name not in ("uvs", "uv_faces")}
+        tensors |= {LAYOUT_TENSOR: torch.tensor([layout_method])}
     digest = hashlib.sha256(repr(parents).encode())
     update: Callable[[bytes], None] = digest.update
     for name, tensor in sorted({**tensors, **{f"region {k}": v for k, v in regions.items()}}.items()):

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from avatar.head.assets import IDENTITY_COEFFICIENTS, JOINT_NAMES, HeadAssets, fingerprint_of
+from avatar.head.assets import IDENTITY_COEFFICIENTS, JOINT_NAMES, LAYOUT_TENSOR, HeadAssets, fingerprint_of
 from avatar.tensors import check_finite, check_shapes
 
 _SHAPES = {
@@ -30,6 +30,8 @@ def head_tensors(assets: HeadAssets) -> dict[str, Tensor]:
     """Everything that `head_from_tensors` needs."""
     tensors = {name: getattr(assets, name).contiguous() for name in _SHAPES}
     tensors["parents"] = torch.tensor(assets.parents)
+    if assets.layout_is_made:
+        tensors[LAYOUT_TENSOR] = torch.tensor([assets.layout_method])
     return tensors | {f"{_REGION}{name}": index.contiguous() for name, index in assets.regions.items()}
 
 
@@ -57,5 +59,14 @@ def head_from_tensors(tensors: Mapping[str, Tensor]) -> HeadAssets:
     parents = tuple(tensors["parents"].tolist())
     if len(parents) != len(JOINT_NAMES) or parents[0] != -1 or any(not 0 <= p < i for i, p in enumerate(parents) if i):
         raise ValueError(f"head.parents is {list(parents)}")
-    fingerprint = fingerprint_of(arrays, parents, regions)
-    return HeadAssets(**arrays, parents=parents, regions=regions, fingerprint=fingerprint)  # pyright: ignore
+    (method,) = tensors[LAYOUT_TENSOR].tolist() if LAYOUT_TENSOR in tensors else (0,)
+    if not isinstance(method, int):
+        raise TypeError(f"head.{LAYOUT_TENSOR} is {method}")
+    fingerprint = fingerprint_of(arrays, parents, regions, method)
+    return HeadAssets(
+        **arrays,  # pyright: ignore
+        parents=parents,
+        regions=regions,
+        fingerprint=fingerprint,
+        layout_method=method,
+    )

@@ -19,6 +19,7 @@ from avatar.head import assets
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.rasterize import rasterize_mesh
 from avatar.head.unwrap import NoLayout, unwrap
+from avatar.runs.trained import load_avatar
 
 EYES = np.array([[0.03, 0.03, 0.06], [-0.03, 0.03, 0.06]])
 RASTER = 512
@@ -209,8 +210,18 @@ def test_such_a_model_is_named_by_its_folder(tmp_path: Path) -> None:
 
 def test_an_avatar_is_trained_without_an_obj(tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "someone", frames=30, size=48)
-    (folder / "head_model" / "head_template.obj").unlink()
+    made = without_obj(folder / "head_model")
     run = tmp_path / "run"
     output = avatar("train", folder, "--out", run, "--frame-offset", 1, *SMALL, "trainer.iterations=8")
     assert "no UV layout (head_template.obj) lies beside the head model: the program makes one" in output
     assert "strict" in avatar("eval", run, "--protocol", "strict")
+    # The file with its head in it knows of the layout, and draws by itself.
+    alone = tmp_path / "alone.safetensors"
+    avatar("export", run, "--with-head", "--format", "avatar", "--out", alone)
+    trained = load_avatar(alone)
+    assert trained.assets.layout_is_made and trained.assets.fingerprint == made.fingerprint
+    assert torch.equal(trained.assets.uvs, made.uvs)
+    # Beside the OBJ it is another head model.
+    write_head_model(folder / "head_model")
+    refused = avatar("eval", run, "--protocol", "strict", status=1)
+    assert "head model" in refused
