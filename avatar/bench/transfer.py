@@ -60,7 +60,8 @@ class Scale:
     iterations: int
 
 
-USUAL, QUICK = Scale(160, 400, 60, 1500), Scale(64, 60, 16, 150)
+# Of 500 frames, the target turns as far as the driver; of 400 it does not, and what it never showed decides.
+USUAL, QUICK = Scale(160, 500, 60, 1500), Scale(64, 60, 16, 150)
 
 
 @dataclass(frozen=True)
