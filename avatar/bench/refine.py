@@ -1,8 +1,8 @@
 """What refinement gives back of what trackers' errors take: a subject's tracking disturbed, refined and trained on again.
 
 The folder's own tracking stands for the truth, and its last frames, which no training sees, are measured. Four avatars of
-the same recipe: trained on the tracking as given, on the disturbed one, on the disturbed one refined through the second
-avatar, and on the given one refined through the first.
+the same recipe: trained on the tracking as given, on the disturbed one, and on both as `avatar train --refine 1` refines
+them, through an avatar that is only trained for that.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from avatar.bench import Request
 from avatar.bench.disturb import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed
 from avatar.bench.results import leave
 from avatar.commands.opening import split_sizes
+from avatar.commands.plan import round_steps
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
@@ -96,7 +97,7 @@ def measure(source: Source, config: Config, out: Path) -> list[Row]:
         for name, recording, again in ((GIVEN, subject.recording, GIVEN_REFINED), (DISTURBED, bent, REFINED)):
             avatar = trial.trained(recording, name)
             rows.append(trial.row(name, avatar, recording))
-            better, seconds = trial.refined(avatar, recording)
+            better, seconds = trial.refined(recording, f"{name}, first")
             avatar = trial.trained(better, again)
             rows.append(trial.row(again, avatar, better, recording, seconds))
     return rows
@@ -122,8 +123,15 @@ class Trial:
             raise KeyboardInterrupt
         return avatar.eval()
 
-    def refined(self, avatar: Avatar, recording: Recording) -> tuple[Recording, float]:
-        """The tracking refined, and the seconds that it took. Raises KeyboardInterrupt after an interruption."""
+    def refined(self, recording: Recording, name: str) -> tuple[Recording, float]:
+        """The tracking refined through a shortly trained avatar, and the seconds that refining took.
+
+        Raises KeyboardInterrupt after an interruption.
+        """
+        trainer = self.config.trainer
+        steps = round_steps(trainer.iterations, len(recording.split.train))
+        short = replace(self.config, trainer=replace(trainer, iterations=steps))
+        avatar = replace(self, config=short).trained(recording, name)
         begin = time.perf_counter()
         background = torch.tensor(self.config.data.background)
         subject = replace(self.subject, recording=recording)

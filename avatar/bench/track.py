@@ -4,8 +4,8 @@ A subject's own folder is the truth. Of demo subjects the pictures in a room, wi
 that `avatar track` gets, with no choice made; of a FOLDER the pictures as they are.
 
 Avatars of one recipe: trained on the true folder, on the video's frames and masks with the true tracking, on what `avatar
-track` made, and on that refined through the third. All are measured on held-out frames against the true pictures in the
-true head masks.
+track` made, and on that as `avatar train --refine 1` refines it. All are measured on held-out frames against the true
+pictures in the true head masks.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def compare(
     avatars[PICTURES] = measured(of_own.trained(given, "pictures"), given, shown)
     avatar = of_own.trained(own.recording, "automatic")
     avatars[AUTOMATIC] = measured(avatar, own.recording, shown)
-    better, refine_seconds = of_own.refined(avatar, own.recording)
+    better, refine_seconds = of_own.refined(own.recording, "first")
     avatars[REFINED] = measured(of_own.trained(better, "refined"), better, shown)
     first = tracked_by_landmarks(tracked, filmed.head, own.recording, assets)
     landmark_error = next(f["value"] for f in info.quality["figures"] if f["name"] == "landmark error")

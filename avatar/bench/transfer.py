@@ -134,7 +134,7 @@ def avatars(
         recording = disturbed(target.recording, HeadModel(assets, target.identity), DISTURBED_SEED)
         avatar = trial.trained(recording, DISTURBED)
         yield DISTURBED, avatar, recording
-        better, _ = trial.refined(avatar, recording)
+        better, _ = trial.refined(recording, f"{DISTURBED}, first")
         yield REFINED, trial.trained(better, REFINED), better
 
 

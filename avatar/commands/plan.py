@@ -22,9 +22,10 @@ from data_prep.open import open_subject
 
 ROUNDS_FOLDER = "rounds"
 PLAN_FORMAT = 1
-# Of the iterations: an avatar that has seen enough to tell where a head is.
-FIRST_SHARE = 0.4
 LEAST_STEPS = 500  # fewer make no avatar
+# An avatar that tells where a head is has seen each training frame some times; later it learns the errors of each frame's
+# tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own.
+FIRST_PASSES, FIRST_SHARE = 3, 0.4
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Plan:
     overrides: tuple[str, ...]  # as they were asked for
     minutes: float | None  # that all of it may take
     iterations: int  # of the run itself
+    round_iterations: int  # of each of the avatars that are only refined through
 
     def save(self, run: Path) -> None:
         content = {
@@ -43,6 +45,7 @@ class Plan:
             "overrides": self.overrides,
             "minutes": self.minutes,
             "iterations": self.iterations,
+            "round_iterations": self.round_iterations,
         }
         write_atomically(plan_file(run), json.dumps(content, indent=1).encode())
 
@@ -62,12 +65,13 @@ class Plan:
         if (
             not isinstance(rounds, int)
             or not isinstance(iterations, int)
+            or not isinstance(in_rounds := raw.get("round_iterations", round(FIRST_SHARE * iterations)), int)
             or not isinstance(minutes, int | float | None)
             or not isinstance(overrides, list)
             or not all(isinstance(o, str) for o in overrides)
         ):
             raise UserError(f"{path} is damaged; start a new run")
-        return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations)
+        return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations, in_rounds)
 
     def final_overrides(self) -> list[str]:
         """Of the run itself."""
@@ -77,40 +81,49 @@ class Plan:
 
     def round_overrides(self) -> list[str]:
         """Of the avatars that are only refined through."""
-        return [*self.overrides, f"trainer.iterations={round_steps(self.iterations)}"]
+        return [*self.overrides, f"trainer.iterations={self.round_iterations}"]
 
 
 def plan_file(run: Path) -> Path:
     return run / ROUNDS_FOLDER / "plan.json"
 
 
-def round_steps(iterations: int) -> int:
-    return max(1, round(FIRST_SHARE * iterations))
+def round_steps(iterations: int, frames: int) -> int:
+    """Of an avatar that is only refined through, before a run of so many iterations on so many training frames."""
+    return max(1, min(round(FIRST_SHARE * iterations), max(LEAST_STEPS, FIRST_PASSES * frames)))
 
 
-def affordable_iterations(seconds: float, step: float, refinement: float, rounds: int) -> int:
-    """Steps of the run itself where each takes `step` seconds and each of the rounds is followed by a `refinement`."""
-    return int((seconds - rounds * refinement) / (step * (1.0 + FIRST_SHARE * rounds)))
+def affordable_iterations(seconds: float, step: float, refinement: float, rounds: int, frames: int) -> int:
+    """Steps of the run itself where each takes `step` seconds and each of the rounds ends with a `refinement`."""
+    steps = (seconds - rounds * refinement) / step
+    able = int(steps / (1.0 + FIRST_SHARE * rounds))
+    in_rounds = round_steps(max(able, 1), frames)
+    return able if in_rounds >= round(FIRST_SHARE * able) else int(steps - rounds * in_rounds)
 
 
-def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: float | None, spent: float) -> int:
-    """The configuration's steps, or as many as the minutes less `spent` seconds allow by what this machine shows on a few.
+def steps_in_time(
+    source: Source, overrides: list[str], rounds: int, minutes: float | None, spent: float
+) -> tuple[int, int]:
+    """Steps of the run itself and of each round: the configuration's, or as many as the minutes less `spent` seconds allow
+    by what this machine shows on a few.
 
     Raises UserError where they allow too few.
     """
     config = load_config(overrides)
     asked = config.trainer.iterations
-    if minutes is None:
-        return asked
     subject, assets = open_subject(source, split_sizes(config), print)
+    frames = len(subject.split.train)
+    if minutes is None:
+        return asked, round_steps(asked, frames)
     term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))
     avatar = new_avatar(assets, subject, config, term.name, CPU)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
     step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds
-    able = affordable_iterations(60.0 * minutes - spent, step, refinement, rounds)
-    if able < min(LEAST_STEPS, asked):
-        least = spent + rounds * refinement + min(LEAST_STEPS, asked) * step * (1.0 + FIRST_SHARE * rounds)
+    able = affordable_iterations(60.0 * minutes - spent, step, refinement, rounds, frames)
+    fewest = min(LEAST_STEPS, asked)
+    if able < fewest:
+        least = spent + rounds * refinement + step * (fewest + rounds * round_steps(fewest, frames))
         raise UserError(
             f"--minutes {minutes:g} is too little for --refine {rounds} of {len(subject)} frames on this machine: "
             f"{spent:.0f} s are gone, it takes about {refinement:.0f} s to refine them and {step:.3f} s a step, so give at "
@@ -121,4 +134,4 @@ def steps_in_time(source: Source, overrides: list[str], rounds: int, minutes: fl
         f"Time         {minutes:g} minutes, {spent:.0f} s of them gone: about {refinement:.0f} s a refinement and "
         f"{step:.3f} s a step allow {able:,} steps; {chosen:,} are taken"
     )
-    return chosen
+    return chosen, round_steps(chosen, frames)

@@ -12,6 +12,7 @@ import torch
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.opening import open_run
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.plan import FIRST_PASSES
 from avatar.compute.choose import choose_device
 from avatar.data.refinement import Refinement, Round
 from avatar.refine.record import frames_csv, sheet, summary
@@ -20,6 +21,7 @@ from avatar.runs.run import Run
 from data_prep.refined import check_target, frame_numbers, write_folder
 
 REFINED_FOLDER = "refined"
+MANY_PASSES = 2 * FIRST_PASSES
 
 
 def run_refine(arguments: Namespace) -> int:
@@ -62,6 +64,11 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     print(f"Subject      {target}")
     print(f"Frames       {target / 'refinement.csv'}")
     print(f"Pictures     {target / 'refinement.png'}")
+    if (passes := run.step / max(len(subject.split.train), 1)) > MANY_PASSES:
+        print(
+            f"Note: this avatar has seen each frame {passes:.0f} times, and learns the tracking's errors by heart with time; "
+            f"avatar train --refine 1 refines through one that has seen it {FIRST_PASSES} times, often better"
+        )
     return OK
 
 

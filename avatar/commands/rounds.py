@@ -70,8 +70,8 @@ def begin_rounds(
     run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str], begin: float
 ) -> int:
     """The minutes are counted from `begin` on, of `time.monotonic`: they include the tracking of a video."""
-    iterations = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
-    plan = Plan(rounds, source, tuple(overrides), minutes, iterations)
+    iterations, in_rounds = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
+    plan = Plan(rounds, source, tuple(overrides), minutes, iterations, in_rounds)
     with locked(run / ROUNDS_FOLDER):
         plan.save(run)
         status = train_refined(run, plan, source)
