@@ -66,7 +66,7 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     print(f"Pictures     {target / 'refinement.png'}")
     if (passes := run.step / max(len(subject.split.train), 1)) > MANY_PASSES:
         print(
-            f"Note: this avatar has seen each frame {passes:.0f} times, and learns the tracking's errors by heart with time; "
+            f"Note: this avatar has seen each frame {passes:.0f} times and may know the tracking's errors by heart; "
             f"avatar train --refine 1 refines through one that has seen it {FIRST_PASSES} times, often better"
         )
     return OK
