@@ -25,7 +25,7 @@ PLAN_FORMAT = 1
 LEAST_STEPS = 500  # fewer make no avatar
 # An avatar that tells where a head is has seen each training frame some times; later it learns the errors of each frame's
 # tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own.
-FIRST_PASSES, FIRST_SHARE = 3, 0.4
+FIRST_PASSES, FIRST_SHARE = 5, 0.4
 
 
 @dataclass(frozen=True)

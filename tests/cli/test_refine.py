@@ -203,8 +203,8 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
 
 
 def test_what_rounds_are_trained_for() -> None:
-    """Three passes over the frames, and no fewer than 500 steps nor more than two fifths of the run's own."""
-    assert plan.round_steps(6000, 400) == 1200 and plan.round_steps(6000, 100) == 500
+    """Five passes over the frames, and no fewer than 500 steps nor more than two fifths of the run's own."""
+    assert plan.round_steps(6000, 400) == 2000 and plan.round_steps(6000, 90) == 500
     assert plan.round_steps(1000, 400) == 400 and plan.round_steps(1, 400) == 1
     for seconds in (30.0, 60.0, 200.0, 900.0):
         for frames in (50, 400, 2000):
