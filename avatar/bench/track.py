@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from avatar.bench import Request
+from avatar.bench.placement import Placement, corners_distance, placement
 from avatar.bench.refine import MEASURED_EVERY, Figures, Trial, figures
 from avatar.bench.results import leave
 from avatar.commands.opening import split_sizes
@@ -36,11 +36,9 @@ from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import load_expression_names
-from avatar.head.model import HeadModel
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
 from data_prep.open import find_head, open_subject
-from data_prep.track.faces.embedding import iris_embedding
-from data_prep.track.faces.landmarks import Landmarks, load_landmarks
+from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import as_tracks, find_embedding
 from data_prep.track.fit.landmark_fit import fit_landmarks
@@ -49,7 +47,6 @@ from data_prep.track.track import Choices, track
 
 SEEDS, ALL_SEEDS = (1,), (1, 2, 3)
 TRUE, PICTURES, AUTOMATIC, REFINED = "true", "true, video's pictures", "automatic", "automatic, refined"
-OUTER_CORNERS, IRISES = (33, 263), (468, 473)  # landmarks
 COMPARED_EVERY = 5  # frames whose masks are compared
 
 
@@ -62,15 +59,6 @@ class Scale:
 
 
 USUAL, QUICK = Scale(120, 384, 160, 1000), Scale(20, 192, 48, 20)
-
-
-@dataclass(frozen=True)
-class Placement:
-    """How far the face's vertices are from the true ones in the picture; per cent of the distance between the irises."""
-
-    all: float  # mean over vertices and frames
-    constant: float  # of each vertex's mean over the frames
-    moving: float  # what remains without that
 
 
 @dataclass(frozen=True)
@@ -239,33 +227,6 @@ def truly_tracked(own: Recording, truth: Recording, pairs: Sequence[tuple[int, i
     true_rows = torch.tensor([true for _, true in pairs])
     tracks = {name: values if name == "shape" else values[true_rows] for name, values in truth.tracks.items()}
     return replace(own, tracks=tracks, intrinsics=truth.intrinsics)
-
-
-def placement(assets: HeadAssets, own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Placement:
-    """How far the face lies from the truth in the picture, over the frames that both have."""
-    irises = torch.from_numpy(iris_embedding(assets).corners[:, 0])
-    ours, theirs = (HeadModel(assets, recording.identity) for recording in (own, truth))
-    residuals, distances = [], []
-    for mine, true in pairs:
-        placed = own.camera(mine).project(ours.vertices(own.params(mine)))[:, :2]
-        expected = truth.camera(true).project(theirs.vertices(truth.params(true)))[:, :2]
-        residuals.append((placed - expected)[assets.regions["face"]].numpy())
-        distances.append(float((expected[irises[0]] - expected[irises[1]]).norm()))
-    # Turned heads show their eyes closer together; the widest tenth is seen from the front.
-    return in_parts(100.0 * np.stack(residuals) / np.percentile(distances, 90))
-
-
-def corners_distance(landmarks: Landmarks) -> float:
-    """Between the outer corners of the eyes, which the interocular distance of 300-W is, in distances of the irises."""
-    points = landmarks.points[landmarks.detected, :, :2]
-    corners, irises = (np.linalg.norm(points[:, a] - points[:, b], axis=-1) for a, b in (OUTER_CORNERS, IRISES))
-    return float(np.percentile(corners, 90) / np.percentile(irises, 90))
-
-
-def in_parts(residuals: Float[np.ndarray, "T V 2"]) -> Placement:
-    constant = residuals.mean(0)
-    lengths = (np.linalg.norm(part, axis=-1).mean() for part in (residuals, constant, residuals - constant))
-    return Placement(*map(float, lengths))
 
 
 def mask_overlaps(own: Subject, truth: Subject, pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:

@@ -19,7 +19,6 @@ from tracked_folder import write_tracked_folder
 from avatar.commands import plan, rounds
 from avatar.commands.opening import source_of
 from avatar.data.source import Source
-from avatar.errors import UserError
 from avatar.refine import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 
@@ -200,31 +199,6 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
     assert "5 minutes, 90 s of them gone" in output and "allow 571 steps" in output and "1.5 of 5 minutes" in output
     refused = avatar(*words[:3], tmp_path / "other", *words[4:], "--refine", 1, "--minutes", 2, status=1)
     assert "90 s are gone" in refused and "give at least 4.6" in refused
-
-
-def test_what_rounds_are_trained_for() -> None:
-    """Five passes over the frames, and no fewer than 500 steps nor more than two fifths of the run's own."""
-    assert plan.round_steps(6000, 400) == 2000 and plan.round_steps(6000, 90) == 500
-    assert plan.round_steps(1000, 400) == 400 and plan.round_steps(1, 400) == 1
-    for seconds in (30.0, 60.0, 200.0, 900.0):
-        for frames in (50, 400, 2000):
-            able = plan.affordable_iterations(seconds, 0.05, 10.0, 2, frames)
-            needed = (able + 2 * plan.round_steps(max(able, 1), frames)) * 0.05 + 2 * 10.0
-            assert needed == pytest.approx(seconds, abs=0.3)
-
-
-def test_a_plan_of_an_earlier_version_is_gone_on_with(folder: Path, tmp_path: Path) -> None:
-    made = plan.Plan(1, Source(folder, folder / "head_model"), tuple(QUICK), None, 1000, 77)
-    made.save(tmp_path)
-    assert plan.Plan.load(tmp_path) == made
-    content = json.loads(plan.plan_file(tmp_path).read_text())
-    del content["round_iterations"]
-    plan.plan_file(tmp_path).write_text(json.dumps(content))
-    assert plan.Plan.load(tmp_path).round_iterations == 400
-    content["round_iterations"] = "many"
-    plan.plan_file(tmp_path).write_text(json.dumps(content))
-    with pytest.raises(UserError, match="is damaged"):
-        plan.Plan.load(tmp_path)
 
 
 def first(run: Path) -> Path:

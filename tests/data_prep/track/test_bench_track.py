@@ -11,17 +11,9 @@ import pytest
 import torch
 from tracked_folder import write_tracked_folder
 
+from avatar.bench.placement import Placement, corners_distance, in_parts, placement
 from avatar.bench.refine import Figures
-from avatar.bench.track import (
-    Placement,
-    Result,
-    corners_distance,
-    in_parts,
-    paired,
-    placement,
-    report,
-    truly_tracked,
-)
+from avatar.bench.track import Result, paired, report, truly_tracked
 from avatar.cli import main
 from avatar.config import load_config
 from avatar.data.recording import Recording

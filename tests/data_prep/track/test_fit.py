@@ -23,6 +23,7 @@ from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.result import Clip
 from data_prep.track.fit.surface import SurfacePoints
+from data_prep.track.progress import silent
 
 FRAMES = 16
 
@@ -49,10 +50,6 @@ def pictures_of(scene: Fitted, change=lambda image: image):
     return shown.__getitem__, [picture.alpha for picture in scene.pictures].__getitem__
 
 
-def quiet(items, total, title):
-    return items
-
-
 def test_the_landmarks_are_met(scene: Fitted) -> None:
     errors = scene.fit.term.errors(scene.fit.identity, scene.fit.motion)
     assert 100 * float(errors.mean()) / scene.seen.eyes < 200 * NOISE
@@ -72,7 +69,7 @@ def test_the_fit_repeats_to_the_bit(scene: Fitted, demo_head_model: Path) -> Non
 
 
 def test_pictures_bring_frames_nearer_to_the_truth(scene: Fitted) -> None:
-    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene), quiet)
+    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene), silent)
     assert done.is_taken and done.after > done.before + 2.0
     assert scene.error(done.motion) < 0.5 * scene.error(scene.fit.motion)
 
@@ -86,14 +83,14 @@ def test_a_light_that_moves_does_not_move_the_head(scene: Fitted) -> None:
         slope = 1 + 0.35 * next(turns) * np.linspace(-1, 1, width)[:, None]
         return np.clip(image * slope, 0, 255).astype(np.uint8)
 
-    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene, lit), quiet)
+    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene, lit), silent)
     assert done.is_taken and scene.error(done.motion) < 0.3 * scene.error(scene.fit.motion)
 
 
 def test_pictures_that_say_nothing_are_not_believed(scene: Fitted) -> None:
     rng = np.random.default_rng(0)
     noise = pictures_of(scene, lambda image: rng.integers(0, 256, image.shape).astype(np.uint8))
-    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *noise, quiet)
+    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *noise, silent)
     assert not done.is_taken and done.motion is scene.fit.motion
 
 
@@ -140,7 +137,7 @@ def test_one_bad_point_does_not_decide_what_is_taken() -> None:
 def test_what_the_held_out_points_gain_little_by_is_not_taken(scene: Fitted, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = iter((30.0, 30.9))
     monkeypatch.setattr(photometric_fit, "_psnr", lambda *_: next(figures))
-    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene), quiet)
+    done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene), silent)
     assert not done.is_taken and done.motion is scene.fit.motion
 
 

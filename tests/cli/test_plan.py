@@ -1,0 +1,37 @@
+"""What `avatar train --refine` trains for, and the file that says so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from avatar.commands import plan
+from avatar.data.source import Source
+from avatar.errors import UserError
+
+
+def test_what_rounds_are_trained_for() -> None:
+    """Five passes over the frames, and no fewer than 500 steps nor more than two fifths of the run's own."""
+    assert plan.round_steps(6000, 400) == 2000 and plan.round_steps(6000, 90) == 500
+    assert plan.round_steps(1000, 400) == 400 and plan.round_steps(1, 400) == 1
+    for seconds in (30.0, 60.0, 200.0, 900.0):
+        for frames in (50, 400, 2000):
+            able = plan.affordable_iterations(seconds, 0.05, 10.0, 2, frames)
+            needed = (able + 2 * plan.round_steps(max(able, 1), frames)) * 0.05 + 2 * 10.0
+            assert needed == pytest.approx(seconds, abs=0.3)
+
+
+def test_a_plan_of_an_earlier_version_is_gone_on_with(tmp_path: Path) -> None:
+    made = plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), None, 1000, 77)
+    made.save(tmp_path)
+    assert plan.Plan.load(tmp_path) == made
+    content = json.loads(plan.plan_file(tmp_path).read_text())
+    del content["round_iterations"]
+    plan.plan_file(tmp_path).write_text(json.dumps(content))
+    assert plan.Plan.load(tmp_path).round_iterations == 400
+    content["round_iterations"] = "many"
+    plan.plan_file(tmp_path).write_text(json.dumps(content))
+    with pytest.raises(UserError, match="is damaged"):
+        plan.Plan.load(tmp_path)
