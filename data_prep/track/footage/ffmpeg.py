@@ -31,6 +31,11 @@ _PICTURE = re.compile(
     r"n:\s*(?P<n>\d+) pts:\s*\S+ pts_time:\s*(?P<time>\S+).*? fmt:(?P<pixels>\w+).*? sar:(?P<sar>\d+/\d+) "
     r"s:(?P<width>\d+)x(?P<height>\d+) i:(?P<field>\w)"
 )
+# showinfo writes a line in pieces, and another thread's message may come between the last two, without its level.
+_BETWEEN = re.compile(r"(?: iskey:\d type:\S|color_trc:\S+) *(.+)")
+_OF_DAMAGE = re.compile(
+    "error|invalid|corrupt|damage|missing|fail|unavailable|out of range|no frame|non-existing|could not|overflow", re.I
+)
 _COLOUR = re.compile(r"color_range:(\S+) color_space:(\S+) color_primaries:(\S+) color_trc:(\S+)")
 
 
@@ -193,12 +198,18 @@ class Decoder:
         if "Parsed_showinfo" in line:
             if (found := _PICTURE.search(line)) is not None:
                 self._noted.put(_shown(found))
+            between = _BETWEEN.search(line)
+            if between is not None and _OF_DAMAGE.search(between[1]):
+                self._complain(between[1])
             return
         said = _LEVEL.match(line)
         if said is not None and said[1] != "warning":
-            self.error_count += 1
-            if len(self.errors) < _KEPT_ERRORS:
-                self.errors.append(said[2].strip())
+            self._complain(said[2])
+
+    def _complain(self, message: str) -> None:
+        self.error_count += 1
+        if len(self.errors) < _KEPT_ERRORS:
+            self.errors.append(message.strip())
 
 
 def _read(process: subprocess.Popen[bytes], shape: tuple[int, int, int]) -> np.ndarray | None:

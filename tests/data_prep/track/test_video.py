@@ -224,6 +224,23 @@ def test_a_complaint_after_the_last_picture_is_heard(tmp_path: Path) -> None:
     assert decoder.errors == ["File ended prematurely"] and decoder.error_count == 1
 
 
+@pytest.mark.parametrize(
+    ("between", "complaints"),
+    [("error while decoding MB 4 3, bytestream -112", 1), ("Increasing reorder buffer to 2", 0), ("", 0)],
+)
+def test_a_complaint_between_the_pieces_of_a_line_is_heard(tmp_path: Path, between: str, complaints: int) -> None:
+    """showinfo writes its line in two pieces; what another thread says between them comes without its level."""
+    shown = (
+        "[Parsed_showinfo_0 @ 0x7f] [info] n:  12 pts:     14 pts_time:0.7     duration:      1 "
+        "duration_time:0.05    fmt:yuv420p cl:left sar:0/1 s:80x64 i:P iskey:0 type:P "
+    )
+    decoder = decoding.Decoder(tmp_path / "a.avi", 0, 8, 8)
+    says = f"sys.stderr.write({shown + between!r} + chr(10) + chr(10)); sys.stdout.write('x' * 192)"
+    decoder.command = [sys.executable, "-c", f"import sys; {says}"]
+    assert [(picture.shown.time, picture.shown.width) for picture in decoder] == [(0.7, 80)]
+    assert decoder.errors == [between][:complaints] and decoder.error_count == complaints
+
+
 REFUSED = {
     "text.mp4": (b"hello\n" * 100, "text.mp4 is not a video that ffmpeg can read (Invalid data found"),
     "text.txt": (b"hello\n" * 100, "text.txt is a text, not a video"),
