@@ -58,7 +58,7 @@ class Scale:
     iterations: int
 
 
-USUAL, QUICK = Scale(120, 384, 160, 1000), Scale(20, 192, 48, 20)
+USUAL, QUICK = Scale(120, 512, 160, 1000), Scale(20, 192, 48, 20)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,10 @@ def run_demo_data(arguments: Namespace) -> int:
     if arguments.video:
         size = 512 if arguments.size is None else arguments.size
         make_video(arguments.out, arguments.frames, size, arguments.seed, arguments.motion)
-        print(f"Next   avatar track {arguments.out} --out SUBJECT --head head_model/ of what avatar demo-data makes")
+        if not (head := head_beside(arguments.out)).exists():
+            make_head_model(head)
+            print(f"Head   {head}")
+        print(f"Next   avatar train {arguments.out} --head {head}")
         return OK
     arguments.size = 256 if arguments.size is None else arguments.size
     make_subject(arguments.out, arguments.frames, arguments.size, arguments.seed, arguments.motion)

@@ -196,7 +196,7 @@ def build_parser() -> argparse.ArgumentParser:
     demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
     demo_data.add_argument("out", type=Path, metavar="OUT")
     demo_data.add_argument("--frames", type=int, default=600)
-    demo_data.add_argument("--video", action="store_true", help="OUT is a plain .mp4 of the person, to be tracked")
+    demo_data.add_argument("--video", action="store_true", help="OUT is a plain .mp4, head_model/ beside it")
     demo_data.add_argument("--size", type=int, help="width and height in pixels (default: 256, of a video 512)")
     demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
     demo_data.add_argument("--motion", choices=("speech", "turn"), default="speech")

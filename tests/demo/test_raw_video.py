@@ -12,6 +12,7 @@ from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, filmed, make_room, make_video
 from avatar.demo.render import render_frame
 from avatar.errors import UserError
+from avatar.head.assets import load_head_assets
 from data_prep.track.footage.source import Span, whole
 from data_prep.track.footage.video import open_video
 
@@ -50,14 +51,18 @@ def test_it_repeats_and_every_seed_has_its_room(pictures: list[np.ndarray]) -> N
     assert np.abs(make_room(SIZE, 1) - make_room(SIZE, 2)).mean() > 10
 
 
-def test_the_command_writes_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "me.mp4"
-    assert main(["demo-data", "--video", str(out), "--frames", "3", "--size", "96", "--seed", "1"]) == 0
-    assert f"avatar track {out}" in capsys.readouterr().out
+def test_the_command_writes_a_video_and_a_head_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, head = tmp_path / "me.mp4", tmp_path / "head_model"
+    options = ["--video", "--frames", "3", "--size", "96"]
+    assert main(["demo-data", str(out), *options, "--seed", "1"]) == 0
+    assert f"avatar train {out} --head {head}" in capsys.readouterr().out
     video = open_video(out)
     assert (video.width, video.height, video.rate) == (96, 96, 25.0)
     assert len(list(video.read(whole(96, 96), Span(), lambda said: None))) == 3
-    assert [path.name for path in tmp_path.iterdir()] == ["me.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["head_model", "me.mp4"]
+    assert load_head_assets(head).num_vertices > 1000
+    assert main(["demo-data", str(tmp_path / "you.mp4"), *options, "--seed", "2"]) == 0
+    assert f"--head {head}" in capsys.readouterr().out  # one is enough for all of them
 
 
 def test_refusals(tmp_path: Path) -> None:
