@@ -48,7 +48,10 @@ PROGRESS_FORMAT = 1  # grows with every change of what refinement finds
 
 @dataclass(frozen=True)
 class Refined:
-    """What became of a subject's T frames; PSNR of the head alone in dB, NaN where a frame shows no head."""
+    """What became of a subject's T frames; PSNR of the head alone in dB, NaN where a frame shows no head.
+
+    `after` is the fit that the moves were made for, before what the head poses' have in common was taken from them.
+    """
 
     tracks: dict[str, Tensor]  # as `Recording.tracks`
     before: Float[np.ndarray, " T"]
@@ -240,15 +243,18 @@ class _Work:
         return _Found(found.moves, before, float(head_psnr(found.picture, made[0])))
 
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
-        """Smooth over time, and keep the given tracking of frames that then fit no better than with it."""
+        """Smooth over time, keep the given tracking of frames that then fit no better than with it, and centre the rest."""
         freedom, numbers = self.freedom, [record.tracking for record in self.subject.manifest.frames]
         moves = smoothed(moves, matrix, freedom.acceleration, freedom.calm, numbers)
         values = freedom.all_values(moves)
         after = np.array(list(self.measured(range(len(values)), values)))
         kept = ~(after[:, 0] <= before[:, 0])
         after[kept] = before[kept]
-        tracks = moved_tracks(self.tracks, values, freedom.changed(), self.centre)
         keep = torch.from_numpy(kept)
+        trained_on = torch.zeros(len(kept), dtype=torch.bool)
+        trained_on[list(self.subject.split.train)] = True
+        values = freedom.all_values(freedom.centred(moves, trained_on & ~keep))
+        tracks = moved_tracks(self.tracks, values, freedom.changed(), self.centre)
         for name, given in self.tracks.items():
             if name != "shape":
                 tracks[name] = torch.where(keep.reshape(-1, *[1] * (given.ndim - 1)), given, tracks[name])

@@ -34,7 +34,7 @@ def clip(avatar: Avatar) -> Clip:
 
 @pytest.fixture(scope="module")
 def wrong(clip: Clip) -> Clip:
-    return wrongly_tracked(clip)
+    return wrongly_tracked(clip, common=False)
 
 
 def refined(avatar: Avatar, clip: Clip, progress: Path, said: list[str] | None = None) -> Refined | None:
@@ -69,6 +69,22 @@ def test_every_frame_comes_nearer_to_the_truth(avatar: Avatar, clip: Clip, wrong
     now, then = (values_of(one.recording.tracks)[:, EXPRESSION] for one in (better, wrong))
     low, high = then[:7].amin(dim=0).minimum(then), then[:7].amax(dim=0).maximum(then)
     assert bool((now >= low).all()) and bool((now <= high).all())
+
+
+def test_what_all_training_frames_share_stays(
+    avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Turns, shifts and depths that every frame's picture asks for are the avatar's preference."""
+    own = refine_module.smoothed
+
+    def shared(moves: torch.Tensor, *rest: Any) -> torch.Tensor:
+        return own(moves, *rest) + torch.where(torch.arange(moves.shape[1]) < 6, 0.03, 0.0)
+
+    monkeypatch.setattr(refine_module, "smoothed", shared)
+    found = refined(avatar, wrong, tmp_path / "progress")
+    assert found is not None and (found.after < result.after).all() and not found.kept.any()
+    for name in ("R", "t", "expression", "jaw"):
+        torch.testing.assert_close(found.tracks[name], result.tracks[name], rtol=0, atol=2e-6)
 
 
 def test_the_avatar_is_left_as_it_was(avatar: Avatar, wrong: Clip, result: Refined) -> None:
