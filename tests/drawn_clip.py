@@ -17,7 +17,7 @@ from tracked_folder import write_head_model
 from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.model import Avatar
-from avatar.refine.motion import EXPRESSION, EYELIDS, EYES, JAW, SHIFT, TURN, moved_tracks, values_of
+from avatar.refine.motion import EXPRESSION, EYELIDS, EYES, JAW, POSE, SHIFT, TURN, moved_tracks, values_of
 from avatar.splat import splat
 from avatar.splat.sh import C0
 from avatar.types import IDENTITY_6D, Frame
@@ -127,13 +127,13 @@ def wrongly_tracked(
 ) -> Clip:
     """The same pictures with a tracking that errs by so much, root mean squares; frames before the last by turns.
 
-    common   whether the training frames err in the mean; what is trained on them would learn that
+    common   whether the head poses of the training frames err in the mean; what is trained on them would learn that
     """
     rng = np.random.default_rng(seed)
     values = values_of(clip.recording.tracks)
     errors = torch.from_numpy(rng.standard_normal(values.shape)).float()
     if not common:
-        errors -= errors[list(clip.recording.split.train)].mean(dim=0)
+        errors[:, POSE] -= errors[list(clip.recording.split.train), POSE].mean(dim=0)
     scale = share * values.std(dim=0)
     scale[TURN], scale[SHIFT] = math.radians(degrees) / math.sqrt(3), 1e-3 * mm / math.sqrt(3)
     scale[SHIFT.stop - 1] = 0.0  # depth hardly shows

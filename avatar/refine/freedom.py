@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.stats import trim_mean
 from torch import Tensor
 
 from avatar.refine.motion import NECK, POSE, SHIFT, TURN, Tracks, accelerations, values_of
@@ -27,6 +28,7 @@ JITTER_SHARE = 0.2
 STILL = 1e-6  # a coefficient that spreads less than this does not move
 # Weight of the given motion's own accelerations as the scale of smoothness. Speech and blinks are abrupt, the head is not.
 HEAD_CALM, FACE_CALM = 1.0, 0.01
+EXTREMES = 0.1  # share of the lowest and of the highest that a mean leaves out: frames in which the tracker was lost
 LEAST_ACCELERATION = 0.02  # units; a clip in which something stands still does not prove that it cannot move
 
 
@@ -60,6 +62,17 @@ class Freedom:
         """The values of every frame, brought within their bounds."""
         moved = self.given.index_add(1, self.index, moves * self.unit)
         return torch.minimum(torch.maximum(moved, self.lowest), self.highest)
+
+    def centred(self, moves: Float[Tensor, "T F"], frames: Bool[Tensor, " T"]) -> Float[Tensor, "T F"]:
+        """The moves less what those of the head pose have in common in `frames`, of which there may be none.
+
+        No picture shows a shift that all training frames share: the avatar has learned it with them. Where moves agree on
+        one all the same, a blurred avatar prefers a size or a place, and the tracker's mean is the better guess.
+        """
+        if not frames.any():
+            return moves
+        common = torch.from_numpy(trim_mean(moves[frames].numpy(), EXTREMES, axis=0))
+        return moves - torch.where(self.index < POSE.stop, common, 0.0)
 
     def changed(self) -> Bool[Tensor, " P"]:
         return torch.zeros(self.given.shape[1], dtype=torch.bool).index_fill(0, self.index, True)

@@ -34,7 +34,7 @@ from avatar.refine.freedom import Freedom, find_freedom
 from avatar.refine.likeness import Likeness, Measure, Target, head_psnr, targets
 from avatar.refine.motion import HeadPose, moved_tracks
 from avatar.refine.parallel import in_order, read_later
-from avatar.refine.smoothing import centred, smoothed
+from avatar.refine.smoothing import smoothed
 from avatar.train.interruption import interruption
 
 COARSEST = 112  # pixels of width: a coarser picture shows nothing that a finer one does not
@@ -50,7 +50,7 @@ PROGRESS_FORMAT = 1  # grows with every change of what refinement finds
 class Refined:
     """What became of a subject's T frames; PSNR of the head alone in dB, NaN where a frame shows no head.
 
-    `after` is the fit that the moves were made for, before what they have in common was taken from them.
+    `after` is the fit that the moves were made for, before what the head poses' have in common was taken from them.
     """
 
     tracks: dict[str, Tensor]  # as `Recording.tracks`
@@ -253,7 +253,7 @@ class _Work:
         keep = torch.from_numpy(kept)
         trained_on = torch.zeros(len(kept), dtype=torch.bool)
         trained_on[list(self.subject.split.train)] = True
-        values = freedom.all_values(centred(moves, trained_on & ~keep))
+        values = freedom.all_values(freedom.centred(moves, trained_on & ~keep))
         tracks = moved_tracks(self.tracks, values, freedom.changed(), self.centre)
         for name, given in self.tracks.items():
             if name != "shape":

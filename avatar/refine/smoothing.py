@@ -16,13 +16,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
-from scipy.stats import trim_mean
 from torch import Tensor
-
-EXTREMES = 0.1  # share of the lowest and of the highest that a mean leaves out: frames in which the tracker was lost
 
 
 def smoothed(
@@ -52,17 +49,6 @@ def smoothed(
         diagonals[0] += strength
         solved[:, k] = solveh_banded(diagonals, strength * own[:, k] - pull[:, k], lower=True)
     return ((torch.from_numpy(solved) @ basis.T) / root).to(moves.dtype)
-
-
-def centred(moves: Float[Tensor, "T F"], frames: Bool[Tensor, " T"]) -> Float[Tensor, "T F"]:
-    """The moves less what those of `frames`, of which there may be none, have in common.
-
-    No picture shows a move that all training frames share: the avatar has learned its opposite with them. Where they agree
-    on one all the same, a blurred avatar prefers a size or a place, and the tracker's mean is the better guess.
-    """
-    if not frames.any():
-        return moves
-    return moves - torch.from_numpy(trim_mean(moves[frames].numpy(), EXTREMES, axis=0))
 
 
 def second_differences(numbers: Sequence[int]) -> csr_array:

@@ -20,7 +20,7 @@ from avatar.refine.freedom import (
     TURN_UNIT,
     find_freedom,
 )
-from avatar.refine.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, SHIFT, accelerations, values_of
+from avatar.refine.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
 
 CENTRE = torch.zeros(3)
 TRAIN = tuple(range(20))
@@ -113,3 +113,16 @@ def test_a_clip_that_stands_still_can_be_refined() -> None:
     assert torch.isfinite(freedom.calm).all()
     assert float(freedom.calm.max()) == pytest.approx(HEAD_CALM / LEAST_ACCELERATION**2)
     assert find_freedom({n: v[:1] if n != "shape" else v for n, v in made.items()}, (0,), CENTRE).unit.all()
+
+
+def test_moves_are_centred_without_extremes_and_only_the_head_poses() -> None:
+    freedom = find_freedom(tracks(), TRAIN, CENTRE)
+    frames = torch.arange(30) < 20
+    moves = torch.randn(30, len(freedom.index), generator=torch.Generator().manual_seed(0)) + 3.0
+    moves[:2] = 1000.0  # the tracker was lost
+    centred = freedom.centred(moves, frames)
+    pose = freedom.index < POSE.stop
+    assert pose.sum() == 6 and torch.equal(centred[:, ~pose], moves[:, ~pose])
+    expected = moves[frames].sort(dim=0).values[2:18].mean(dim=0)
+    torch.testing.assert_close(moves[:, pose] - centred[:, pose], expected[pose].expand(30, 6), rtol=0, atol=1e-4)
+    assert torch.equal(freedom.centred(moves, torch.zeros(30, dtype=torch.bool)), moves)

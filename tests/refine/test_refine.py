@@ -74,11 +74,11 @@ def test_every_frame_comes_nearer_to_the_truth(avatar: Avatar, clip: Clip, wrong
 def test_what_all_training_frames_share_stays(
     avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What every frame's picture asks for is the avatar's preference."""
+    """Turns, shifts and depths that every frame's picture asks for are the avatar's preference."""
     own = refine_module.smoothed
 
     def shared(moves: torch.Tensor, *rest: Any) -> torch.Tensor:
-        return own(moves, *rest) + 0.03
+        return own(moves, *rest) + torch.where(torch.arange(moves.shape[1]) < 6, 0.03, 0.0)
 
     monkeypatch.setattr(refine_module, "smoothed", shared)
     found = refined(avatar, wrong, tmp_path / "progress")

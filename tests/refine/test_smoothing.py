@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from avatar.refine.smoothing import centred, second_differences, smoothed
+from avatar.refine.smoothing import second_differences, smoothed
 
 FRAMES, VALUES = 9, 4
 
@@ -67,12 +67,3 @@ def test_the_given_motions_own_jumps_are_evened_out() -> None:
 def test_rows_of_second_differences() -> None:
     rows = second_differences([1, 2, 3, 4, 9, 10]).toarray()
     assert np.array_equal(rows, [[1, -2, 1, 0, 0, 0], [0, 1, -2, 1, 0, 0]])
-
-
-def test_moves_are_centred_without_extremes() -> None:
-    frames = torch.arange(30) < 20
-    moves = torch.randn(30, 7, generator=torch.Generator().manual_seed(0)) + 3.0
-    moves[:2] = 1000.0  # the tracker was lost
-    expected = moves[frames].sort(dim=0).values[2:18].mean(dim=0)
-    torch.testing.assert_close(moves - centred(moves, frames), expected.expand(30, 7), rtol=0, atol=1e-4)
-    assert torch.equal(centred(moves, torch.zeros(30, dtype=torch.bool)), moves)
