@@ -4,8 +4,8 @@ A subject's own folder is the truth. Of demo subjects the pictures in a room, wi
 that `avatar track` gets, with no choice made; of a FOLDER the pictures as they are.
 
 Avatars of one recipe: trained on the true folder, on the video's frames and masks with the true tracking, on what `avatar
-track` made, and on that as `avatar train --refine 1` refines it. All are measured on held-out frames against the true
-pictures in the true head masks.
+track` made, and on that as `avatar train --refine 1` and `--refine 2` refine it. All are measured on held-out frames
+against the true pictures in the true head masks.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from data_prep.track.fit.result import Clip
 from data_prep.track.track import Choices, track
 
 SEEDS, ALL_SEEDS = (1,), (1, 2, 3)
-TRUE, PICTURES, AUTOMATIC, REFINED = "true", "true, video's pictures", "automatic", "automatic, refined"
+TRUE, PICTURES, AUTOMATIC = "true", "true, video's pictures", "automatic"
+REFINED, AGAIN = "automatic, refined", "refined twice"
 COMPARED_EVERY = 5  # frames whose masks are compared
 
 
@@ -182,6 +183,8 @@ def compare(
     avatars[AUTOMATIC] = measured(avatar, own.recording, shown)
     better, refine_seconds = of_own.refined(own.recording, "first")
     avatars[REFINED] = measured(of_own.trained(better, "refined"), better, shown)
+    best, _ = of_own.refined(better, "second")
+    avatars[AGAIN] = measured(of_own.trained(best, "refined twice"), best, shown)
     first = tracked_by_landmarks(tracked, filmed.head, own.recording, assets)
     landmark_error = next(f["value"] for f in info.quality["figures"] if f["name"] == "landmark error")
     matte_overlap, head_overlap = mask_overlaps(own, truth, pairs[::COMPARED_EVERY])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +25,9 @@ ROUNDS_FOLDER = "rounds"
 PLAN_FORMAT = 1
 LEAST_STEPS = 500  # fewer make no avatar
 # An avatar that tells where a head is has seen each training frame some times; later it learns the errors of each frame's
-# tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own.
-FIRST_PASSES, FIRST_SHARE = 5, 0.4
+# tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own; but no fewer than
+# these, where the run takes as many: what is still blurred tells little, however often it has seen a few frames.
+FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.4, 1000
 
 
 @dataclass(frozen=True)
@@ -90,15 +92,17 @@ def plan_file(run: Path) -> Path:
 
 def round_steps(iterations: int, frames: int) -> int:
     """Of an avatar that is only refined through, before a run of so many iterations on so many training frames."""
-    return max(1, min(round(FIRST_SHARE * iterations), max(LEAST_STEPS, FIRST_PASSES * frames)))
+    usual = min(round(FIRST_SHARE * iterations), FIRST_PASSES * frames)
+    return max(1, min(iterations, max(FIRST_STEPS, usual)))
 
 
 def affordable_iterations(seconds: float, step: float, refinement: float, rounds: int, frames: int) -> int:
-    """Steps of the run itself where each takes `step` seconds and each of the rounds ends with a `refinement`."""
-    steps = (seconds - rounds * refinement) / step
-    able = int(steps / (1.0 + FIRST_SHARE * rounds))
-    in_rounds = round_steps(max(able, 1), frames)
-    return able if in_rounds >= round(FIRST_SHARE * able) else int(steps - rounds * in_rounds)
+    """Steps of the run itself where each takes `step` seconds and each of the rounds ends with a `refinement`; 0 or less
+    where there is no time."""
+    steps = int((seconds - rounds * refinement) / step)
+    if steps <= 0:
+        return steps
+    return bisect_right(range(steps + 1), steps, key=lambda own: own + rounds * round_steps(own, frames)) - 1
 
 
 def steps_in_time(

@@ -13,14 +13,16 @@ from avatar.errors import UserError
 
 
 def test_what_rounds_are_trained_for() -> None:
-    """Five passes over the frames, and no fewer than 500 steps nor more than two fifths of the run's own."""
-    assert plan.round_steps(6000, 400) == 2000 and plan.round_steps(6000, 90) == 500
-    assert plan.round_steps(1000, 400) == 400 and plan.round_steps(1, 400) == 1
+    """Five passes over the frames, and no more than two fifths of the run's own steps; a thousand where it has as many."""
+    assert plan.round_steps(6000, 400) == 2000 and plan.round_steps(6000, 900) == 2400
+    assert plan.round_steps(6000, 90) == plan.round_steps(2000, 400) == plan.round_steps(1000, 400) == 1000
+    assert plan.round_steps(300, 400) == 300 and plan.round_steps(1, 400) == 1
     for seconds in (30.0, 60.0, 200.0, 900.0):
         for frames in (50, 400, 2000):
             able = plan.affordable_iterations(seconds, 0.05, 10.0, 2, frames)
             needed = (able + 2 * plan.round_steps(max(able, 1), frames)) * 0.05 + 2 * 10.0
             assert needed == pytest.approx(seconds, abs=0.3)
+    assert plan.affordable_iterations(19.0, 0.05, 10.0, 2, 50) < 0
 
 
 def test_a_plan_of_an_earlier_version_is_gone_on_with(tmp_path: Path) -> None:

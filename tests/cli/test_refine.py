@@ -146,8 +146,9 @@ def test_an_interrupted_refinement_goes_on(run: Path, tmp_path: Path, monkeypatc
     assert [path.name for path in tmp_path.iterdir()] == ["refined"]
 
 
-def test_training_in_rounds(folder: Path, tmp_path: Path) -> None:
+def test_training_in_rounds(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "run"
+    monkeypatch.setattr(plan, "FIRST_STEPS", 4)
     output = avatar("train", folder, "--out", run, "--frame-offset", 1, "--refine", 2, *QUICK)
     assert "Round 1 of 2" in output and "Round 2 of 2" in output
     assert output.count("4/4") >= 2 and "10/10" in output  # two shorter trainings, and the run's own
@@ -172,9 +173,9 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.5))
     monkeypatch.setattr(plan, "LEAST_STEPS", 5)
     output = avatar(*words, "--refine", 1, "--minutes", 0.2)
-    assert "allow 11 steps; 11 are taken" in output and "of 0.2 minutes" in output
+    assert "allow 8 steps; 8 are taken" in output and "of 0.2 minutes" in output
     steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (run, first(run))]
-    assert steps == [11, 4]
+    assert steps == [8, 8]
     assert "with --minutes 0.2, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
     assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 0.2, "--resume")
 
@@ -191,15 +192,16 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(rounds, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(rounds.training, "tracked_source", tracked)
     monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 10.0)
-    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.25))
+    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.05))
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
     monkeypatch.setattr(rounds, "train_refined", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
-    # 300 seconds less 90 and 10, by a quarter of a second for 1.4 steps
-    assert "5 minutes, 90 s of them gone" in output and "allow 571 steps" in output and "1.5 of 5 minutes" in output
+    # 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
+    assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output
+    assert "allow 3,000 steps; 1,000 are taken" in output
     refused = avatar(*words[:3], tmp_path / "other", *words[4:], "--refine", 1, "--minutes", 2, status=1)
-    assert "90 s are gone" in refused and "give at least 4.6" in refused
+    assert "90 s are gone" in refused and "give at least 2.5" in refused
 
 
 def first(run: Path) -> Path:

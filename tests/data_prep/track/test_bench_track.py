@@ -124,7 +124,13 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
     assert 1.3 < subject["corners"] < 1.5
     assert 0.0 < subject["first_vertices"]["moving"] != subject["vertices"]["moving"]
     assert subject["matte"] > 0.97 and subject["head"] > 0.95
-    assert set(subject["avatars"]) == {"true", "true, video's pictures", "automatic", "automatic, refined"}
+    assert set(subject["avatars"]) == {
+        "true",
+        "true, video's pictures",
+        "automatic",
+        "automatic, refined",
+        "refined twice",
+    }
     assert f"{subject['avatars']['automatic']['psnr']:.2f}" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bench_track.json", "bench_track.md"]
 
