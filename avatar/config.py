@@ -139,7 +139,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.seed": (0, 2**31 - 1),
     "trainer.lr_warmup": (0, MOST_STEPS),
     "trainer.lr_final": (0, 1),
-    "trainer.adam_eps": (1e-30, 1),
+    "trainer.adam_eps": (1e-20, 1),  # float32 has no squares of gradients below 1e-21: less would not bound their steps
     "trainer.sh_interval": (1, MOST_STEPS),
     "trainer.huber_delta": (1e-6, 1000),
     "trainer.mouth_weight": (0, 10**6),

@@ -106,7 +106,7 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("data.size=big", "data.size=big is not valid: it must be a whole number, or null"),
         ("trainer.iterations=0", "trainer.iterations=0 is out of range: it must be from 1 to 99999999"),
         ("trainer.iterations=99999999999", "trainer.iterations=99999999999 is out of range"),
-        ("trainer.adam_eps=0", "trainer.adam_eps=0 is out of range: it must be from 1e-30 to 1"),
+        ("trainer.adam_eps=0", "trainer.adam_eps=0 is out of range: it must be from 1e-20 to 1"),
         ("trainer.adam_eps=tiny", "trainer.adam_eps=tiny is not valid: it must be a number"),
         ("trainer.mouth_weight=inf", "trainer.mouth_weight=inf is out of range: it must be from 0 to 1000000"),
         ("trainer.huber_delta=1e400", "trainer.huber_delta=inf is out of range"),

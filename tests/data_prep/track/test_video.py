@@ -226,7 +226,12 @@ def test_a_complaint_after_the_last_picture_is_heard(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("between", "complaints"),
-    [("error while decoding MB 4 3, bytestream -112", 1), ("Increasing reorder buffer to 2", 0), ("", 0)],
+    [
+        ("error while decoding MB 4 3, bytestream -112", 1),
+        ("File ended prematurely", 1),
+        ("Increasing reorder buffer to 2", 0),
+        ("", 0),
+    ],
 )
 def test_a_complaint_between_the_pieces_of_a_line_is_heard(tmp_path: Path, between: str, complaints: int) -> None:
     """showinfo writes its line in two pieces; what another thread says between them comes without its level."""
