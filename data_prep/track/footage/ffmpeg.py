@@ -34,7 +34,8 @@ _PICTURE = re.compile(
 # showinfo writes a line in pieces, and another thread's message may come between the last two, without its level.
 _BETWEEN = re.compile(r"(?: iskey:\d type:\S|color_trc:\S+) *(.+)")
 _OF_DAMAGE = re.compile(
-    "error|invalid|corrupt|damage|missing|fail|unavailable|out of range|no frame|non-existing|could not|overflow|premature|truncat",
+    "error|invalid|corrupt|damage|missing|fail|unavailable|out of range|no frame|non-existing|could not|overflow|"
+    "premature|truncat",
     re.I,
 )
 _COLOUR = re.compile(r"color_range:(\S+) color_space:(\S+) color_primaries:(\S+) color_trc:(\S+)")

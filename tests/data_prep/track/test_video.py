@@ -224,16 +224,11 @@ def test_a_complaint_after_the_last_picture_is_heard(tmp_path: Path) -> None:
     assert decoder.errors == ["File ended prematurely"] and decoder.error_count == 1
 
 
-@pytest.mark.parametrize(
-    ("between", "complaints"),
-    [
-        ("error while decoding MB 4 3, bytestream -112", 1),
-        ("File ended prematurely", 1),
-        ("Increasing reorder buffer to 2", 0),
-        ("", 0),
-    ],
-)
-def test_a_complaint_between_the_pieces_of_a_line_is_heard(tmp_path: Path, between: str, complaints: int) -> None:
+HEARD = ("error while decoding MB 4 3, bytestream -112", "File ended prematurely")
+
+
+@pytest.mark.parametrize("between", [*HEARD, "Increasing reorder buffer to 2", ""])
+def test_a_complaint_between_the_pieces_of_a_line_is_heard(tmp_path: Path, between: str) -> None:
     """showinfo writes its line in two pieces; what another thread says between them comes without its level."""
     shown = (
         "[Parsed_showinfo_0 @ 0x7f] [info] n:  12 pts:     14 pts_time:0.7     duration:      1 "
@@ -243,7 +238,7 @@ def test_a_complaint_between_the_pieces_of_a_line_is_heard(tmp_path: Path, betwe
     says = f"sys.stderr.write({shown + between!r} + chr(10) + chr(10)); sys.stdout.write('x' * 192)"
     decoder.command = [sys.executable, "-c", f"import sys; {says}"]
     assert [(picture.shown.time, picture.shown.width) for picture in decoder] == [(0.7, 80)]
-    assert decoder.errors == [between][:complaints] and decoder.error_count == complaints
+    assert decoder.errors == [said for said in HEARD if said == between] and decoder.error_count == len(decoder.errors)
 
 
 REFUSED = {
