@@ -20,9 +20,7 @@ from data_prep.track.matting import band_radius, closed_form, within_limits
 
 SIDE = 256  # of the networks' pictures
 _SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network
-_STEEPER = (
-    1.5  # shares about a half, so many times: closed-form matting spreads an edge over more pixels than it covers
-)
+_STEEPER = 1.5  # times, about a half: closed-form matting spreads an edge over more pixels than it covers
 # How far hair, ears and neck reach beyond the landmarks' box, of its longer side: above, beside, below.
 _ABOVE, _BESIDE, _BELOW = 0.75, 0.5, 0.6
 _LOADING = threading.Lock()
