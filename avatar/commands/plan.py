@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -30,6 +31,13 @@ LEAST_STEPS = 500  # fewer make no avatar
 FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.4, 1000
 
 
+class Pace(NamedTuple):
+    """What a round took, in seconds, with all that belongs to it."""
+
+    step: float
+    refinement: float
+
+
 @dataclass(frozen=True)
 class Plan:
     rounds: int
@@ -38,6 +46,7 @@ class Plan:
     minutes: float | None  # that all of it may take
     iterations: int  # of the run itself
     round_iterations: int  # of each of the avatars that are only refined through
+    spent: float = 0.0  # seconds of the minutes when the plan was written
 
     def save(self, run: Path) -> None:
         content = {
@@ -48,6 +57,7 @@ class Plan:
             "minutes": self.minutes,
             "iterations": self.iterations,
             "round_iterations": self.round_iterations,
+            "spent": self.spent,
         }
         write_atomically(plan_file(run), json.dumps(content, indent=1).encode())
 
@@ -69,11 +79,26 @@ class Plan:
             or not isinstance(iterations, int)
             or not isinstance(in_rounds := raw.get("round_iterations", round(FIRST_SHARE * iterations)), int)
             or not isinstance(minutes, int | float | None)
+            or not isinstance(spent := raw.get("spent", 0.0), int | float)
             or not isinstance(overrides, list)
             or not all(isinstance(o, str) for o in overrides)
         ):
             raise UserError(f"{path} is damaged; start a new run")
-        return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations, in_rounds)
+        source = Source.from_dict(raw.get("source"))
+        return cls(rounds, source, tuple(overrides), minutes, iterations, in_rounds, float(spent))
+
+    def paced(self, pace: Pace, rounds: int, frames: int) -> Plan:
+        """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
+        many rounds are still to come; never fewer than make an avatar."""
+        assert self.minutes is not None
+        asked = load_config(self.overrides).trainer.iterations
+        able = affordable_iterations(60.0 * self.minutes - self.spent, pace.step, pace.refinement, rounds, frames)
+        chosen = min(asked, max(able, LEAST_STEPS))
+        print(
+            f"Time         {self.spent:.0f} s of {self.minutes:g} minutes are gone, and a step takes {pace.step:.3f} s: "
+            f"{chosen:,} steps are taken" + (", which is more than there is time for" if chosen > able else "")
+        )
+        return replace(self, iterations=chosen, round_iterations=round_steps(chosen, frames))
 
     def final_overrides(self) -> list[str]:
         """Of the run itself."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from avatar.commands import OK, training
 from avatar.commands.opening import open_run
 from avatar.commands.outputs import check_run_folder
-from avatar.commands.plan import ROUNDS_FOLDER, Plan, plan_file, steps_in_time
+from avatar.commands.plan import ROUNDS_FOLDER, Pace, Plan, plan_file, steps_in_time
 from avatar.commands.refining import refine_run
 from avatar.commands.training import resume_run, train_new
 from avatar.config import load_config
@@ -40,7 +40,7 @@ def run_train(arguments: Namespace) -> int:
         refuse_changes(run, plan, arguments, overrides)
         source = moved_source(run, plan.source, arguments)
         with locked(run / ROUNDS_FOLDER):
-            return train_refined(run, plan, source)
+            return train_refined(run, plan, source, time.monotonic() - plan.spent)
     if arguments.refine is None:
         if arguments.minutes is not None:
             raise UserError("--minutes goes with --refine; without it, say --iterations")
@@ -71,13 +71,10 @@ def begin_rounds(
 ) -> int:
     """The minutes are counted from `begin` on, of `time.monotonic`: they include the tracking of a video."""
     iterations, in_rounds = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
-    plan = Plan(rounds, source, tuple(overrides), minutes, iterations, in_rounds)
+    plan = Plan(rounds, source, tuple(overrides), minutes, iterations, in_rounds, time.monotonic() - begin)
     with locked(run / ROUNDS_FOLDER):
         plan.save(run)
-        status = train_refined(run, plan, source)
-    if status == OK and minutes is not None:
-        print(f"Time         {(time.monotonic() - begin) / 60:.1f} of {minutes:g} minutes")
-    return status
+        return train_refined(run, plan, source, begin)
 
 
 def refuse_changes(run: Path, plan: Plan, arguments: Namespace, overrides: list[str]) -> None:
@@ -104,23 +101,46 @@ def moved_source(run: Path, source: Source, arguments: Namespace) -> Source:
     return source if head is None else replace(source, head=head)
 
 
-def train_refined(run: Path, plan: Plan, source: Source) -> int:
+def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
     """Train, refine, and so on, and at last train the run itself; what is done already is not done again."""
     name = plan.source.folder.resolve().name
     for number in range(1, plan.rounds + 1):
         stage = run / ROUNDS_FOLDER / str(number)
         if not (stage / name).is_dir():
             print(f"Round {number} of {plan.rounds}: a first avatar, and the tracking refined through it")
-            status = go_on_or_begin(source, plan.round_overrides(), stage / "run")
-            if status == OK:
-                status = refine_run(open_run(stage / "run", source.head, source.folder), stage / name)
+            status, plan = train_round(plan, source, stage, begin, plan.rounds - number)
+            plan.save(run)
             if status != OK:
                 return status
         # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
         source = replace(source, folder=stage / name, tracking=None, frame_offset=None, format=None, fps=None)
-    return go_on_or_begin(source, plan.final_overrides(), run)
+    status = go_on_or_begin(source, plan.final_overrides(), run)
+    if status == OK and plan.minutes is not None:
+        print(f"Time         {(time.monotonic() - begin) / 60:.1f} of {plan.minutes:g} minutes")
+    return status
+
+
+def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: int) -> tuple[int, Plan]:
+    """The round in the folder `stage`, with `to_come` after it; and the plan, with the time that is gone. A round that was
+    made in one sitting shows what steps take, and so how many there is time for."""
+    at_once, started = not is_begun(stage / "run"), time.monotonic()
+    status = go_on_or_begin(source, plan.round_overrides(), stage / "run")
+    trained = time.monotonic()
+    if status != OK:
+        return status, replace(plan, spent=trained - begin)
+    run = open_run(stage / "run", source.head, source.folder)
+    status = refine_run(run, stage / plan.source.folder.resolve().name)
+    refined = time.monotonic()
+    plan = replace(plan, spent=refined - begin)
+    if status == OK and at_once and plan.minutes is not None:
+        pace = Pace((trained - started) / plan.round_iterations, refined - trained)
+        plan = plan.paced(pace, to_come, len(run.subject.split.train))
+    return status, plan
 
 
 def go_on_or_begin(source: Source, overrides: list[str], run: Path) -> int:
-    begun = (run / RUN_FILE).is_file() and list_checkpoints(run / "checkpoints")
-    return resume_run(run, source.head, source.folder) if begun else train_new(source, overrides, run)
+    return resume_run(run, source.head, source.folder) if is_begun(run) else train_new(source, overrides, run)
+
+
+def is_begun(run: Path) -> bool:
+    return (run / RUN_FILE).is_file() and bool(list_checkpoints(run / "checkpoints"))

@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle, vector_to_skew_symmetric_matrix
 from torch import Tensor
 
-from avatar.compute.device import on_gpu
 from avatar.head.model import matrix_from_6d
 from avatar.types import HeadParams
 
@@ -44,11 +43,8 @@ class HeadPose(NamedTuple):
 
 
 def rotation(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
-    """Rotation vectors -> matrices; smooth everywhere, at zero too."""
+    """Rotation vectors -> matrices by Rodrigues' formula; smooth everywhere, at zero too."""
     skew = vector_to_skew_symmetric_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape, 3)
-    if not on_gpu(vectors):
-        return torch.linalg.matrix_exp(skew)
-    # torch's exponential waits for a GPU to say how many terms it takes. Rodrigues' formula:
     angle = _angle(vectors)[..., None]
     sine, cosine = torch.sinc(angle / math.pi), 0.5 * torch.sinc(angle / (2.0 * math.pi)).square()
     return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + sine * skew + cosine * (skew @ skew)

@@ -37,13 +37,13 @@ from avatar.refine.parallel import in_order, read_later
 from avatar.refine.smoothing import smoothed
 from avatar.train.interruption import interruption
 
-COARSEST = 112  # pixels of width: a coarser picture shows nothing that a finer one does not
-COARSE_STEPS, FINE_STEPS = 3, 5
+COARSEST = 224  # pixels of width: on fewer a step takes as long, and finds nothing that one on all does not
+COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
 UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
-PROGRESS_FORMAT = 1  # grows with every change of what refinement finds
+PROGRESS_FORMAT = 2  # grows with every change of what refinement finds
 
 
 @dataclass(frozen=True)
@@ -113,6 +113,8 @@ def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, backgr
     with frozen(avatar):
         work = _Work(avatar, subject, size, background)
         frames = work.samples(max(TIMED_FRAMES, workers))
+        flat = work.factors([torch.eye(len(work.freedom.index))] * work.levels)
+        list(work.refined(work.samples(workers), flat))  # the first gradient loads parts of torch
         begin = time.perf_counter()
         factors = work.factors(work.curvatures(workers))
         middle = time.perf_counter()

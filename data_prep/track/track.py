@@ -40,7 +40,7 @@ from data_prep.track.quality import judge
 from data_prep.track.stages import growing, hash_of
 from data_prep.track.work import Choices, Work
 
-STAGES_VERSION = 5  # raised when what a stage makes changes
+STAGES_VERSION = 6  # raised when what a stage makes changes
 
 
 def track(

@@ -169,15 +169,21 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     output = avatar(*words, "--refine", 1, "--minutes", 0.001, status=1)
     assert "too little for --refine 1 of 14 frames" in output and not (run / "rounds").exists()
 
+    # Tracking and opening take 1 s, the round's training 10 and its refinement 20: of 60 seconds 29 are left, for steps
+    # that took 10 seconds for 11.
     monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 3.8)
-    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.5))
+    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=2.5))
     monkeypatch.setattr(plan, "LEAST_STEPS", 5)
-    output = avatar(*words, "--refine", 1, "--minutes", 0.2)
-    assert "allow 8 steps; 8 are taken" in output and "of 0.2 minutes" in output
-    steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (run, first(run))]
-    assert steps == [8, 8]
-    assert "with --minutes 0.2, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
-    assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 0.2, "--resume")
+    ticks = iter((0.0, 0.0, 1.0, 1.0, 11.0, 31.0, 57.0))
+    monkeypatch.setattr(rounds, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
+    output = avatar(*words, "--refine", 1, "--minutes", 1)
+    assert "allow 11 steps; 11 are taken" in output and "of 1 minutes" in output
+    assert "31 s of 1 minutes are gone, and a step takes 0.909 s: 31 steps are taken" in output
+    steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (first(run), run)]
+    assert steps == [11, 31]
+    monkeypatch.undo()
+    assert "with --minutes 1, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
+    assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 1, "--resume")
 
 
 def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +201,8 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.05))
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
-    monkeypatch.setattr(rounds, "train_refined", lambda *_: 0)
+    monkeypatch.setattr(rounds, "train_round", lambda plan, *_: (0, plan))
+    monkeypatch.setattr(rounds, "go_on_or_begin", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
     # 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
     assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output

@@ -77,10 +77,11 @@ class LandmarkTerm:
 
         def rows_of(chunk: slice) -> tuple[Tensor, Tensor, Tensor | None]:
             part, moving = self.take(chunk), motion[chunk]
-            at = to_camera(moving, self.points.positions(identity, moving))
+            placed = self.points.placed(identity, moving)
+            at = to_camera(moving, placed.positions)
             slopes = self.camera.slopes(at)
             in_head = (slopes.flatten(1, 2) @ moving.R).unflatten(1, slopes.shape[1:3])  # [T, L, 2, 3]
-            _, derivatives = self.points.positions_and_derivatives(identity, moving, in_head, with_identity)
+            derivatives = self.points.derivatives(placed, in_head, with_identity)
             pose = by_pose(moving, at, slopes).permute(1, 2, 0, 3)  # [L, 2, T, 6]
             by_step = frame_columns(pose.flatten(0, 1), derivatives, columns).unflatten(0, (-1, 2))  # [L, 2, T, D]
             residuals, weights, scales = part._residuals(self.camera.project(at))

@@ -24,8 +24,8 @@ from data_prep.track.fit.landmark_fit import POINT_SHARE, LandmarkFit, eye_dista
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import minimise
 from data_prep.track.fit.motion import Motion, at_rest
-from data_prep.track.fit.photometric_term import PhotometricTerm
-from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
+from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
+from data_prep.track.fit.skin_points import by_joints, seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints
 from data_prep.track.fit.texture import light_basis, lit_texture
 from data_prep.track.progress import Progress
@@ -60,7 +60,9 @@ def fit_pictures(
     """`images` and `mattes` are those of the fit's frames by row. The identity stays as it is."""
     T, motion = len(start.motion), start.motion
     corners, barycentric = spread_points(assets, skin_triangles(assets))
-    is_held = torch.arange(len(corners)) % HELD_OUT == HELD_OUT // 2
+    order = by_joints(assets, corners, barycentric)  # the derivatives of neighbours are made in place
+    corners, barycentric = corners[order], barycentric[order]
+    is_held = order % HELD_OUT == HELD_OUT // 2
     eyes = float(start.term.unit.mean()) / POINT_SHARE  # pixels of the frames
     points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
     boxes = _boxes(points, start.identity, motion, camera)
@@ -68,24 +70,26 @@ def fit_pictures(
     crops = cut_out(images, mattes, rows, boxes, min(1.0, EYES_IN_CROPS / eyes))
     skin = _Skin(assets, corners, barycentric, camera, crops, start)
     held, compared_at = skin.subset(is_held), dict.fromkeys(BLURS, ~is_held)
-    compared_at[BLURS[0]] = ~is_held & (torch.arange(len(corners)) % COARSE_SHARE == 0)
+    compared_at[BLURS[0]] = ~is_held & (order % COARSE_SHARE == 0)
     on_mouth = _near_lips(assets, start, points)
     terms = (_quieter(start.term), start.priors, start.smoothness)
     first = skin.weights(motion)
     weights = first
     levels = [blur for blur in BLURS for _ in range(ROUNDS)]
-    blurred, last = None, None
+    blurred, compared, seen, last = None, None, None, None
     for blur in progress(levels, len(levels), "fitting to pictures", "textures"):
         if blur != last:
-            blurred, last = None, blur  # frees the memory of the level before
+            blurred, seen, last = None, None, blur  # frees the memory of the level before
             blurred = BlurredCrops(crops, 0.01 * blur * eyes * crops.scale)
             weights = first if motion is start.motion else skin.weights(motion)
-        assert blurred is not None
-        compared, own = skin.subset(compared_at[blur]), weights[:, compared_at[blur]]
-        values = compared.values(blurred, motion)
+            compared = skin.subset(compared_at[blur])
+            seen = SkinValues(compared.points, camera, blurred)
+        assert blurred is not None and compared is not None and seen is not None
+        own = weights[:, compared_at[blur]]
+        values = seen.at(start.identity, motion)
         wanted = lit_texture(values, own, compared.basis).values(compared.basis)
         own = own * torch.where(on_mouth[compared_at[blur]], 1.0, _trust(values - wanted, own))
-        term = PhotometricTerm(compared.points, camera, blurred, 0, wanted, own)
+        term = PhotometricTerm(seen, wanted, own)
         motion = minimise(
             (term, *terms), start.identity, motion, start.columns, ITERATIONS, with_identity=False, coupled=True
         ).motion
@@ -119,12 +123,7 @@ class _Skin:
 
     def values(self, images: BlurredCrops, motion: Motion) -> Float[Tensor, "T N"]:
         _, camera, _, start = self._of
-
-        def of(chunk: slice) -> Tensor:
-            at = to_camera(motion[chunk], self.points.positions(start.identity, motion[chunk]))
-            return images.values(camera.project(at), chunk)
-
-        return torch.cat(over_chunks(of, len(motion), _FRAMES_AT_ONCE))
+        return SkinValues(self.points, camera, images).at(start.identity, motion)
 
     def weights(self, motion: Motion) -> Float[Tensor, "T N"]:
         """How much each point counts in each frame, see `seen_weights`."""

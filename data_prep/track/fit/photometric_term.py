@@ -22,55 +22,60 @@ from data_prep.track.fit.surface import SurfacePoints
 
 DEVIATION = 0.03  # of grey values from 0 to 1
 ROBUST = 3.0  # scale of Cauchy's loss, in deviations
-_FRAMES_AT_ONCE = 8
+_FRAMES_AT_ONCE = 16
+
+
+class SkinValues:
+    """What T frames show of N points. The last values are kept: a step begins where the one before ended."""
+
+    def __init__(self, points: SurfacePoints, camera: Pinhole, images: BlurredCrops) -> None:
+        self.points, self.camera, self.images = points, camera, images
+        self._kept: tuple[Tensor, Motion, Tensor] | None = None
+
+    def at(self, identity: Float[Tensor, " I"], motion: Motion) -> Float[Tensor, "T N"]:
+        if self._kept is not None and self._kept[0] is identity and self._kept[1] is motion:
+            return self._kept[2]
+
+        def of(chunk: slice) -> Tensor:
+            at = to_camera(motion[chunk], self.points.positions(identity, motion[chunk]))
+            return self.images.values(self.camera.project(at), chunk)
+
+        values = torch.cat(over_chunks(of, len(motion), _FRAMES_AT_ONCE))
+        self._kept = identity, motion, values
+        return values
 
 
 @dataclass(frozen=True)
 class PhotometricTerm:
     """Of N points in T frames. The wanted values and the weights stay as they are while the motion is improved."""
 
-    points: SurfacePoints
-    camera: Pinhole
-    images: BlurredCrops
-    first: int  # number of the first frame in `images`
+    seen: SkinValues
     wanted: Float[Tensor, "T N"]
     weights: Float[Tensor, "T N"]  # 0 where a point is not seen
 
     def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
-        def cost_of(chunk: slice) -> float:
-            at = to_camera(motion[chunk], self.points.positions(identity, motion[chunk]))
-            values = self.images.values(self.camera.project(at), self._frames(chunk))
-            residuals = (values - self.wanted[chunk]) / DEVIATION
-            robust = ROBUST**2 * torch.log1p((residuals / ROBUST) ** 2)
-            return float(0.5 * (self.weights[chunk] * robust).sum())
-
-        return sum(over_chunks(cost_of, len(motion), _FRAMES_AT_ONCE))
+        residuals = (self.seen.at(identity, motion) - self.wanted) / DEVIATION
+        robust = ROBUST**2 * torch.log1p((residuals / ROBUST) ** 2)
+        return float(0.5 * (self.weights * robust).sum())
 
     def add_to(
         self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
     ) -> None:
-        with_identity = len(equations.shared) > 0
+        with_identity, seen = len(equations.shared) > 0, self.seen
 
         def rows_of(chunk: slice) -> tuple[Tensor, Tensor, Tensor | None]:
             moving = motion[chunk]
-            at = to_camera(moving, self.points.positions(identity, moving))
-            residuals, gradient = self._residuals(self.camera.project(at), chunk)
-            slopes = gradient[:, :, None] @ self.camera.slopes(at)  # [T, N, 1, 3]
+            placed = seen.points.placed(identity, moving)
+            at = to_camera(moving, placed.positions)
+            values, gradient = seen.images.sample(seen.camera.project(at), chunk)
+            residuals = (values - self.wanted[chunk]) / DEVIATION
+            slopes = gradient[:, :, None] / DEVIATION @ seen.camera.slopes(at)  # [T, N, 1, 3]
             robust = (self.weights[chunk] / (1 + (residuals / ROBUST) ** 2)).sqrt()
             slopes = slopes * robust[..., None, None]
             in_head = (slopes.flatten(1, 2) @ moving.R)[:, :, None]
-            _, derivatives = self.points.positions_and_derivatives(identity, moving, in_head, with_identity)
+            derivatives = seen.points.derivatives(placed, in_head, with_identity)
             pose = by_pose(moving, at, slopes)[:, :, 0].transpose(0, 1)  # [N, T, 6]
             J = frame_columns(pose, derivatives, columns)
             return J, (residuals * robust).T, derivatives.identity if with_identity else None
 
         equations.add_chunks(rows_of, _FRAMES_AT_ONCE)
-
-    def _residuals(self, pixels: Float[Tensor, "T N 2"], chunk: slice) -> tuple[Tensor, Tensor]:
-        """In deviations [T, N], and their derivatives by the pixels [T, N, 2]."""
-        values, gradient = self.images.sample(pixels, self._frames(chunk))
-        return (values - self.wanted[chunk]) / DEVIATION, gradient / DEVIATION
-
-    def _frames(self, chunk: slice) -> slice:
-        """Where the images of a chunk are."""
-        return slice(self.first + chunk.start, self.first + chunk.stop)

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
@@ -48,6 +48,16 @@ class Derivatives(NamedTuple):
     identity: Float[Tensor, "N*Q T I"]  # I = 0 unless asked for
 
 
+class Placed(NamedTuple):
+    """Points where a motion places them, and what their derivatives are made from."""
+
+    positions: Float[Tensor, "T N 3"]  # in the head's own space, metres
+    motion: Motion
+    local: list[Float[Tensor, "T 3 3"]]  # every joint's rotation relative to its parent
+    world: Float[Tensor, "T J 3 3"]  # and in the head's space
+    turned: list[Float[Tensor, "T M P 3"]]  # R_j g_j of every group's points and joints
+
+
 class SurfacePoints:
     """N points of a head model, given by the corners of their triangles and barycentric weights; float64.
 
@@ -68,6 +78,7 @@ class SurfacePoints:
         self.num_points, self.num_identities, self.num_expressions = len(corners), identities, len(expressions)
         self._has_features = bool(assets.pose_dirs[corners].any())
         self._groups = _groups(assets, corners, barycentric.double(), identities, expressions, self._has_features)
+        self._rest: tuple[Tensor, list[Tensor]] | None = None  # an identity and what `_at_rest` gives for it
 
     def of(self, rows: Int[Tensor, " M"]) -> SurfacePoints:
         """Some of the points."""
@@ -84,18 +95,19 @@ class SurfacePoints:
             total[:, group.rows] = g @ world[:, list(group.joints)].transpose(2, 3).flatten(1, 2)
         return total
 
-    def positions_and_derivatives(
-        self,
-        identity: Float[Tensor, " I"],
-        motion: Motion,
-        directions: Float[Tensor, "T N Q 3"],
-        with_identity: bool = False,
-    ) -> tuple[Float[Tensor, "T N 3"], Derivatives]:
-        """Positions [T, N, 3] as above, and the derivatives of directions . positions."""
-        T, N, Q = directions.shape[:3]
-        E, I = self.num_expressions, self.num_identities if with_identity else 0  # noqa: E741
+    def placed(self, identity: Float[Tensor, " I"], motion: Motion) -> Placed:
+        """`positions`, to the last digits, on the way to `derivatives`."""
         local, world = self._pose(motion)
         turned = self._turned(identity, motion, local, world)
+        return Placed(self._carried(turned, ROOT, len(motion)), motion, local, world, turned)
+
+    def derivatives(
+        self, placed: Placed, directions: Float[Tensor, "T N Q 3"], with_identity: bool = False
+    ) -> Derivatives:
+        """Of directions . positions."""
+        (T, N, Q), motion = directions.shape[:3], placed.motion
+        E, I = self.num_expressions, self.num_identities if with_identity else 0  # noqa: E741
+        local, world, turned = placed[2:]
         by_coefficients = torch.empty(N, Q * T, E + 2 + self._num_features, dtype=torch.float64)
         by_identity = torch.empty(N, Q * T, I, dtype=torch.float64)
         q = directions.permute(1, 2, 0, 3)  # [N, Q, T, 3]
@@ -117,7 +129,7 @@ class SurfacePoints:
                 own = by_features[..., 9 * (joint - 1) : 9 * joint]
                 column = column + _rows_times(own, change.flatten(2).transpose(1, 2))
             columns.append(column)
-        return self._carried(turned, ROOT, T), Derivatives(
+        return Derivatives(
             torch.cat(columns, dim=-1),
             by_coefficients[..., :E],
             by_coefficients[..., E : E + 2],
@@ -137,14 +149,20 @@ class SurfacePoints:
             world.append(world[self._parents[joint]] @ local[-1])
         return local, torch.stack(world, dim=1)
 
+    def _at_rest(self, identity: Tensor) -> list[Float[Tensor, "M 3*P"]]:
+        """g_j of every group's points and joints without expression and features. Kept: all frames share an identity."""
+        kept = self._rest
+        if kept is None or kept[0] is not identity:
+            kept = self._rest = identity, [group.template + group.identity @ identity for group in self._groups]
+        return kept[1]
+
     def _unturned(self, identity: Tensor, motion: Motion, local: list[Tensor]) -> Iterator[Float[Tensor, "T M 3*P"]]:
         """g_j of every group's points and joints."""
         parts = [motion.expression, motion.eyelids]
         if self._has_features:
             parts.append((torch.stack(local[1:], dim=1) - local[0][:, None]).flatten(1))
         coefficients = torch.cat(parts, dim=1)
-        for group in self._groups:
-            rest = group.template + group.identity @ identity
+        for group, rest in zip(self._groups, self._at_rest(identity), strict=True):
             g = rest.flatten() + coefficients @ group.basis.flatten(0, 1).T
             yield g.reshape(len(motion), *rest.shape)
 
@@ -209,6 +227,15 @@ def _ancestry(parents: tuple[int, ...], joint: int) -> list[int]:
     return line
 
 
+def joint_dependence(assets: HeadAssets, share: Float[Tensor, "N 3 J"]) -> Bool[Tensor, "N J"]:
+    """Which joints move points, whose corners follow each joint by `share`."""
+    depends = (share != 0).any(1)
+    for joint in reversed(range(1, len(assets.parents))):  # a bone is turned by the joint above it
+        depends[:, assets.parents[joint]] |= depends[:, joint]
+    depends[:, ROOT] = True
+    return depends
+
+
 def _groups(
     assets: HeadAssets,
     corners: Tensor,
@@ -218,12 +245,8 @@ def _groups(
     has_features: bool,
 ) -> list[_Group]:
     """The points by the set of joints that they depend on."""
-    J = len(assets.parents)
     share = barycentric[..., None] * assets.weights[corners].double()  # [N, 3, J]
-    depends = (share != 0).any(1)  # [N, J]
-    for joint in reversed(range(1, J)):  # a bone is turned by the joint above it
-        depends[:, assets.parents[joint]] |= depends[:, joint]
-    depends[:, ROOT] = True
+    depends = joint_dependence(assets, share)
     bases = torch.cat(
         (
             assets.template[:, :, None],

@@ -83,8 +83,9 @@ def test_positions_and_derivatives_are_those_of_the_head_model(make_head, seed: 
     torch.testing.assert_close(points.positions(identity, motion), expected, rtol=0, atol=1e-12)
 
     directions = torch.randn(T, N, 2, 3, dtype=torch.float64)
-    positions, derivatives = points.positions_and_derivatives(identity, motion, directions, with_identity=True)
-    torch.testing.assert_close(positions, expected, rtol=0, atol=1e-12)
+    placed = points.placed(identity, motion)
+    torch.testing.assert_close(placed.positions, expected, rtol=0, atol=1e-12)
+    derivatives = points.derivatives(placed, directions, with_identity=True)
 
     def along(identity: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         at = by_head_model(assets, corners, weights, identity, motion.moved(step))
@@ -114,10 +115,9 @@ def test_without_identity_and_pose_correctives_the_rest_is_the_same() -> None:
     motion, identity = some_motion(0), torch.zeros(0, dtype=torch.float64)
     points = SurfacePoints(plain, corners, weights, 0, USED)
     expected = by_head_model(plain, corners, weights, identity, motion)
-    positions, derivatives = points.positions_and_derivatives(
-        identity, motion, torch.ones(T, N, 1, 3, dtype=torch.float64)
-    )
-    torch.testing.assert_close(positions, expected, rtol=0, atol=1e-12)
+    placed = points.placed(identity, motion)
+    torch.testing.assert_close(placed.positions, expected, rtol=0, atol=1e-12)
+    derivatives = points.derivatives(placed, torch.ones(T, N, 1, 3, dtype=torch.float64))
     assert derivatives.identity.shape == (N, T, 0)
 
 

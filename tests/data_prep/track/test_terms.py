@@ -18,7 +18,7 @@ from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import Term
 from data_prep.track.fit.motion import Motion, rotations
 from data_prep.track.fit.normal_equations import NormalEquations
-from data_prep.track.fit.photometric_term import PhotometricTerm
+from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
 from data_prep.track.fit.priors import make_priors
 from data_prep.track.fit.smoothness import make_smoothness
 from data_prep.track.fit.surface import SurfacePoints
@@ -84,7 +84,7 @@ def photometric_term() -> PhotometricTerm:
     blurred = BlurredCrops(crops, 2.0)
     values, _ = blurred.sample(CAMERA.project(to_camera(motion, points.positions(IDENTITY, motion))), slice(0, T))
     wanted = values + noise(T, N, seed=11, scale=0.05)
-    return PhotometricTerm(points, CAMERA, blurred, 0, wanted, noise(T, N, seed=12).abs())
+    return PhotometricTerm(SkinValues(points, CAMERA, blurred), wanted, noise(T, N, seed=12).abs())
 
 
 def gradients(term: Term, step: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -144,11 +144,22 @@ def test_some_landmarks_cost_what_they_cost_among_others() -> None:
 
 
 def test_values_are_those_of_samples_with_derivatives() -> None:
-    term = photometric_term()
+    images = photometric_term().seen.images
     pixels = 60.0 + noise(2, 7, 2, seed=20, scale=40.0)  # some of them outside
-    values, gradient = term.images.sample(pixels, slice(1, 3))
-    assert torch.equal(term.images.values(pixels, slice(1, 3)), values) and gradient.any()
-    assert not torch.equal(term.images.values(pixels, slice(2, 4)), values)
+    values, gradient = images.sample(pixels, slice(1, 3))
+    assert torch.equal(images.values(pixels, slice(1, 3)), values) and gradient.any()
+    assert not torch.equal(images.values(pixels, slice(2, 4)), values)
+
+
+def test_kept_values_are_those_of_the_same_motion_and_identity() -> None:
+    seen, motion = photometric_term().seen, some_motion()
+    values = seen.at(IDENTITY, motion)
+    assert seen.at(IDENTITY, motion) is values
+    fresh = SkinValues(seen.points, seen.camera, seen.images)
+    for identity, other in ((IDENTITY, replace(motion, t=motion.t + 0.01)), (IDENTITY + 0.5, motion)):
+        assert not torch.equal(seen.at(identity, other), values)
+        assert torch.equal(seen.at(identity, other), fresh.at(identity, other))
+    assert torch.equal(seen.at(IDENTITY, motion), values)
 
 
 def test_frames_that_do_not_follow_each_other_are_not_compared() -> None:
