@@ -14,6 +14,7 @@ from avatar.commands.opening import split_sizes
 from avatar.commands.training import new_avatar
 from avatar.compute.device import CPU
 from avatar.config import load_config
+from avatar.data.manifest import parse_number
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
@@ -71,21 +72,19 @@ class Plan:
             raise UserError(f"{path} cannot be read ({error})") from None
         if not isinstance(raw, dict) or raw.get("format") != PLAN_FORMAT:
             raise UserError(f"{path} was written by another version of this program; start a new run")
-        rounds, overrides, minutes, iterations = (
-            raw.get(key) for key in ("rounds", "overrides", "minutes", "iterations")
-        )
-        if (
-            not isinstance(rounds, int)
-            or not isinstance(iterations, int)
-            or not isinstance(in_rounds := raw.get("round_iterations", round(FIRST_SHARE * iterations)), int)
-            or not isinstance(minutes, int | float | None)
-            or not isinstance(spent := raw.get("spent", 0.0), int | float)
-            or not isinstance(overrides, list)
-            or not all(isinstance(o, str) for o in overrides)
-        ):
-            raise UserError(f"{path} is damaged; start a new run")
-        source = Source.from_dict(raw.get("source"))
-        return cls(rounds, source, tuple(overrides), minutes, iterations, in_rounds, float(spent))
+        try:
+            rounds, iterations = _whole(raw["rounds"]), _whole(raw["iterations"])
+            in_rounds = _whole(raw.get("round_iterations", round(FIRST_SHARE * iterations)))
+            minutes = None if raw["minutes"] is None else parse_number(raw["minutes"], "minutes")
+            spent = parse_number(raw.get("spent", 0.0), "spent")
+            overrides = raw["overrides"]
+            if not isinstance(overrides, list) or not all(isinstance(override, str) for override in overrides):
+                raise ValueError("overrides are no list of texts")
+        except KeyError as error:
+            raise UserError(f"{path} is damaged: {error.args[0]} is missing; start a new run") from None
+        except ValueError as error:
+            raise UserError(f"{path} is damaged: {error}; start a new run") from None
+        return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations, in_rounds, spent)
 
     def paced(self, pace: Pace, rounds: int, frames: int) -> Plan:
         """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
@@ -109,6 +108,13 @@ class Plan:
     def round_overrides(self) -> list[str]:
         """Of the avatars that are only refined through."""
         return [*self.overrides, f"trainer.iterations={self.round_iterations}"]
+
+
+def _whole(value: object) -> int:
+    """A count. Raises ValueError for what is none."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{value!r} is no count")
+    return value
 
 
 def plan_file(run: Path) -> Path:

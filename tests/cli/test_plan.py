@@ -33,7 +33,30 @@ def test_a_plan_of_an_earlier_version_is_gone_on_with(tmp_path: Path) -> None:
     del content["round_iterations"]
     plan.plan_file(tmp_path).write_text(json.dumps(content))
     assert plan.Plan.load(tmp_path).round_iterations == 400
-    content["round_iterations"] = "many"
-    plan.plan_file(tmp_path).write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("rounds", 0),
+        ("rounds", True),
+        ("iterations", 6000.0),
+        ("round_iterations", "many"),
+        ("minutes", float("nan")),
+        ("minutes", "5"),
+        ("spent", float("inf")),
+        ("overrides", [1]),
+    ],
+)
+def test_a_damaged_plan_is_refused(tmp_path: Path, key: str, value: object) -> None:
+    plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), 5.0, 1000, 77).save(tmp_path)
+    whole = json.loads(plan.plan_file(tmp_path).read_text())
+    plan.plan_file(tmp_path).write_text(json.dumps({**whole, key: value}))
     with pytest.raises(UserError, match="is damaged"):
+        plan.Plan.load(tmp_path)
+    if key in ("round_iterations", "spent"):  # an earlier version left them out
+        return
+    del whole[key]
+    plan.plan_file(tmp_path).write_text(json.dumps(whole))
+    with pytest.raises(UserError, match=f"is damaged: {key} is missing"):
         plan.Plan.load(tmp_path)
