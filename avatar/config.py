@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -168,16 +169,16 @@ def config_dir() -> Path:
 def load_config(overrides: Sequence[str] = ()) -> Config:
     """Compose configs/config.yaml with `key=value` or `group=option` overrides, later ones winning.
 
+    `trainer.iterations` without `trainer.passes` lifts a preset's limit of passes over the frames.
     Raises UserError for an unknown key or option, a wrong type or a value out of range.
     """
-    composed = _composed(overrides)
-    values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
-    for key, text in (override.split("=", 1) for override in overrides if override.partition("=")[0] not in _groups()):
+    values: dict[str, Any] = OmegaConf.to_container(_composed(overrides), resolve=True)  # type: ignore[assignment]
+    given = dict(override.split("=", 1) for override in overrides if override.partition("=")[0] not in _groups())
+    for key, text in given.items():
         *sections, name = key.split(".")
-        section = values
-        for part in sections:
-            section = section[part]
-        section[name] = typed_value(text)
+        reduce(dict.__getitem__, sections, values)[name] = typed_value(text)
+    if "trainer.iterations" in given and "trainer.passes" not in given:
+        values["trainer"]["passes"] = None
     return config_from_dict(values)
 
 

@@ -53,17 +53,17 @@ def test_the_papers_networks_have_the_papers_sizes(width: int, layers: int, publ
     assert (f"{count // 1000}K" if count < 1e6 else f"{count / 1e6:.1f}M") == published
 
 
-def test_the_default_is_the_fast_preset_of_the_papers_model() -> None:
+def test_the_default_is_the_best_preset_of_the_papers_model() -> None:
     config, paper = load_config(), load_config(["preset=paper"])
-    assert config == load_config(["preset=fast"])
+    assert config == load_config(["preset=best"]) == load_config(["experiment=best"])
     assert config.model.latent_grid == 16 and config.trainer.initial_colours == "frames"
     assert (config.model.latent_dim, config.model.uv_size) == (paper.model.latent_dim, paper.model.uv_size)
     assert load_config(["preset=fast", "model.latent_grid=null"]).model.latent_grid is None
 
 
-def test_the_best_recipe_is_the_default_with_its_kept_ingredients() -> None:
-    ours, default = flatten(load_config(["experiment=best"]).to_dict()), flatten(load_config().to_dict())
-    assert {key: value for key, value in ours.items() if value != default[key]} == {
+def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
+    ours, fast = flatten(load_config().to_dict()), flatten(load_config(["preset=fast"]).to_dict())
+    assert {key: value for key, value in ours.items() if value != fast[key]} == {
         "model.uv_detail": 2,
         "trainer.iterations": 5000,
         "trainer.passes": 10,
@@ -74,6 +74,13 @@ def test_the_best_recipe_is_the_default_with_its_kept_ingredients() -> None:
         "trainer.learning_rates.scale": 2.0e-2,
         "trainer.learning_rates.rotation": 4.0e-3,
     }
+
+
+def test_who_says_how_many_steps_means_them() -> None:
+    assert load_config().trainer.passes == 10
+    assert load_config(["trainer.iterations=7000"]).trainer.passes is None
+    assert load_config(["trainer.iterations=7000", "trainer.passes=3"]).trainer.passes == 3
+    assert load_config(["trainer.passes=3", "trainer.iterations=7000"]).trainer.passes == 3
 
 
 def test_later_overrides_win_and_survive_a_round_trip() -> None:

@@ -35,6 +35,7 @@ from avatar.model import Avatar
 from avatar.refine.motion import EXPRESSION, values_of
 from avatar.refine.refine import refine_subject
 from avatar.render import Renderer
+from avatar.train.order import planned_steps, within_passes
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
 from data_prep.open import find_head, open_subject
@@ -115,7 +116,8 @@ class Trial:
 
     def trained(self, recording: Recording, name: str) -> Avatar:
         """An avatar of the subject's pictures with this tracking. Raises KeyboardInterrupt after an interruption."""
-        config, subject = self.config, replace(self.subject, recording=recording)
+        trainer = within_passes(self.config.trainer, len(recording.split.train))
+        config, subject = replace(self.config, trainer=trainer), replace(self.subject, recording=recording)
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(self.assets, subject.identity, config.model)
         term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
@@ -128,8 +130,9 @@ class Trial:
 
         Raises KeyboardInterrupt after an interruption.
         """
-        trainer = self.config.trainer
-        steps = round_steps(trainer.iterations, len(recording.split.train))
+        frames = len(recording.split.train)
+        trainer = within_passes(self.config.trainer, frames)
+        steps = round_steps(trainer.iterations, frames)
         short = replace(self.config, trainer=replace(trainer, iterations=steps))
         avatar = replace(self, config=short).trained(recording, name)
         begin = time.perf_counter()
@@ -232,7 +235,7 @@ def recovered(rows: Sequence[Row]) -> float:
 def report(rows: Sequence[Row], config: Config) -> str:
     head = f"{'PSNR':>7}{'SSIM':>8}{'LPIPS':>8}{'mouth':>7}"
     lines = [
-        f"Held-out frames, head alone, {config.trainer.iterations} steps. Driven by the tracking that was trained on "
+        f"Held-out frames, head alone, {planned_steps(config.trainer)}. Driven by the tracking that was trained on "
         "(own), by what that was before refining, and by the given one",
         f"{'trained on':>20} {'own'.center(30)} {'before'.center(30)} {'given'.center(30)}   vertices, mm and px  outside",
         f"{'':>20} {head} {head} {head}",

@@ -36,6 +36,7 @@ from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import load_expression_names
+from avatar.train.order import planned_steps
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
 from data_prep.open import find_head, open_subject
 from data_prep.track.faces.landmarks import load_landmarks
@@ -246,7 +247,7 @@ def mask_overlaps(own: Subject, truth: Subject, pairs: Sequence[tuple[int, int]]
 def report(results: Sequence[Result], config: Config) -> list[str]:
     size = "the size of the video" if config.data.size is None else f"{config.data.size} px"
     lines = [
-        f"Held-out frames at {size}, head alone, {config.trainer.iterations} steps, against the true pictures",
+        f"Held-out frames at {size}, head alone, {planned_steps(config.trainer)}, against the true pictures",
         "Errors of the face's vertices in % of the distance between the irises: all, the same in all frames, without "
         "that; and all in % of that between the outer corners of the eyes, as in 300-W",
     ]

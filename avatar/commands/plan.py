@@ -20,6 +20,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.refine.refine import estimated_seconds
 from avatar.train.cost import measure_cost
+from avatar.train.order import within_passes
 from avatar.train.step import choose_perceptual
 from data_prep.open import open_subject
 
@@ -90,7 +91,7 @@ class Plan:
         """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
         many rounds are still to come; never fewer than make an avatar."""
         assert self.minutes is not None
-        asked = load_config(self.overrides).trainer.iterations
+        asked = within_passes(load_config(self.overrides).trainer, frames).iterations
         able = affordable_iterations(60.0 * self.minutes - self.spent, pace.step, pace.refinement, rounds, frames)
         chosen = min(asked, max(able, LEAST_STEPS))
         print(
@@ -145,9 +146,9 @@ def steps_in_time(
     Raises UserError where they allow too few.
     """
     config = load_config(overrides)
-    asked = config.trainer.iterations
     subject, assets = open_subject(source, split_sizes(config), print)
     frames = len(subject.split.train)
+    asked = within_passes(config.trainer, frames).iterations
     if minutes is None:
         return asked, round_steps(asked, frames)
     term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))

@@ -187,7 +187,9 @@ def refuse_changes(run: Path, info: RunInfo, arguments: Namespace, overrides: li
         recorded = {**flatten(info.config.to_dict()), **info.options}
         asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
         limited = (
-            recorded["trainer.passes"] is not None and asked["trainer.iterations"] > recorded["trainer.iterations"]
+            recorded["trainer.passes"] is not None
+            and asked["trainer.passes"] == recorded["trainer.passes"]
+            and asked["trainer.iterations"] > recorded["trainer.iterations"]
         )
         free = {"device", *(["trainer.iterations"] if limited else [])}  # what was asked for is not recorded
         for key in (override.partition("=")[0] for override in overrides):

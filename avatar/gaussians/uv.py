@@ -12,10 +12,12 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
+from avatar.head.features import eyeballs, openings
 from avatar.head.rasterize import rasterize_mesh
 
 DETAILED = ("lips", "left_eyeball", "right_eyeball")  # region names of FLAME_masks.pkl; what moves most is about them
 REACH = 0.012  # metres from them, on the template: lids, lashes and the corners of the mouth are within it
+REACH_OF_OPENINGS = 0.02  # where only the mouth's opening is known, which lies behind the lips
 
 FINEST = 2048  # texels a side, of a raster and of a detailed one
 
@@ -35,8 +37,7 @@ def uv_texels(assets: HeadAssets, size: int, detail: int = 1) -> UVTexels:
     those of one that is `detail` times as fine.
 
     Row 0 is the top of the map (v = 1). Texels of a triangle that touches the region `boundary` (the rim of the neck) are
-    left out, as in FlashAvatar. Raises ValueError when nothing is covered, UserError for a raster that is too fine and
-    for detail on a head model that does not say where its mouth and eyes are.
+    left out, as in FlashAvatar. Raises ValueError when nothing is covered, UserError for a raster that is too fine.
     """
     coarse = _raster(assets, size)
     if detail == 1:
@@ -44,7 +45,7 @@ def uv_texels(assets: HeadAssets, size: int, detail: int = 1) -> UVTexels:
     if size * detail > FINEST:
         raise UserError(
             f"model.uv_size={size} times model.uv_detail={detail} is {size * detail} texels a side: at most {FINEST} are "
-            "possible"
+            "possible; lower one of them"
         )
     fine, is_detailed = _raster(assets, size * detail), detailed_faces(assets)
     outside, inside = ~is_detailed[coarse.face], is_detailed[fine.face]
@@ -52,16 +53,23 @@ def uv_texels(assets: HeadAssets, size: int, detail: int = 1) -> UVTexels:
 
 
 def detailed_faces(assets: HeadAssets) -> Bool[Tensor, " F"]:
-    """The triangles that lie within REACH of lips and eyeballs. Raises UserError where the head model names neither."""
+    """The triangles that lie within REACH of lips and eyeballs; where the head model names neither, about what turns with
+    the eyes and about the openings of the face. None where there is nothing of that either."""
     named = [assets.regions[name] for name in DETAILED if len(assets.regions.get(name, ()))]
-    if not named:
-        raise UserError(
-            "model.uv_detail needs to know where mouth and eyes are, and the head model names no region "
-            f"{', '.join(DETAILED)}: put its FLAME_masks.pkl beside it, or train with model.uv_detail=1"
-        )
+    if named:
+        near = _within(assets, torch.cat(named), REACH)
+    else:
+        near = _within(assets, eyeballs(assets), REACH) | _within(assets, openings(assets), REACH_OF_OPENINGS)
+    return near[assets.faces].all(dim=1)
+
+
+def _within(assets: HeadAssets, vertices: Int[Tensor, " R"], reach: float) -> Bool[Tensor, " V"]:
+    """The vertices within so many metres of these, on the template."""
+    if len(vertices) == 0:
+        return torch.zeros(assets.num_vertices, dtype=torch.bool)
     points = assets.template.numpy()
-    distances = KDTree(points[torch.cat(named).numpy()]).query(points, distance_upper_bound=REACH)[0]
-    return torch.from_numpy(np.isfinite(distances))[assets.faces].all(dim=1)
+    distances = KDTree(points[vertices.numpy()]).query(points, distance_upper_bound=reach)[0]
+    return torch.from_numpy(np.isfinite(distances))
 
 
 def painted(

@@ -17,6 +17,11 @@ def within_passes(config: TrainerConfig, frames: int) -> TrainerConfig:
     return replace(config, iterations=min(config.iterations, config.passes * frames))
 
 
+def planned_steps(config: TrainerConfig) -> str:
+    """How many steps that is, for a heading, before the number of frames is known."""
+    return f"{config.iterations} steps" + (f", at most {config.passes} passes" if config.passes is not None else "")
+
+
 def frame_order(frames: Sequence[int], seed: int, start: int, stop: int) -> Iterator[int]:
     """The frames of steps `start` to `stop` - 1: every pass over `frames` in a new random order.
 

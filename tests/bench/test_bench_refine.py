@@ -104,7 +104,7 @@ def test_the_share_recovered_and_the_report() -> None:
         Row("disturbed, refined", figures(27.4), figures(25.2), figures(26.5), 0.6, 0.3, 2, 13.6),
     ]
     assert recovered(rows) == pytest.approx(0.8)
-    config = SimpleNamespace(trainer=SimpleNamespace(iterations=1500))
+    config = SimpleNamespace(trainer=SimpleNamespace(iterations=1500, passes=None))
     text = report(rows, config)  # type: ignore[arg-type]
     assert "80% of the PSNR lost" in text and "12 and 14 s" in text and "1500 steps" in text
     line = next(line for line in text.splitlines() if "disturbed, refined" in line)

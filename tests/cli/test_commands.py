@@ -53,7 +53,7 @@ def test_doctor_says_what_works() -> None:
 def test_what_training_was_made_from_is_recorded(trained: Path, tracked_folder: Path) -> None:
     info = json.loads((trained / "run.json").read_text())
     assert info["source"]["folder"] == str(tracked_folder) and info["source"]["frame_offset"] == 1
-    assert info["perceptual"] == "dssim" and info["options"]["preset"] == "fast"
+    assert info["perceptual"] == "dssim" and info["options"]["preset"] == "best"
     assert info["config"]["data"]["size"] == 40 and info["config"]["trainer"]["seed"] == 3
     assert len(info["data_hash"]) == len(info["head_fingerprint"]) == 64
 

@@ -77,7 +77,7 @@ def test_a_head_that_is_smaller_than_lpips_sees_is_trained_on(tmp_path: Path) ->
 TOO_LARGE = {
     "network": (["model.mlp_width=65536", "model.mlp_layers=1000"], "the deformation network", "model.mlp_width or"),
     "texels": (
-        ["model.uv_size=2048", "model.latent_dim=4096"],
+        ["model.uv_size=1024", "model.latent_dim=4096"],
         "the HyperGaussians",
         "model.uv_size or model.latent_dim",
     ),
@@ -101,7 +101,7 @@ def test_a_foreign_avatar_file_that_lies_about_its_size_is_refused(tracked_folde
     run = tmp_path / "run"
     avatar("train", tracked_folder, "--frame-offset", 1, "--out", run, *QUICK)
     portrait = read_portrait(run / "avatar.safetensors")
-    huge = replace(portrait.config.model, mlp_width=65536, mlp_layers=1000, uv_size=2048, latent_dim=4096)
+    huge = replace(portrait.config.model, mlp_width=65536, mlp_layers=1000, uv_size=1024, latent_dim=4096)
     file = tmp_path / "foreign.safetensors"
     write_portrait(file, replace(portrait, config=replace(portrait.config, model=huge)))
     head = tracked_folder / "head_model"

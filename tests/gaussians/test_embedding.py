@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -62,12 +60,8 @@ def test_a_detailed_map_is_painted_on_the_finer_raster() -> None:
     assert not covered[0].any() and not image[~covered].any()
 
 
-def test_detail_needs_regions_and_room() -> None:
+def test_detail_needs_room() -> None:
     assets = grid_head()
-    bare = replace(assets, regions={"boundary": assets.regions["boundary"]})
-    assert len(uv_texels(bare, 16).face)
-    with pytest.raises(UserError, match="names no region lips, left_eyeball, right_eyeball: put its FLAME_masks.pkl"):
-        uv_texels(bare, 16, detail=2)
     with pytest.raises(
         UserError, match=r"model\.uv_size=1024 times model\.uv_detail=4 is 4096 texels a side: at most 2048"
     ):

@@ -41,8 +41,9 @@ def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, .
 
 def test_gaussians_of_a_finer_raster_are_counted() -> None:
     config, assets = small_config("model.uv_detail=2").model, grid_head(rows=31, columns=41)
+    coarse = small_config("model.uv_detail=1").model
     gaussians = count_gaussians(config, assets)
-    assert gaussians == len(Avatar(assets, torch.zeros(3), config)) > count_gaussians(small_config().model, assets)
+    assert gaussians == len(Avatar(assets, torch.zeros(3), config)) > count_gaussians(coarse, assets)
 
 
 def test_a_map_too_coarse_for_a_single_gaussian_gets_a_sentence() -> None:
@@ -107,7 +108,7 @@ def test_the_largest_part_is_what_is_to_be_lowered() -> None:
         return max(needs, key=lambda need: need.size).what
 
     assert largest("model.mlp_width=65536", "model.mlp_layers=1000") == "the deformation network"
-    assert largest("model.uv_size=2048", "model.latent_dim=64") == "the HyperGaussians"
+    assert largest("model.uv_size=1024", "model.latent_dim=64") == "the HyperGaussians"
     assert (
         largest("preset=paper", "model.uv_size=2048", "model.mlp_width=1024") == "the network's layers at every place"
     )

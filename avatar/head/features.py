@@ -1,0 +1,35 @@
+"""Where a head model's eyes and mouth are, when it names no regions."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from avatar.head.assets import EYES, JOINT_NAMES, HeadAssets
+
+EYE_JOINTS = [JOINT_NAMES.index(name) for name in EYES]
+FACE = 0.12  # metres from the middle between the eyes, on the template: a mouth's opening is nearer, a neck's farther
+
+
+def eyeballs(assets: HeadAssets) -> Int[Tensor, " R"]:
+    """The vertices that turn with an eye."""
+    return torch.nonzero(assets.weights[:, EYE_JOINTS].sum(dim=1) > 0.5).flatten()
+
+
+def openings(assets: HeadAssets) -> Int[Tensor, " R"]:
+    """The vertices on the rim of a hole in the face: the inner rim of the lips in FLAME, in others eye sockets too."""
+    triangles = assets.faces.numpy()
+    edges = np.sort(np.concatenate((triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]])), axis=1)
+    distinct, times = np.unique(edges, axis=0, return_counts=True)
+    a, b = distinct[times == 1].T
+    V = assets.num_vertices
+    rim_of = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(V, V)), directed=False)[1]
+    points = assets.template.double().numpy()
+    middle = (assets.joint_regressor[EYE_JOINTS].double().numpy() @ points).mean(axis=0)
+    found = [np.flatnonzero(rim_of == rim) for rim in np.unique(rim_of[a])]
+    near = [rim for rim in found if np.linalg.norm(points[rim].mean(axis=0) - middle) < FACE]
+    return torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *near]))
