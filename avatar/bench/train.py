@@ -29,7 +29,7 @@ from avatar.train.step import Judge, Objective, choose_perceptual, training_step
 from avatar.types import Frame
 from data_prep.open import find_head, open_subject
 
-PRESETS = ("paper", "balanced", "fast")
+PRESETS = ("paper", "balanced", "fast", "best")
 FRAMES = 8  # training frames that take turns; all are decoded before the clock runs
 ONCE_A_FRAME = ("skinning",)  # done once for each frame of a training, not in every step
 QUICK = ("model.uv_size=20", "data.size=48", "model.mlp_width=16")

@@ -43,7 +43,7 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     run(Request(tmp_path, quick=True, inputs=(tracked_folder,), frame_offset=1))
     output = capsys.readouterr().out
     figures = json.loads((tmp_path / "bench_train.json").read_text())
-    assert [row["preset"] for row in figures["rows"]] == ["paper", "balanced", "fast"]
+    assert [row["preset"] for row in figures["rows"]] == ["paper", "balanced", "fast", "best"]
     sums: list[str] = []
     for row in figures["rows"]:
         assert f"{row['late']['median']:.1f} ({row['late']['p95']:.1f})" in output

@@ -34,7 +34,7 @@ addEventListener("load", () => {
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_tracked_folder(tmp_path_factory.mktemp("report") / "someone", frames=30, size=48)
-    train_small(folder, folder.parent / "run")
+    train_small(folder, folder.parent / "run", ["model.uv_detail=1"])
     assert main(["eval", str(folder.parent / "run"), "--protocol", "hypergaussians"]) == 0
     assert main(["report", str(folder.parent / "run")]) == 0
     return folder.parent / "run"
