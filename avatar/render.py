@@ -22,7 +22,7 @@ from torch.nn.functional import embedding_bag
 from avatar.compute.device import brought, on_gpu
 from avatar.compute.workers import single_threaded_workers
 from avatar.errors import UserError
-from avatar.gaussians.compose import compose, compose_carried, compose_slice, split_offsets
+from avatar.gaussians.compose import compose_carried, compose_raw, compose_slice
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.ndgs import Slice
 from avatar.model import Avatar
@@ -157,7 +157,7 @@ class Renderer:
     def place(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"] | Slice) -> Gaussians:
         if isinstance(offsets, Slice):
             return compose_slice(points, **self._base, position=offsets.position, density=offsets.density)
-        return compose(points, offsets=split_offsets(offsets), **self._base)
+        return compose_raw(points, raw=offsets, **self._base)
 
 
 def drawn(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:

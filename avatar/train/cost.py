@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.config import Config
+from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
@@ -18,7 +19,7 @@ from avatar.train.optim import make_optimizer
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
 
-MEASURED_STEPS = 3  # after one that is not counted
+MEASURED_STEPS = 3  # of each kind, after one that is not counted
 _COPIES = 4  # of every parameter: itself, its gradient, Adam's two moments
 
 
@@ -26,7 +27,7 @@ _COPIES = 4  # of every parameter: itself, its gradient, Adam's two moments
 class Cost:
     gaussians: int
     parameters: int
-    step_seconds: float  # median, on this machine, with all terms of the loss
+    step_seconds: float  # on this machine, the mean over the run; of each kind of step the median
     iterations: int
     cache_bytes: int  # decoded frames, at most what the configuration allows
     parameter_bytes: int  # with gradients and the optimizer's state
@@ -54,19 +55,37 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
     vertices = avatar.head.vertices(frame.params)
-    seconds = []
-    last = config.trainer.iterations - 1  # when all of the loss and of the colour takes part
-    for _ in range(1 + MEASURED_STEPS):
-        begin = time.perf_counter()
-        training_step(avatar, optimizer, objective, last, frame, vertices)
-        seconds.append(time.perf_counter() - begin)
+    total = 0.0
+    for count, step in kinds_of_steps(config.trainer, term.every):
+        seconds = []
+        for _ in range(1 + MEASURED_STEPS):
+            begin = time.perf_counter()
+            training_step(avatar, optimizer, objective, step, frame, vertices)
+            seconds.append(time.perf_counter() - begin)
+        total += count * float(np.median(seconds[1:]))
     height, width = frame.image.shape[:2]
     parameters = sum(p.numel() for p in avatar.parameters())
     return Cost(
         gaussians=len(avatar),
         parameters=parameters,
-        step_seconds=float(np.median(seconds[1:])),
+        step_seconds=total / config.trainer.iterations,
         iterations=config.trainer.iterations,
         cache_bytes=min(width * height * BYTES_PER_PIXEL * frames, config.data.cache_mb << 20),
         parameter_bytes=4 * _COPIES * parameters,
     )
+
+
+def kinds_of_steps(trainer: TrainerConfig, every: int) -> list[tuple[int, int]]:
+    """How many steps of a run are alike in what their loss takes, and the last one of them: before the perceptual term,
+    with it, which every so many-th step is, and between those."""
+    start = round(trainer.perceptual_start * trainer.iterations)
+    late = trainer.iterations - start
+    with_term = math.ceil(late / every)
+    last_with_term = start + (with_term - 1) * every
+    last = trainer.iterations - 1
+    kinds = [
+        (start, start - 1),
+        (with_term, last_with_term),
+        (late - with_term, last if last != last_with_term else last - 1),
+    ]
+    return [(count, step) for count, step in kinds if count]
