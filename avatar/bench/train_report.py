@@ -82,6 +82,8 @@ def write_plot(rows: Sequence[Row], path: Path) -> None:
     unique = dict(zip(labels, handles, strict=True))
     axes.legend(unique.values(), unique.keys(), fontsize=8, ncols=2)
     axes.invert_yaxis()
-    axes.set(xlabel="milliseconds of a training step, forward and backward", title=f"{rows[0].gaussians:,} Gaussians")
+    counts = sorted({row.gaussians for row in rows})
+    title = f"{' to '.join(f'{count:,}' for count in dict.fromkeys((counts[0], counts[-1])))} Gaussians"
+    axes.set(xlabel="milliseconds of a training step, forward and backward", title=title)
     axes.grid(alpha=0.3, axis="x")
     figure.savefig(path, dpi=100)

@@ -30,7 +30,8 @@ LEAST_STEPS = 500  # fewer make no avatar
 # An avatar that tells where a head is has seen each training frame some times; later it learns the errors of each frame's
 # tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own; but no fewer than
 # these, where the run takes as many: what is still blurred tells little, however often it has seen a few frames.
-FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.4, 1000
+FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.25, 1000
+EARLIER_SHARE = 0.4  # in plans that do not say it
 
 
 class Pace(NamedTuple):
@@ -75,7 +76,7 @@ class Plan:
             raise UserError(f"{path} was written by another version of this program; start a new run")
         try:
             rounds, iterations = _whole(raw["rounds"]), _whole(raw["iterations"])
-            in_rounds = _whole(raw.get("round_iterations", round(FIRST_SHARE * iterations)))
+            in_rounds = _whole(raw.get("round_iterations", round(EARLIER_SHARE * iterations)))
             minutes = None if raw["minutes"] is None else parse_number(raw["minutes"], "minutes")
             spent = parse_number(raw.get("spent", 0.0), "spent")
             overrides = raw["overrides"]

@@ -13,8 +13,8 @@ from avatar.errors import UserError
 
 
 def test_what_rounds_are_trained_for() -> None:
-    """Five passes over the frames, and no more than two fifths of the run's own steps; a thousand where it has as many."""
-    assert plan.round_steps(6000, 400) == 2000 and plan.round_steps(6000, 900) == 2400
+    """Five passes over the frames, and no more than a quarter of the run's own steps; a thousand where it has as many."""
+    assert plan.round_steps(12000, 400) == 2000 and plan.round_steps(6000, 900) == 1500
     assert plan.round_steps(6000, 90) == plan.round_steps(2000, 400) == plan.round_steps(1000, 400) == 1000
     assert plan.round_steps(300, 400) == 300 and plan.round_steps(1, 400) == 1
     for seconds in (30.0, 60.0, 200.0, 900.0):
