@@ -32,6 +32,7 @@ LEAST_STEPS = 500  # fewer make no avatar
 # these, where the run takes as many: what is still blurred tells little, however often it has seen a few frames.
 FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.25, 1000
 EARLIER_SHARE = 0.4  # in plans that do not say it
+PLANNED_SHARE = 0.97  # of the minutes: the rest is for opening and closing the run itself, which nothing before shows
 
 
 class Pace(NamedTuple):
@@ -93,7 +94,7 @@ class Plan:
         many rounds are still to come; never fewer than make an avatar."""
         assert self.minutes is not None
         asked = within_passes(load_config(self.overrides).trainer, frames).iterations
-        able = affordable_iterations(60.0 * self.minutes - self.spent, pace.step, pace.refinement, rounds, frames)
+        able = affordable_iterations(plannable(self.minutes) - self.spent, pace.step, pace.refinement, rounds, frames)
         chosen = min(asked, max(able, LEAST_STEPS))
         print(
             f"Time         {self.spent:.0f} s of {self.minutes:g} minutes are gone, and a step takes {pace.step:.3f} s: "
@@ -129,6 +130,11 @@ def round_steps(iterations: int, frames: int) -> int:
     return max(1, min(iterations, max(FIRST_STEPS, usual)))
 
 
+def plannable(minutes: float) -> float:
+    """Seconds that are divided among steps and refinements."""
+    return PLANNED_SHARE * 60.0 * minutes
+
+
 def affordable_iterations(seconds: float, step: float, refinement: float, rounds: int, frames: int) -> int:
     """Steps of the run itself where each takes `step` seconds and each of the rounds ends with a `refinement`; 0 or less
     where there is no time."""
@@ -157,14 +163,14 @@ def steps_in_time(
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
     step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds
-    able = affordable_iterations(60.0 * minutes - spent, step, refinement, rounds, frames)
+    able = affordable_iterations(plannable(minutes) - spent, step, refinement, rounds, frames)
     fewest = min(LEAST_STEPS, asked)
     if able < fewest:
         least = spent + rounds * refinement + step * (fewest + rounds * round_steps(fewest, frames))
         raise UserError(
             f"--minutes {minutes:g} is too little for --refine {rounds} of {len(subject)} frames on this machine: "
             f"{spent:.0f} s are gone, it takes about {refinement:.0f} s to refine them and {step:.3f} s a step, so give at "
-            f"least {least / 60:.1f}"
+            f"least {least / plannable(1.0):.1f}"
         )
     chosen = min(asked, able)
     print(

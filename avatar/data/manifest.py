@@ -7,7 +7,7 @@ prepared folder. `MANIFEST_VERSION` grows with every change of meaning; other ve
 from __future__ import annotations
 
 import json
-import math
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -153,7 +153,7 @@ def _of(raw: dict[str, Any], key: str, kind: type) -> Any:
 
 def parse_number(value: Any, name: str) -> float:
     """A finite number. Raises ValueError naming it."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
         raise ValueError(f"{name} is not a finite number")
     return float(value)
 

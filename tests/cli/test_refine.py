@@ -169,18 +169,18 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     output = avatar(*words, "--refine", 1, "--minutes", 0.001, status=1)
     assert "too little for --refine 1 of 14 frames" in output and not (run / "rounds").exists()
 
-    # Tracking and opening take 1 s, the round's training 10 and its refinement 20: of 60 seconds 29 are left, for steps
-    # that took 10 seconds for 11.
+    # Tracking and opening take 1 s, the round's training 10 and its refinement 20: of the 58.2 that are planned
+    # of 60 seconds 27.2 are left, for steps that took 10 seconds for 10.
     monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 3.8)
     monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=2.5))
     monkeypatch.setattr(plan, "LEAST_STEPS", 5)
     ticks = iter((0.0, 0.0, 1.0, 1.0, 11.0, 31.0, 57.0))
     monkeypatch.setattr(rounds, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
     output = avatar(*words, "--refine", 1, "--minutes", 1)
-    assert "allow 11 steps; 11 are taken" in output and "of 1 minutes" in output
-    assert "31 s of 1 minutes are gone, and a step takes 0.909 s: 31 steps are taken" in output
+    assert "allow 10 steps; 10 are taken" in output and "of 1 minutes" in output
+    assert "31 s of 1 minutes are gone, and a step takes 1.000 s: 27 steps are taken" in output
     steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (first(run), run)]
-    assert steps == [11, 31]
+    assert steps == [10, 27]
     monkeypatch.undo()
     assert "with --minutes 1, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
     assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 1, "--resume")
@@ -204,11 +204,11 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(rounds, "train_round", lambda plan, *_: (0, plan))
     monkeypatch.setattr(rounds, "go_on_or_begin", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
-    # 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
+    # 0.97 of 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
     assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output
-    assert "allow 3,000 steps; 1,000 are taken" in output
+    assert "allow 2,820 steps; 1,000 are taken" in output
     refused = avatar(*words[:3], tmp_path / "other", *words[4:], "--refine", 1, "--minutes", 2, status=1)
-    assert "90 s are gone" in refused and "give at least 2.5" in refused
+    assert "90 s are gone" in refused and "give at least 2.6" in refused
 
 
 def first(run: Path) -> Path:
