@@ -21,7 +21,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from avatar.config_values import check_choice, check_device, check_range, checked_value, shown, typed_value
+from avatar.config_values import cause, check_choice, check_device, check_range, checked_value, shown, typed_value
 from avatar.data.background import Colour
 from avatar.errors import UserError
 
@@ -94,6 +94,7 @@ class TrainerConfig:
     preview_every: int
     checkpoint_every: int
     keep_checkpoints: int
+    stray_share: float = 0.0  # runs that lack it were made without
 
 
 @dataclass
@@ -153,6 +154,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.preview_every": (1, MOST_STEPS),
     "trainer.checkpoint_every": (1, MOST_STEPS),
     "trainer.keep_checkpoints": (1, 10**6),
+    "trainer.stray_share": (0, 1),
 }
 RANGES |= {f"trainer.learning_rates.{f.name}": (0.0, 10.0) for f in dataclasses.fields(LearningRates)}
 
@@ -199,7 +201,7 @@ def _composed(overrides: Sequence[str], hydra: bool = False) -> DictConfig:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             return compose("config", overrides=chosen, return_hydra_config=hydra)
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(f"the configuration cannot be composed: {_cause(error)}") from None
+        raise UserError(f"the configuration cannot be composed: {cause(error)}") from None
 
 
 def config_from_dict(values: dict[str, Any]) -> Config:
@@ -225,6 +227,8 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
     kinds = get_type_hints(schema)
     if unknown := [key for key in values if key not in kinds]:
         raise _no_such_key(f"{prefix}{unknown[0]}")
+    defaults = {f.name: f.default for f in dataclasses.fields(schema) if f.default is not dataclasses.MISSING}
+    values = defaults | values
     if missing := [key for key in kinds if key not in values]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(
@@ -291,10 +295,3 @@ def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
-
-
-def _cause(error: Exception) -> str:
-    """The first line of the innermost message: Hydra wraps the cause in several others."""
-    while error.__cause__ is not None and isinstance(error.__cause__, Exception):
-        error = error.__cause__
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -79,3 +79,10 @@ def shown(value: Any) -> str:
         value = int(value)
     text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def cause(error: Exception) -> str:
+    """The first line of the innermost message: Hydra wraps the cause in several others."""
+    while error.__cause__ is not None and isinstance(error.__cause__, Exception):
+        error = error.__cause__
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -36,6 +36,7 @@ from avatar.refine.motion import HeadPose, moved_tracks
 from avatar.refine.parallel import in_order, read_later
 from avatar.refine.smoothing import smoothed
 from avatar.train.interruption import interruption
+from avatar.train.order import evenly_spread
 
 COARSEST = 224  # pixels of width: on fewer a step takes as long, and finds nothing that one on all does not
 COARSE_STEPS, FINE_STEPS = 3, 8
@@ -181,8 +182,7 @@ class _Work:
 
     def samples(self, count: int) -> list[int]:
         """Training frames, evenly spread; fewer where there are fewer."""
-        train = self.subject.split.train
-        return [train[i] for i in np.unique(np.linspace(0, len(train) - 1, count).round().astype(int))]
+        return evenly_spread(self.subject.split.train, count)
 
     def curvatures(self, count: int = SAMPLES) -> list[Float[Tensor, "F F"]]:
         """By level: the mean over a few training frames, with the prior's, which is one."""

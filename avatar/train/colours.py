@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +10,7 @@ from avatar.data.subject import Subject
 from avatar.head.rasterize import rasterize_mesh
 from avatar.model import Avatar
 from avatar.splat.sh import C0
+from avatar.train.order import evenly_spread
 from avatar.types import Frame
 
 FRAMES = 16  # evenly spread over the training frames: enough for every head turn to take part
@@ -24,10 +24,8 @@ def colour_from_frames(avatar: Avatar, subject: Subject, size: int | None, frame
     A frame counts by the cosine between the surface's normal and the line of sight, squared, times the matte, and not at
     all where the mesh hides the place. Gaussians that no frame shows keep their colour. Returns how many were coloured.
     """
-    train = subject.split.train
-    chosen = [train[i] for i in np.linspace(0, len(train) - 1, min(frames, len(train))).round().astype(int)]
     total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar))
-    for index in dict.fromkeys(chosen):
+    for index in evenly_spread(subject.split.train, frames):
         colours, seen = seen_colours(avatar, subject.frame(index, size))
         total += colours * seen[:, None]
         weight += seen

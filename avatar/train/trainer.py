@@ -26,6 +26,7 @@ from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Objective, PerceptualTerm, stopped, training_step
+from avatar.train.strays import remove_strays, strays_step
 
 
 def train(
@@ -93,6 +94,9 @@ def train(
                     outcome = training_step(avatar, optimizer, objective, step, frame, vertices, judge)
                     step += 1
                     progress.note(step, outcome)
+                    if step == strays_step(trainer):
+                        progress.settle()
+                        remove_strays(avatar, loader, subject.split.train, trainer.stray_share, step)
                     shows = step % trainer.preview_every == 0 or step == trainer.iterations
                     saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
                     if shows or saves or interrupted():
