@@ -216,3 +216,9 @@ def test_a_key_of_any_length_is_answered_in_a_short_sentence() -> None:
     with pytest.raises(UserError) as refused:
         config_from_dict({**asdict(load_config()), "x" * 20_000: 1})
     assert "there is no configuration key 'xxx" in str(refused.value) and len(str(refused.value)) < 300
+
+
+def test_a_configuration_of_an_earlier_version_means_what_it_meant() -> None:
+    values = load_config().to_dict()
+    assert values["trainer"].pop("stray_share") > 0
+    assert config_from_dict(values) == load_config(["trainer.stray_share=0"])
