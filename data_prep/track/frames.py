@@ -18,6 +18,7 @@ from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.look import Look
 from data_prep.track.progress import Progress
+from data_prep.track.spill import despilled
 
 # JPEG without subsampled colours: see docs/data.md for its size and error beside PNG's.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -130,6 +131,19 @@ def write_masks(
         write_image(mask_file(folder, number), make(number), [])
 
     for _ in ahead(numbers, one, progress, title):
+        pass
+
+
+def write_despilled(
+    folder: Path, numbers: Sequence[int], images: FrameImages, mattes: FrameMattes, width: int, progress: Progress
+) -> None:
+    """The frames as `spill.despilled` makes them, as JPEG; by some threads."""
+
+    def one(row: int) -> None:
+        made = despilled(images[row], mattes[row], width)  # type: ignore[arg-type]
+        write_image(frame_file(folder, numbers[row]), cv2.cvtColor(made, cv2.COLOR_RGB2BGR), JPEG)
+
+    for _ in ahead(range(len(numbers)), one, progress, "cleaning the outline"):
         pass
 
 

@@ -54,11 +54,15 @@ class Stages:
             ) from None
         return result, key
 
-    def finish(self, target: Path, temporary: tuple[str, ...]) -> None:
-        """Remove what only the making needed, and give the folder its name."""
+    def finish(self, target: Path, temporary: tuple[str, ...], better: Mapping[str, str] | None = None) -> None:
+        """Remove what only the making needed, put each stage of `better` in the place of the one that it is named with, and
+        give the folder its name."""
         try:
             for name in temporary:
                 shutil.rmtree(self.folder / name, ignore_errors=True)
+            for name, other in (better or {}).items():
+                shutil.rmtree(self.folder / other)
+                (self.folder / name).rename(self.folder / other)
             for record in self.folder.glob(f"*/{RECORD}"):
                 record.unlink()
             (self.folder / LOCK_FILE).unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 look     every picture's faces; one person, one shot, a regular grid of times
 frames   the crop of every picture with the face
 matte    the person against the background
+despilled  the frames again, where the background's colours have run into the person
 fit      identity, and pose and expression of every frame: by landmarks, then by pictures where that gains
 head     head and neck without clothes
 mouth    the lips and what is between them
@@ -21,6 +22,7 @@ from avatar.errors import UserError
 from avatar.files.third_party import FACE_LANDMARKER, SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find
 from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets
 from data_prep.avatar_track import (
+    FRAMES,
     LANDMARKS_FILE,
     TrackingInfo,
     read_info,
@@ -38,9 +40,12 @@ from data_prep.track.look import Look
 from data_prep.track.progress import Progress, silent
 from data_prep.track.quality import judge
 from data_prep.track.stages import growing, hash_of
-from data_prep.track.work import Choices, Work
+from data_prep.track.work import DESPILLED, Choices, Work
 
-STAGES_VERSION = 6  # raised when what a stage makes changes
+STAGES_VERSION = 7  # raised when what a stage makes changes
+SPILL = (
+    "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
+)
 
 
 def track(
@@ -85,6 +90,10 @@ def track(
         landmarks = in_view(look.landmarks, view)
         frames_key = work.frames(look, view, [seen, options])
         matte_key = work.mattes(look, view, mattes, network, frames_key, options)
+        spill = work.despill(landmarks, [frames_key, matte_key])
+        notes = (*footage.notes, *look.notes, *([SPILL.format(spill)] if spill else []))
+        if spill:
+            say(f"note: {notes[-1]}")
         fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
         overlaps = work.masks(landmarks, fit)
         work.overlay(fit, look)
@@ -103,11 +112,14 @@ def track(
             head_fingerprint=head.fingerprint,
             source={"video": video.name, "sha256": footage.content_hash(), "key": key, "box": list(view.box)} | options,
             left_out=_left_out(look),
-            notes=(*footage.notes, *look.notes),
+            notes=notes,
             quality=quality.to_json(),
         )
         write_tracking(stages.folder, info, fit.tracks)
-        stages.finish(out, ("look", "fit"))
+        if spill:
+            stages.finish(out, ("look", "fit"), better={DESPILLED: FRAMES})
+        else:
+            stages.finish(out, ("look", "fit", DESPILLED))
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.track import spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
@@ -19,7 +20,15 @@ from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Box, Footage, Span, View
-from data_prep.track.frames import FrameImages, FrameMattes, in_view, write_frames, write_given_mattes, write_masks
+from data_prep.track.frames import (
+    FrameImages,
+    FrameMattes,
+    in_view,
+    write_despilled,
+    write_frames,
+    write_given_mattes,
+    write_masks,
+)
 from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matte import open_matter, sharpened
@@ -27,6 +36,8 @@ from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.progress import Progress
 from data_prep.track.stages import Stages
+
+DESPILLED = "despilled"  # the stage that stands in for the frames
 
 
 @dataclass(frozen=True)
@@ -108,6 +119,21 @@ class Work:
             return {}
 
         return self._stages.run(MATTE, {"frames": frames_key, "network": network, "given": options["matte"]}, make)[1]
+
+    def despill(self, landmarks: Landmarks, inputs: list[Any]) -> int:
+        """Writes the frames without the background's colours on the person, where they reach in so far that it can be seen;
+        returns how many pixels, or 0."""
+        numbers = _numbers(landmarks)
+        images, mattes = FrameImages(self._folder / FRAMES, numbers), FrameMattes(self._folder / MATTE, numbers)
+
+        def make(folder: Path) -> dict[str, Any]:
+            rows = range(0, len(numbers), -(-len(numbers) // spill.CLIP_FRAMES))
+            width = spill.spill_width((images[row], mattes[row]) for row in rows)  # type: ignore[arg-type]
+            if width:
+                write_despilled(folder, numbers, images, mattes, width, self._progress)
+            return {"width": width}
+
+        return self._stages.run(DESPILLED, {"of": inputs}, make)[0]["width"]
 
     def fit(
         self, landmarks: Landmarks, intrinsics: tuple[float, float, float, float], head_path: Path, inputs: list[Any]

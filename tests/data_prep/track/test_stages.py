@@ -36,6 +36,22 @@ def test_a_stage_is_made_once_for_its_inputs(tmp_path: Path) -> None:
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["out", "out/one", "out/one/file"]
 
 
+def test_a_better_stage_takes_anothers_place(tmp_path: Path) -> None:
+    def writes(text: str):
+        def write(folder: Path) -> dict[str, int]:
+            (folder / "file").write_text(text)
+            return {}
+
+        return write
+
+    with growing(tmp_path / "out") as stages:
+        stages.run("frames", {}, writes("as filmed"))
+        stages.run("cleaned", {}, writes("better"))
+        stages.finish(tmp_path / "out", (), better={"cleaned": "frames"})
+    assert (tmp_path / "out/frames/file").read_text() == "better"
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["out", "out/frames", "out/frames/file"]
+
+
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, UserError("no")])
 def test_an_interruption_keeps_whole_stages_only(tmp_path: Path, interruption: BaseException) -> None:
     def interrupted(folder: Path) -> dict[str, int]:
