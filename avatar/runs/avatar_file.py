@@ -116,7 +116,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             if not isinstance(header, dict) or header.get("format") != AVATAR_FORMAT or "frames" not in header:
                 found = header.get("format") if isinstance(header, dict) else "none"
                 raise UserError(f"{path} is not an avatar of this program (format {found}, expected {AVATAR_FORMAT})")
-            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            # Copies: in a file a tensor may lie at any address, and some products are rounded by where their operands lie.
+            return header, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged or no avatar file ({error}); copy it again, or export it again") from None
 
