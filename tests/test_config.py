@@ -65,11 +65,12 @@ def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
     ours, fast = flatten(load_config().to_dict()), flatten(load_config(["preset=fast"]).to_dict())
     assert {key: value for key, value in ours.items() if value != fast[key]} == {
         "model.uv_detail": 2,
-        "trainer.iterations": 5000,
+        "trainer.iterations": 4000,
         "trainer.passes": 10,
         "trainer.dssim_early": 0.1,
         "trainer.dssim_weight": 0.2,
         "trainer.stray_share": 0.05,
+        "trainer.align_rate": 0.2,
         "trainer.learning_rates.sh_dc": 1.0e-2,
         "trainer.learning_rates.sh_rest": 2.5e-3,
         "trainer.learning_rates.scale": 2.0e-2,

@@ -22,6 +22,7 @@ ORDER = [
     "gaussians",
     "splat",
     "losses",
+    "tracking",
     "motion",
     "runs",
     "train",

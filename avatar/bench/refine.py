@@ -32,9 +32,10 @@ from avatar.head.model import HeadModel
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.model import Avatar
-from avatar.refine.motion import EXPRESSION, values_of
 from avatar.refine.refine import refine_subject
 from avatar.render import Renderer
+from avatar.tracking.motion import EXPRESSION, values_of
+from avatar.train.align import UNALIGNED
 from avatar.train.order import planned_steps, within_passes
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
@@ -73,7 +74,9 @@ class Row:
 
 def run(request: Request) -> None:
     (folder,) = request.inputs
-    config = load_config([*(QUICK if request.quick else ()), "trainer.preview_every=1000000", *request.overrides])
+    config = load_config(
+        [UNALIGNED, *(QUICK if request.quick else ()), "trainer.preview_every=1000000", *request.overrides]
+    )
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     rows = measure(source, config, request.out)
     content = {

@@ -29,12 +29,12 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
-from avatar.refine.descent import Descent, Problem, curvature, descend
-from avatar.refine.freedom import Freedom, find_freedom
-from avatar.refine.likeness import Likeness, Measure, Target, head_psnr, targets
-from avatar.refine.motion import HeadPose, moved_tracks
 from avatar.refine.parallel import in_order, read_later
 from avatar.refine.smoothing import smoothed
+from avatar.tracking.descent import Descent, Problem, curvature, descend
+from avatar.tracking.freedom import Freedom, find_freedom
+from avatar.tracking.likeness import Likeness, Measure, Target, head_psnr, targets
+from avatar.tracking.motion import HeadPose, moved_tracks
 from avatar.train.interruption import interruption
 from avatar.train.order import evenly_spread
 

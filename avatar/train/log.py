@@ -64,6 +64,10 @@ class TrainingLog:
             shown["psnr"] = f"{self._psnr:.2f}"
         self._bar.set_postfix(shown, refresh=False)
 
+    def say(self, news: str) -> None:
+        """Above the bar."""
+        self._bar.write(news)
+
     def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""
         pair = torch.cat((truth, render), dim=1).detach().clamp(0, 1)

@@ -104,15 +104,18 @@ def training_step(
     frame: Frame,
     vertices: Float[Tensor, "V 3"],
     judge: Judge | None = None,
+    watched: Callable[[Gaussians], Gaussians] | None = None,
 ) -> Outcome:
-    """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`.
+    """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`; drawn are `watched` of its Gaussians.
 
     Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
     is not finite; with a `judge` the latter is for it to see to.
     """
     target = frame.composite(objective.background)
     try:
-        image = objective.draw(step, frame, avatar(frame.params, vertices), avatar.config.sh_degree)
+        gaussians = avatar(frame.params, vertices)
+        gaussians = gaussians if watched is None else watched(gaussians)
+        image = objective.draw(step, frame, gaussians, avatar.config.sh_degree)
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
     loss = objective.loss(step, frame, image, target)

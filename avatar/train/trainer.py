@@ -19,6 +19,7 @@ from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
 from avatar.train.ahead import Ahead, Prompt, Spoilt
+from avatar.train.align import Alignment
 from avatar.train.colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
@@ -61,6 +62,10 @@ def train(
     if resume is not None:
         load_optimizer(optimizer, avatar, resume.tensors)
     meshes = PosedMeshes(avatar)
+    data, is_gpu = config.data, on_gpu(avatar.code)
+    alignment = Alignment(avatar, subject, config) if trainer.align_rate > 0 and not is_gpu else None
+    if alignment is not None and resume is not None:
+        alignment.load(resume.tensors)
     background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)
     meta = {
@@ -73,11 +78,11 @@ def train(
     }
 
     def save(step: int) -> None:
-        tensors = {**module_tensors(avatar), **optimizer_tensors(optimizer, avatar)}
+        aligned = {} if alignment is None else alignment.tensors()
+        tensors = {**module_tensors(avatar), **optimizer_tensors(optimizer, avatar), **aligned}
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
-    data, is_gpu = config.data, on_gpu(avatar.code)
     shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
     step = saved = start
     with (
@@ -90,8 +95,18 @@ def train(
             order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
             try:
                 for frame in loader.frames(order):
-                    vertices, judge = meshes.vertices(frame), progress.judge(step)
-                    outcome = training_step(avatar, optimizer, objective, step, frame, vertices, judge)
+                    if alignment is not None:
+                        alignment.prepare(step, loader, log.say)
+                    placed = None if alignment is None else alignment.place(frame)
+                    if placed is None:
+                        seen, vertices, watched = frame, meshes.vertices(frame), None
+                    else:
+                        seen, watched = placed.frame, placed.watched
+                        vertices = avatar.vertices(seen.params)
+                    judge = progress.judge(step)
+                    outcome = training_step(avatar, optimizer, objective, step, seen, vertices, judge, watched)
+                    if alignment is not None and placed is not None:
+                        alignment.learn(step, placed)
                     step += 1
                     progress.note(step, outcome)
                     if step == strays_step(trainer):

@@ -20,8 +20,8 @@ from avatar.bench.refine import Figures, Row, coefficients_outside, recovered, r
 from avatar.cli import main
 from avatar.data.recording import Recording
 from avatar.model import Avatar
-from avatar.refine.motion import EXPRESSION, EYELIDS, NECK, values_of
 from avatar.refine.record import movements
+from avatar.tracking.motion import EXPRESSION, EYELIDS, NECK, values_of
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from drawn_clip import EXPRESSIONS, true_tracks
 
-from avatar.refine.freedom import (
+from avatar.tracking.freedom import (
     DEPTH_UNIT,
     FACE_CALM,
     HEAD_CALM,
@@ -20,7 +20,7 @@ from avatar.refine.freedom import (
     TURN_UNIT,
     find_freedom,
 )
-from avatar.refine.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
+from avatar.tracking.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
 
 CENTRE = torch.zeros(3)
 TRAIN = tuple(range(20))

@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
-from avatar.refine.freedom import Freedom
-from avatar.refine.likeness import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, Likeness, Target
-from avatar.refine.motion import HeadPose
+from avatar.tracking.freedom import Freedom
+from avatar.tracking.likeness import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, Likeness, Target
+from avatar.tracking.motion import HeadPose
 
 PROBE = 0.1  # units that a value is moved by to see what it does
 MEMORY = 5  # steps that the frame's own curvature is learned from
@@ -40,22 +40,35 @@ class Problem:
 
 
 @torch.no_grad()
-def curvature(likeness: Likeness, problem: Problem, level: int) -> Float[Tensor, "F F"]:
-    """J^T J of the misfit in the frame's moves at the given tracking, each pixel weighted as the Huber loss weights it."""
+def curvature(
+    likeness: Likeness,
+    problem: Problem,
+    level: int,
+    moves: Float[Tensor, " F"] | None = None,
+    weight: Float[Tensor, "h w"] | None = None,
+) -> Float[Tensor, "F F"]:
+    """J^T J of the misfit in the frame's moves, each pixel weighted as the Huber loss weights it.
+
+    moves    where; None: at the given tracking
+    weight   of the pixels besides; None: all are one
+    """
     target, freedom = problem.targets[level], problem.freedom
-    moves = torch.zeros(len(freedom.index), device=freedom.unit.device)
+    moves = torch.zeros(len(freedom.index), device=freedom.unit.device) if moves is None else moves.clone()
 
     def picture(moves: Tensor) -> Tensor:
         return likeness.picture(freedom.values(problem.frame, moves), problem.given, target)
 
-    still = picture(moves)
-    error = (still - target.picture).abs()
-    weight = torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt()
+    before = picture(moves)
+    error = (before - target.picture).abs()
+    root = torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt()
+    if weight is not None:
+        root = root * weight.sqrt()[..., None]
     columns = []
     for k in range(len(moves)):
-        moves[k] = PROBE
-        columns.append(((picture(moves) - still) * weight).flatten() / PROBE)
-        moves[k] = 0.0
+        at = float(moves[k])
+        moves[k] = at + PROBE
+        columns.append(((picture(moves) - before) * root).flatten() / PROBE)
+        moves[k] = at
     jacobian = torch.stack(columns, dim=1)
     return OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian.T @ jacobian) / (3.0 * target.area)
 

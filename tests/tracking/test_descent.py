@@ -11,11 +11,11 @@ from drawn_clip import BACKGROUND, Clip, drawn_clip, patterned_avatar, screen_er
 
 from avatar.data.recording import Recording
 from avatar.model import Avatar
-from avatar.refine.descent import Problem, curvature, descend
-from avatar.refine.freedom import find_freedom
-from avatar.refine.likeness import Likeness, targets
-from avatar.refine.motion import HeadPose, moved_tracks
 from avatar.refine.refine import frozen
+from avatar.tracking.descent import Problem, curvature, descend
+from avatar.tracking.freedom import find_freedom
+from avatar.tracking.likeness import Likeness, targets
+from avatar.tracking.motion import HeadPose, moved_tracks
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,9 @@ from avatar.compute.device import brought, on_gpu
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.model import Avatar
-from avatar.refine.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.splat import splat
 from avatar.splat.sh import C0, sh_colours
+from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.types import Camera, Frame, Gaussians
 
 # The squared error of a frame counts as this many independent observations with this standard deviation. Errors of

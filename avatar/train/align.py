@@ -1,0 +1,204 @@
+"""Bundle adjustment: training moves the tracking of its own frames towards what the avatar shows.
+
+Where a tracker errs, frames disagree on where a detail lies, and the avatar blurs it to please them all. A step has its
+loss's gradient in every Gaussian, and so, for the price of a posed mesh, in the frame's tracking, which takes a share of
+the Gauss-Newton step; the curvature is that of refinement (`avatar.tracking`), which all frames share. A prior and bounds
+keep the values' meaning. What all frames' head poses have in common is taken out after every pass, because held-out frames
+and drivers keep the tracking that they have. Where tracking is sharp there is nothing to gain and noise to catch: then the
+given tracking is taken up again.
+
+Left out is how a turn of the head changes the colours that depend on the view: at most 0.24 of the gradient's units, where
+it was compared with the whole (docs/best.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.config import Config
+from avatar.data.loader import FrameLoader
+from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.model import Avatar
+from avatar.splat import CannotDraw
+from avatar.tracking.descent import Problem, curvature
+from avatar.tracking.freedom import find_freedom
+from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness, camera_gradient, head_psnr, targets
+from avatar.tracking.motion import HeadPose, head_params, moved_pose
+from avatar.train.order import evenly_spread
+from avatar.train.step import stopped
+from avatar.types import Frame, Gaussians
+
+BEGIN = 0.1  # share of the steps after which the avatar shows enough
+AGAIN = 0.35  # after which the curvature, of a sharper avatar, is measured anew, and the gain is judged
+LAST_RATE = 0.1  # share of the rate that the last step takes
+SAMPLES = 6  # training frames whose mean curvature stands for all
+JUDGED = 24  # training frames
+LEAST_GAIN = 0.15  # dB of these
+# Where refinement moves every frame, and farther than training would; before the user's own overrides.
+UNALIGNED = "trainer.align_rate=0"
+_PREFIX = "align."  # begins the names in a checkpoint
+
+
+class Placed:
+    """A training frame where its tracking has been moved to, for one step."""
+
+    def __init__(self, frame: Frame, values: Float[Tensor, " P"], given: HeadPose, centre: Float[Tensor, 3]) -> None:
+        self._values = values.detach().requires_grad_()
+        self._pose = moved_pose(self._values, given, centre)
+        self._still = HeadPose(self._pose.R.detach(), self._pose.t.detach())
+        camera = replace(frame.camera, R_cam_world=self._still.R, t_cam_world=self._still.t)
+        self.frame = replace(frame, camera=camera, params=head_params(self._values))
+        self._drawn: Gaussians | None = None
+
+    def watched(self, gaussians: Gaussians) -> Gaussians:
+        """The same, which keep what drawing them has as gradient."""
+        self._drawn = gaussians._replace(means=_watched(gaussians.means), quats=_watched(gaussians.quats))
+        return self._drawn
+
+    def gradient(self) -> Float[Tensor, " P"]:
+        """Of the loss in the frame's values, once it has been differentiated."""
+        drawn, through_face = self._drawn, self._values.grad
+        assert drawn is not None and drawn.means.grad is not None and through_face is not None
+        by_quats = torch.zeros_like(drawn.quats) if drawn.quats.grad is None else drawn.quats.grad
+        by_pose = camera_gradient(drawn, self._still, drawn.means.grad, by_quats)
+        (through_pose,) = torch.autograd.grad(tuple(self._pose), self._values, tuple(by_pose))
+        return through_face + through_pose
+
+
+def _watched(values: Tensor) -> Tensor:
+    own = values.view_as(values) if values.requires_grad else values.clone().requires_grad_()
+    own.retain_grad()
+    return own
+
+
+class Alignment:
+    """The moves of a subject's training frames, from the given tracking; on the CPU."""
+
+    def __init__(self, avatar: Avatar, subject: Subject, config: Config) -> None:
+        trainer, background = config.trainer, torch.tensor(config.data.background)
+        self._rate, self._steps, self._mouth_weight = trainer.align_rate, trainer.iterations, trainer.mouth_weight
+        self._begin, self._again = (round(share * trainer.iterations) for share in (BEGIN, AGAIN))
+        self._train: Sequence[int] = subject.split.train
+        self._tracks = subject.recording.tracks
+        self._centre = avatar.head.neutral_vertices().mean(dim=0)
+        self._freedom = find_freedom(self._tracks, self._train, self._centre)
+        self._likeness = Likeness(avatar, background, self._centre)
+        self._moves = torch.zeros(len(subject), len(self._freedom.index))
+        self._factor: Float[Tensor, "F F"] | None = None  # of the curvature, lower Cholesky; None: nothing moves
+        self._is_over = False
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a checkpoint."""
+        factor = self._moves.new_zeros(0, 0) if self._factor is None else self._factor
+        named = {"moves": self._moves.clone(), "factor": factor, "is_over": torch.tensor(float(self._is_over))}
+        return {f"{_PREFIX}{name}": value for name, value in named.items()}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `tensors` gave, to the bit. Raises UserError where it is not there, or not of these frames."""
+        given = [tensors.get(f"{_PREFIX}{name}") for name in ("moves", "factor", "is_over")]
+        moves, factor, is_over = given
+        F = self._moves.shape[1]
+        if moves is None or factor is None or is_over is None or moves.shape != self._moves.shape:
+            raise UserError("the checkpoint lacks the tracking of its training frames; training cannot go on from it")
+        if tuple(factor.shape) not in ((0, 0), (F, F)):
+            raise UserError(f"the checkpoint has {_PREFIX}factor of shape {list(factor.shape)}, not {[F, F]}")
+        self._moves = moves.clone()
+        self._factor = factor.clone() if len(factor) else None
+        self._is_over = bool(is_over)
+
+    def prepare(self, step: int, loader: FrameLoader, say: Callable[[str], object]) -> None:
+        """What comes before step `step` (from 0). Raises UserError, naming step and frame, when the Gaussians cannot be
+        drawn."""
+        if self._is_over or step < self._begin:
+            return
+        if step == self._begin:
+            self._measure(step, loader)
+        elif step == self._again:
+            gain = self._gain(step, loader)
+            if not gain >= LEAST_GAIN:
+                self._is_over, self._factor = True, None
+                self._moves.zero_()
+                say(f"Training keeps its frames' tracking: it is sharp (moving it gains {max(gain, 0.0):.2f} dB).")
+                return
+            self._measure(step, loader)
+            say(f"Training moves its frames' tracking to where the avatar fits them: {gain:.2f} dB so far.")
+        elif (step - self._begin) % len(self._train) == 0:
+            self._centre_moves()
+
+    def place(self, frame: Frame) -> Placed | None:
+        """None: where it is."""
+        if self._factor is None or not bool(frame.head_mask.any()):
+            return None
+        values = self._freedom.values(frame.index, self._moves[frame.index])
+        return Placed(frame, values, self._given(frame.index), self._centre)
+
+    def learn(self, step: int, placed: Placed) -> None:
+        """Move the frame by what step `step` (from 0) has found."""
+        assert self._factor is not None
+        frame, freedom = placed.frame, self._freedom
+        moves = self._moves[frame.index]
+        # The loss is a mean over the frame; the misfit counts a number of observations on the head.
+        scale = OBSERVATIONS / PIXEL_SIGMA**2 * frame.head_mask.numel() / float(frame.head_mask.sum())
+        gradient = scale * placed.gradient()[freedom.index] * freedom.unit + moves
+        if not bool(torch.isfinite(gradient).all()):
+            return
+        way = (step - self._begin) / max(self._steps - self._begin, 1)
+        direction = torch.cholesky_solve(gradient[:, None], self._factor)[:, 0]
+        low, high = freedom.bounds(frame.index)
+        moved = moves - self._rate * LAST_RATE**way * direction
+        self._moves[frame.index] = torch.minimum(torch.maximum(moved, low), high)
+
+    def _given(self, frame: int) -> HeadPose:
+        return HeadPose(self._tracks["R"][frame], self._tracks["t"][frame])
+
+    def _centre_moves(self) -> None:
+        trained_on = torch.zeros(len(self._moves), dtype=torch.bool)
+        trained_on[list(self._train)] = True
+        centred = self._freedom.centred(self._moves, trained_on)
+        self._moves = torch.where(trained_on[:, None], centred, self._moves)
+
+    def _measure(self, step: int, loader: FrameLoader) -> None:
+        def measured(frame: Frame, problem: Problem) -> Tensor:
+            weight = 1.0 + self._mouth_weight * frame.mouth_mask[problem.targets[0].box]
+            return curvature(self._likeness, problem, 0, self._moves[frame.index], weight)
+
+        found = self._of_frames(step, loader, SAMPLES, measured)
+        if not found:
+            self._is_over = True
+            return
+        prior = torch.eye(self._moves.shape[1])
+        self._factor = torch.linalg.cholesky(torch.stack(found).mean(dim=0) + prior)
+
+    def _gain(self, step: int, loader: FrameLoader) -> float:
+        """What the moves gain on training frames, dB."""
+
+        def measured(frame: Frame, problem: Problem) -> Tensor:
+            target, moves = problem.targets[0], self._moves[frame.index]
+            moved, still = (
+                head_psnr(self._likeness.picture(self._freedom.values(frame.index, at), problem.given, target), target)
+                for at in (moves, torch.zeros_like(moves))
+            )
+            return moved - still
+
+        found = self._of_frames(step, loader, JUDGED, measured)
+        return float(torch.stack(found).mean()) if found else 0.0
+
+    def _of_frames(
+        self, step: int, loader: FrameLoader, count: int, measured: Callable[[Frame, Problem], Tensor]
+    ) -> list[Tensor]:
+        """Of evenly spread training frames that show a head."""
+        found = []
+        for frame in loader.frames(evenly_spread(self._train, count)):
+            if (made := targets(frame, self._likeness.background, 1)) is None:
+                continue
+            try:
+                found.append(measured(frame, Problem(self._given(frame.index), made, frame.index, self._freedom)))
+            except CannotDraw as error:
+                raise stopped(step, frame, str(error)) from error
+        return found

@@ -1,0 +1,157 @@
+"""Training frames whose tracking is moved while the avatar is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
+from small_runs import small_config, train_small
+
+from avatar.errors import UserError
+from avatar.model import Avatar
+from avatar.refine.refine import frozen
+from avatar.runs.checkpoint import Checkpoint, list_checkpoints, newest_checkpoint
+from avatar.splat import splat
+from avatar.tracking.freedom import find_freedom
+from avatar.tracking.likeness import Likeness, misfit, targets
+from avatar.tracking.motion import HeadPose, moved_tracks
+from avatar.train import align as align_module
+from avatar.train.align import Alignment, Placed
+from avatar.train.optim import make_optimizer
+from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.types import Frame
+
+STEPS = 200
+
+
+class Pictures:
+    """A loader of frames that are in memory."""
+
+    def __init__(self, clip: Clip) -> None:
+        self._clip = clip
+
+    def frames(self, indices: Iterable[int]) -> Iterator[Frame]:
+        return (self._clip.pictures[index] for index in indices)
+
+
+@pytest.fixture
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Avatar:
+    return patterned_avatar(tmp_path_factory.mktemp("head"))
+
+
+@pytest.mark.parametrize(("view_dependent", "tolerance"), [(0.0, 1e-3), (1.0, 0.05)])
+def test_the_gradient_is_that_of_refinement(avatar: Avatar, view_dependent: float, tolerance: float) -> None:
+    """But for what a turn does to colours that depend on the view."""
+    clip = wrongly_tracked(drawn_clip(avatar))
+    with torch.no_grad():
+        avatar.sh_rest.mul_(view_dependent)
+    (target,) = targets(clip.pictures[3], BACKGROUND, 1) or ()
+    tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
+    given, freedom = HeadPose(tracks["R"][3], tracks["t"][3]), find_freedom(tracks, clip.split.train, centre)
+    values = freedom.values(3, torch.full((len(freedom.index),), 0.3))
+    placed = Placed(clip.pictures[3], values, given, centre)
+    params = placed.frame.params
+    gaussians = placed.watched(avatar(params, avatar.vertices(params)))
+    picture = splat(gaussians, placed.frame.camera, BACKGROUND, region=target.box).image[target.box]
+    misfit(picture, target).backward()
+    with frozen(avatar):
+        expected = Likeness(avatar, BACKGROUND, centre).fit(values, given, target).gradient
+    found = placed.gradient()
+    assert float((found - expected)[freedom.index].mul(freedom.unit).norm()) < tolerance * float(
+        expected[freedom.index].mul(freedom.unit).norm()
+    )
+
+
+def aligned(avatar: Avatar, clip: Clip) -> tuple[Alignment, Clip, list[str]]:
+    """The clip after so many steps of an avatar that stands still, with the tracking that it then has."""
+    config = small_config(f"data.size={SIZE}", f"trainer.iterations={STEPS}", "trainer.align_rate=0.5")
+    for group in ("sh_dc", "sh_rest", "opacity", "scale", "rotation", "mlp", "hyper"):
+        setattr(config.trainer.learning_rates, group, 0.0)
+    alignment = Alignment(avatar, clip, config)  # type: ignore[arg-type]
+    objective = Objective(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
+    optimizer, loader, said = make_optimizer(avatar, config.trainer), Pictures(clip), []
+    for step in range(STEPS):
+        frame = clip.pictures[clip.split.train[step % len(clip.split.train)]]
+        alignment.prepare(step, loader, said.append)  # type: ignore[arg-type]
+        if (placed := alignment.place(frame)) is None:
+            continue
+        vertices = avatar.vertices(placed.frame.params)
+        training_step(avatar, optimizer, objective, 2000, placed.frame, vertices, None, placed.watched)
+        alignment.learn(step, placed)
+    moves = alignment.tensors()["align.moves"]
+    tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
+    freedom = find_freedom(tracks, clip.split.train, centre)
+    moved = moved_tracks(tracks, freedom.all_values(moves), freedom.changed(), centre)
+    return alignment, replace(clip, recording=replace(clip.recording, tracks=moved)), said
+
+
+def test_disturbed_training_frames_come_back_and_others_stay(avatar: Avatar) -> None:
+    true = drawn_clip(avatar)
+    clip = wrongly_tracked(true, common=False)
+    _, found, said = aligned(avatar, clip)
+    train, test = list(clip.split.train), list(clip.split.test)
+    before = screen_errors(avatar, clip.recording, true.recording, train)
+    after = screen_errors(avatar, found.recording, true.recording, train)
+    assert after < 0.35 * before
+    for name in ("R", "t", "jaw", "expression"):
+        torch.testing.assert_close(found.recording.tracks[name][test], clip.recording.tracks[name][test])
+    assert len(said) == 1 and "moves its frames' tracking" in said[0]
+
+
+def test_sharp_tracking_is_kept(avatar: Avatar) -> None:
+    clip = drawn_clip(avatar)
+    alignment, _, said = aligned(avatar, clip)
+    assert len(said) == 1 and "it is sharp" in said[0]
+    assert not alignment.tensors()["align.moves"].any()
+    assert alignment.place(clip.pictures[0]) is None
+
+
+def test_a_frame_without_a_head_stays(avatar: Avatar) -> None:
+    clip = wrongly_tracked(drawn_clip(avatar))
+    alignment, _, _ = aligned(avatar, clip)
+    frame = clip.pictures[0]
+    assert alignment.place(frame) is not None
+    assert alignment.place(replace(frame, head_mask=torch.zeros_like(frame.head_mask))) is None
+
+
+def test_head_poses_are_centred(avatar: Avatar) -> None:
+    clip = wrongly_tracked(drawn_clip(avatar), common=True)
+    alignment, _, _ = aligned(avatar, clip)
+    alignment._centre_moves()
+    moves = alignment.tensors()["align.moves"][list(clip.split.train)]
+    assert float(moves[:, :6].mean(dim=0).abs().max()) < 0.1 < float(moves[:, :6].abs().max())
+
+
+def test_a_resumed_run_has_the_same_bits(tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(align_module, "LEAST_GAIN", -100.0)
+    train_small(tracked_folder, tmp_path / "whole")
+    whole = newest_checkpoint(tmp_path / "whole")
+    assert whole.tensors["align.moves"].any() and not whole.tensors["align.is_over"].any()
+    for left in (1, 2):
+        run = tmp_path / f"broken{left}"
+        train_small(tracked_folder, run)
+        for file in list_checkpoints(run / "checkpoints")[left:]:
+            file.unlink()
+        halfway = newest_checkpoint(run)
+        assert halfway.step == 4 * left
+        train_small(tracked_folder, run, resume=halfway)
+        broken = newest_checkpoint(run)
+        assert broken.step == whole.step and broken.tensors.keys() == whole.tensors.keys()
+        assert all(torch.equal(value, broken.tensors[name]) for name, value in whole.tensors.items())
+
+
+def test_a_checkpoint_without_the_moves_is_refused(tracked_folder: Path, tmp_path: Path) -> None:
+    train_small(tracked_folder, tmp_path / "run", ["trainer.align_rate=0"])
+    plain = newest_checkpoint(tmp_path / "run")
+    assert not [name for name in plain.tensors if name.startswith("align.")]
+    with pytest.raises(UserError, match="lacks the tracking of its training frames"):
+        train_small(tracked_folder, tmp_path / "run", resume=plain)
+    train_small(tracked_folder, tmp_path / "other")
+    whole = newest_checkpoint(tmp_path / "other")
+    wrong = Checkpoint(8, {**whole.tensors, "align.factor": torch.zeros(3, 3)}, whole.meta)
+    with pytest.raises(UserError, match=r"align.factor of shape \[3, 3\]"):
+        train_small(tracked_folder, tmp_path / "other", resume=wrong)
