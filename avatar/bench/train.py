@@ -23,6 +23,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.train.ahead import Guard
+from avatar.train.align import one_step
 from avatar.train.optim import make_optimizer
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Judge, Objective, choose_perceptual, training_step
@@ -65,7 +66,10 @@ class Trainee:
     def step(self, number: int) -> None:
         frame = next(self.frames)
         vertices = self.meshes.vertices(frame)
-        training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
+        if self.judge is None:
+            one_step(self.avatar, self.optimizer, self.objective, number, frame, vertices)
+        else:
+            training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
 
 
 def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:

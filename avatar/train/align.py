@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -29,17 +30,19 @@ from avatar.splat import CannotDraw
 from avatar.tracking.descent import Problem, curvature
 from avatar.tracking.freedom import find_freedom
 from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness, camera_gradient, head_psnr, targets
-from avatar.tracking.motion import HeadPose, head_params, moved_pose
+from avatar.tracking.motion import HeadPose, head_params, moved_pose, values_of
 from avatar.train.order import evenly_spread
-from avatar.train.step import stopped
+from avatar.train.posed import PosedMeshes
+from avatar.train.step import Objective, stopped, training_step
 from avatar.types import Frame, Gaussians
 
 BEGIN = 0.1  # share of the steps after which the avatar shows enough
 AGAIN = 0.35  # after which the curvature, of a sharper avatar, is measured anew, and the gain is judged
-LAST_RATE = 0.1  # share of the rate that the last step takes
+END = 0.6  # after which the tracking stays where it is, and posed meshes need not be made again
+LAST_RATE = 0.1  # share of the rate that is left then
 SAMPLES = 6  # training frames whose mean curvature stands for all
 JUDGED = 24  # training frames
-LEAST_GAIN = 0.15  # dB of these
+LEAST_GAIN = 0.25  # dB of these
 # Where refinement moves every frame, and farther than training would; before the user's own overrides.
 UNALIGNED = "trainer.align_rate=0"
 _PREFIX = "align."  # begins the names in a checkpoint
@@ -77,18 +80,52 @@ def _watched(values: Tensor) -> Tensor:
     return own
 
 
+def one_step(
+    avatar: Avatar,
+    optimizer: torch.optim.Adam,
+    objective: Objective,
+    step: int,
+    frame: Frame,
+    vertices: Float[Tensor, "V 3"],
+) -> None:
+    """What step number `step` (from 0) takes, for who times it: with its frame's tracking moved by nothing, if any is."""
+    if objective.config.align_rate == 0:
+        training_step(avatar, optimizer, objective, step, frame, vertices)
+        return
+    params, given = frame.params, HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)
+    tracks = {name: getattr(params, name)[None] for name in ("neck", "jaw", "eyes", "eyelids", "expression")}
+    values = values_of(tracks | {"t": given.t[None]})[0]
+    placed = Placed(frame, values, given, avatar.head.neutral_vertices().mean(dim=0))
+    posed = avatar.vertices(placed.frame.params)
+    training_step(avatar, optimizer, objective, step, placed.frame, posed, None, placed.watched)
+    placed.gradient()
+
+
+class Seen(NamedTuple):
+    """What a step sees."""
+
+    frame: Frame
+    vertices: Float[Tensor, "V 3"]
+    placed: Placed | None = None  # the frame's tracking may move
+
+    @property
+    def watched(self) -> Callable[[Gaussians], Gaussians] | None:
+        return None if self.placed is None else self.placed.watched
+
+
 class Alignment:
     """The moves of a subject's training frames, from the given tracking; on the CPU."""
 
     def __init__(self, avatar: Avatar, subject: Subject, config: Config) -> None:
         trainer, background = config.trainer, torch.tensor(config.data.background)
-        self._rate, self._steps, self._mouth_weight = trainer.align_rate, trainer.iterations, trainer.mouth_weight
-        self._begin, self._again = (round(share * trainer.iterations) for share in (BEGIN, AGAIN))
+        self._rate, self._mouth_weight = trainer.align_rate, trainer.mouth_weight
+        self._begin, self._again, self._end = (round(share * trainer.iterations) for share in (BEGIN, AGAIN, END))
         self._train: Sequence[int] = subject.split.train
         self._tracks = subject.recording.tracks
         self._centre = avatar.head.neutral_vertices().mean(dim=0)
         self._freedom = find_freedom(self._tracks, self._train, self._centre)
         self._likeness = Likeness(avatar, background, self._centre)
+        self._meshes = PosedMeshes(avatar)
         self._moves = torch.zeros(len(subject), len(self._freedom.index))
         self._factor: Float[Tensor, "F F"] | None = None  # of the curvature, lower Cholesky; None: nothing moves
         self._is_over = False
@@ -112,10 +149,39 @@ class Alignment:
         self._factor = factor.clone() if len(factor) else None
         self._is_over = bool(is_over)
 
-    def prepare(self, step: int, loader: FrameLoader, say: Callable[[str], object]) -> None:
-        """What comes before step `step` (from 0). Raises UserError, naming step and frame, when the Gaussians cannot be
-        drawn."""
-        if self._is_over or step < self._begin:
+    def see(self, step: int, frame: Frame, loader: FrameLoader, say: Callable[[str], object]) -> Seen:
+        """The frame as step `step` (from 0) sees it; every step has to ask. Raises UserError, naming step and frame, when
+        the Gaussians cannot be drawn."""
+        self._prepare(step, loader, say)
+        if self._factor is None or not bool(frame.head_mask.any()):
+            return Seen(frame, self._meshes.vertices(frame))
+        values = self._freedom.values(frame.index, self._moves[frame.index])
+        placed = Placed(frame, values, self._given(frame.index), self._centre)
+        if step < self._end:
+            return Seen(placed.frame, self._likeness.avatar.vertices(placed.frame.params), placed)
+        with torch.no_grad():
+            still = replace(placed.frame, params=head_params(values))
+            return Seen(still, self._meshes.vertices(still))
+
+    def learn(self, step: int, seen: Seen) -> None:
+        """Move the frame by what step `step` (from 0) has found."""
+        if seen.placed is None or self._factor is None:
+            return
+        frame, freedom = seen.frame, self._freedom
+        moves = self._moves[frame.index]
+        # The loss is a mean over the frame; the misfit counts a number of observations on the head.
+        scale = OBSERVATIONS / PIXEL_SIGMA**2 * frame.head_mask.numel() / float(frame.head_mask.sum())
+        gradient = scale * seen.placed.gradient()[freedom.index] * freedom.unit + moves
+        if not bool(torch.isfinite(gradient).all()):
+            return
+        way = (step - self._begin) / max(self._end - self._begin, 1)
+        direction = torch.cholesky_solve(gradient[:, None], self._factor)[:, 0]
+        low, high = freedom.bounds(frame.index)
+        moved = moves - self._rate * LAST_RATE**way * direction
+        self._moves[frame.index] = torch.minimum(torch.maximum(moved, low), high)
+
+    def _prepare(self, step: int, loader: FrameLoader, say: Callable[[str], object]) -> None:
+        if self._is_over or not self._begin <= step <= self._end:
             return
         if step == self._begin:
             self._measure(step, loader)
@@ -128,31 +194,11 @@ class Alignment:
                 return
             self._measure(step, loader)
             say(f"Training moves its frames' tracking to where the avatar fits them: {gain:.2f} dB so far.")
+        elif step == self._end:
+            self._centre_moves()
+            self._meshes = PosedMeshes(self._likeness.avatar)  # those of before were of the given tracking
         elif (step - self._begin) % len(self._train) == 0:
             self._centre_moves()
-
-    def place(self, frame: Frame) -> Placed | None:
-        """None: where it is."""
-        if self._factor is None or not bool(frame.head_mask.any()):
-            return None
-        values = self._freedom.values(frame.index, self._moves[frame.index])
-        return Placed(frame, values, self._given(frame.index), self._centre)
-
-    def learn(self, step: int, placed: Placed) -> None:
-        """Move the frame by what step `step` (from 0) has found."""
-        assert self._factor is not None
-        frame, freedom = placed.frame, self._freedom
-        moves = self._moves[frame.index]
-        # The loss is a mean over the frame; the misfit counts a number of observations on the head.
-        scale = OBSERVATIONS / PIXEL_SIGMA**2 * frame.head_mask.numel() / float(frame.head_mask.sum())
-        gradient = scale * placed.gradient()[freedom.index] * freedom.unit + moves
-        if not bool(torch.isfinite(gradient).all()):
-            return
-        way = (step - self._begin) / max(self._steps - self._begin, 1)
-        direction = torch.cholesky_solve(gradient[:, None], self._factor)[:, 0]
-        low, high = freedom.bounds(frame.index)
-        moved = moves - self._rate * LAST_RATE**way * direction
-        self._moves[frame.index] = torch.minimum(torch.maximum(moved, low), high)
 
     def _given(self, frame: int) -> HeadPose:
         return HeadPose(self._tracks["R"][frame], self._tracks["t"][frame])

@@ -15,10 +15,9 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.tracking.motion import HeadPose, values_of
-from avatar.train.align import Placed
+from avatar.train.align import one_step
 from avatar.train.optim import make_optimizer
-from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.train.step import Objective, choose_perceptual
 from avatar.types import Frame
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
@@ -62,13 +61,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
         seconds = []
         for _ in range(1 + MEASURED_STEPS):
             begin = time.perf_counter()
-            if config.trainer.align_rate > 0:  # of such a frame, which most are where their tracking errs
-                placed = placed_frame(frame, avatar)
-                posed = avatar.vertices(placed.frame.params)
-                training_step(avatar, optimizer, objective, step, placed.frame, posed, None, placed.watched)
-                placed.gradient()
-            else:
-                training_step(avatar, optimizer, objective, step, frame, vertices)
+            one_step(avatar, optimizer, objective, step, frame, vertices)
             seconds.append(time.perf_counter() - begin)
         total += count * float(np.median(seconds[1:]))
     height, width = frame.image.shape[:2]
@@ -81,14 +74,6 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
         cache_bytes=min(width * height * BYTES_PER_PIXEL * frames, config.data.cache_mb << 20),
         parameter_bytes=4 * _COPIES * parameters,
     )
-
-
-def placed_frame(frame: Frame, avatar: Avatar) -> Placed:
-    """The frame where its tracking is, ready to be moved."""
-    params, pose = frame.params, HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)
-    tracks = {name: getattr(params, name)[None] for name in ("neck", "jaw", "eyes", "eyelids", "expression")}
-    values = values_of(tracks | {"t": pose.t[None]})[0]
-    return Placed(frame, values, pose, avatar.head.neutral_vertices().mean(dim=0))
 
 
 def kinds_of_steps(trainer: TrainerConfig, every: int) -> list[tuple[int, int]]:

@@ -19,7 +19,7 @@ from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
 from avatar.train.ahead import Ahead, Prompt, Spoilt
-from avatar.train.align import Alignment
+from avatar.train.align import Alignment, Seen
 from avatar.train.colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
@@ -95,18 +95,16 @@ def train(
             order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
             try:
                 for frame in loader.frames(order):
-                    if alignment is not None:
-                        alignment.prepare(step, loader, log.say)
-                    placed = None if alignment is None else alignment.place(frame)
-                    if placed is None:
-                        seen, vertices, watched = frame, meshes.vertices(frame), None
+                    if alignment is None:
+                        seen = Seen(frame, meshes.vertices(frame))
                     else:
-                        seen, watched = placed.frame, placed.watched
-                        vertices = avatar.vertices(seen.params)
+                        seen = alignment.see(step, frame, loader, log.say)
                     judge = progress.judge(step)
-                    outcome = training_step(avatar, optimizer, objective, step, seen, vertices, judge, watched)
-                    if alignment is not None and placed is not None:
-                        alignment.learn(step, placed)
+                    outcome = training_step(
+                        avatar, optimizer, objective, step, seen.frame, seen.vertices, judge, seen.watched
+                    )
+                    if alignment is not None:
+                        alignment.learn(step, seen)
                     step += 1
                     progress.note(step, outcome)
                     if step == strays_step(trainer):

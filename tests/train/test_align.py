@@ -76,12 +76,9 @@ def aligned(avatar: Avatar, clip: Clip) -> tuple[Alignment, Clip, list[str]]:
     optimizer, loader, said = make_optimizer(avatar, config.trainer), Pictures(clip), []
     for step in range(STEPS):
         frame = clip.pictures[clip.split.train[step % len(clip.split.train)]]
-        alignment.prepare(step, loader, said.append)  # type: ignore[arg-type]
-        if (placed := alignment.place(frame)) is None:
-            continue
-        vertices = avatar.vertices(placed.frame.params)
-        training_step(avatar, optimizer, objective, 2000, placed.frame, vertices, None, placed.watched)
-        alignment.learn(step, placed)
+        seen = alignment.see(step, frame, loader, said.append)  # type: ignore[arg-type]
+        training_step(avatar, optimizer, objective, 2000, seen.frame, seen.vertices, None, seen.watched)
+        alignment.learn(step, seen)
     moves = alignment.tensors()["align.moves"]
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
     freedom = find_freedom(tracks, clip.split.train, centre)
@@ -107,15 +104,23 @@ def test_sharp_tracking_is_kept(avatar: Avatar) -> None:
     alignment, _, said = aligned(avatar, clip)
     assert len(said) == 1 and "it is sharp" in said[0]
     assert not alignment.tensors()["align.moves"].any()
-    assert alignment.place(clip.pictures[0]) is None
+    seen = alignment.see(STEPS, clip.pictures[0], Pictures(clip), said.append)  # type: ignore[arg-type]
+    assert seen.frame is clip.pictures[0] and seen.placed is None
 
 
-def test_a_frame_without_a_head_stays(avatar: Avatar) -> None:
+def test_at_the_end_frames_are_seen_where_they_were_moved_to(avatar: Avatar) -> None:
+    """But for one that shows no head, which stays."""
     clip = wrongly_tracked(drawn_clip(avatar))
-    alignment, _, _ = aligned(avatar, clip)
-    frame = clip.pictures[0]
-    assert alignment.place(frame) is not None
-    assert alignment.place(replace(frame, head_mask=torch.zeros_like(frame.head_mask))) is None
+    alignment, found, said = aligned(avatar, clip)
+    frame, loader = clip.pictures[2], Pictures(clip)
+    for _ in range(2):  # the second time from what is kept
+        seen = alignment.see(STEPS, frame, loader, said.append)  # type: ignore[arg-type]
+        assert seen.placed is None and not seen.vertices.requires_grad
+        torch.testing.assert_close(seen.frame.camera.R_cam_world, found.recording.tracks["R"][2])
+        torch.testing.assert_close(seen.frame.camera.t_cam_world, found.recording.tracks["t"][2])
+        torch.testing.assert_close(seen.vertices, avatar.head.vertices(found.recording.params(2)))
+    hidden = replace(frame, head_mask=torch.zeros_like(frame.head_mask))
+    assert alignment.see(STEPS, hidden, loader, said.append).frame is hidden  # type: ignore[arg-type]
 
 
 def test_head_poses_are_centred(avatar: Avatar) -> None:
