@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.compute.device import on_gpu
 from avatar.config import Config
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
@@ -45,7 +46,7 @@ JUDGED = 24  # training frames
 LEAST_GAIN = 0.25  # dB of these
 # Where refinement moves every frame, and farther than training would; before the user's own overrides.
 UNALIGNED = "trainer.align_rate=0"
-_PREFIX = "align."  # begins the names in a checkpoint
+_PREFIX, _NAMES = "align.", ("moves", "factor", "is_over")  # in a checkpoint
 
 
 class Placed:
@@ -80,6 +81,31 @@ def _watched(values: Tensor) -> Tensor:
     return own
 
 
+def make_alignment(
+    avatar: Avatar, subject: Subject, config: Config, saved: Mapping[str, Tensor] | None
+) -> Alignment | None:
+    """For a run that begins, or goes on from the tensors of a checkpoint; None where it moves no tracking.
+
+    On a GPU none does, nor one that began on it. Raises UserError where a GPU is to go on with one that does, and for
+    tensors that are not of these frames.
+    """
+    if config.trainer.align_rate == 0:
+        return None
+    moves = None if saved is None else saved.get(f"{_PREFIX}moves")
+    if on_gpu(avatar.code):
+        if moves is not None and bool(moves.any()):
+            raise UserError(
+                "this run moves its frames' tracking (trainer.align_rate), which a GPU does not yet: add --device cpu"
+            )
+        return None
+    if saved is not None and moves is None:
+        return None
+    alignment = Alignment(avatar, subject, config)
+    if saved is not None:
+        alignment.load(saved)
+    return alignment
+
+
 def one_step(
     avatar: Avatar,
     optimizer: torch.optim.Adam,
@@ -88,8 +114,9 @@ def one_step(
     frame: Frame,
     vertices: Float[Tensor, "V 3"],
 ) -> None:
-    """What step number `step` (from 0) takes, for who times it: with its frame's tracking moved by nothing, if any is."""
-    if objective.config.align_rate == 0:
+    """What step number `step` (from 0) takes, for who times it: where frames' tracking is moved, that, by nothing."""
+    config = objective.config
+    if config.align_rate == 0 or not BEGIN <= step / config.iterations < END:
         training_step(avatar, optimizer, objective, step, frame, vertices)
         return
     params, given = frame.params, HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)
@@ -133,18 +160,17 @@ class Alignment:
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""
         factor = self._moves.new_zeros(0, 0) if self._factor is None else self._factor
-        named = {"moves": self._moves.clone(), "factor": factor, "is_over": torch.tensor(float(self._is_over))}
-        return {f"{_PREFIX}{name}": value for name, value in named.items()}
+        values = (self._moves.clone(), factor, torch.tensor(float(self._is_over)))
+        return {f"{_PREFIX}{name}": value for name, value in zip(_NAMES, values, strict=True)}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Put back what `tensors` gave, to the bit. Raises UserError where it is not there, or not of these frames."""
-        given = [tensors.get(f"{_PREFIX}{name}") for name in ("moves", "factor", "is_over")]
-        moves, factor, is_over = given
+        moves, factor, is_over = (tensors.get(f"{_PREFIX}{name}") for name in _NAMES)
         F = self._moves.shape[1]
-        if moves is None or factor is None or is_over is None or moves.shape != self._moves.shape:
-            raise UserError("the checkpoint lacks the tracking of its training frames; training cannot go on from it")
-        if tuple(factor.shape) not in ((0, 0), (F, F)):
-            raise UserError(f"the checkpoint has {_PREFIX}factor of shape {list(factor.shape)}, not {[F, F]}")
+        if moves is None or factor is None or is_over is None:
+            raise UserError("the checkpoint lacks a part of its frames' moves; training cannot go on from it")
+        if moves.shape != self._moves.shape or tuple(factor.shape) not in ((0, 0), (F, F)):
+            raise UserError("the checkpoint's moves are not of this subject's frames; training cannot go on from it")
         self._moves = moves.clone()
         self._factor = factor.clone() if len(factor) else None
         self._is_over = bool(is_over)

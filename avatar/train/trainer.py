@@ -19,7 +19,7 @@ from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
 from avatar.train.ahead import Ahead, Prompt, Spoilt
-from avatar.train.align import Alignment, Seen
+from avatar.train.align import Seen, make_alignment
 from avatar.train.colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
@@ -63,9 +63,7 @@ def train(
         load_optimizer(optimizer, avatar, resume.tensors)
     meshes = PosedMeshes(avatar)
     data, is_gpu = config.data, on_gpu(avatar.code)
-    alignment = Alignment(avatar, subject, config) if trainer.align_rate > 0 and not is_gpu else None
-    if alignment is not None and resume is not None:
-        alignment.load(resume.tensors)
+    alignment = make_alignment(avatar, subject, config, None if resume is None else resume.tensors)
     background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)
     meta = {

@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
-from small_runs import small_config, train_small
+from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.refine.refine import frozen
-from avatar.runs.checkpoint import Checkpoint, list_checkpoints, newest_checkpoint
+from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.splat import splat
 from avatar.tracking.freedom import find_freedom
 from avatar.tracking.likeness import Likeness, misfit, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
 from avatar.train import align as align_module
-from avatar.train.align import Alignment, Placed
+from avatar.train.align import Alignment, Placed, make_alignment
 from avatar.train.optim import make_optimizer
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
@@ -149,14 +149,31 @@ def test_a_resumed_run_has_the_same_bits(tracked_folder: Path, tmp_path: Path, m
         assert all(torch.equal(value, broken.tensors[name]) for name, value in whole.tensors.items())
 
 
-def test_a_checkpoint_without_the_moves_is_refused(tracked_folder: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_kind(tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that a GPU began has no moves, and gets none; a GPU does not take one that has; damaged ones are refused."""
+    monkeypatch.setattr(align_module, "LEAST_GAIN", -100.0)
     train_small(tracked_folder, tmp_path / "run", ["trainer.align_rate=0"])
     plain = newest_checkpoint(tmp_path / "run")
     assert not [name for name in plain.tensors if name.startswith("align.")]
-    with pytest.raises(UserError, match="lacks the tracking of its training frames"):
-        train_small(tracked_folder, tmp_path / "run", resume=plain)
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    untrained = new_avatar(assets, subject, config)
+
+    def made(tensors: dict[str, torch.Tensor]) -> Alignment | None:
+        return make_alignment(untrained, subject, config, tensors)
+
+    assert made(dict(plain.tensors)) is None
     train_small(tracked_folder, tmp_path / "other")
-    whole = newest_checkpoint(tmp_path / "other")
-    wrong = Checkpoint(8, {**whole.tensors, "align.factor": torch.zeros(3, 3)}, whole.meta)
-    with pytest.raises(UserError, match=r"align.factor of shape \[3, 3\]"):
-        train_small(tracked_folder, tmp_path / "other", resume=wrong)
+    whole = dict(newest_checkpoint(tmp_path / "other").tensors)
+    alignment = made(whole)
+    assert alignment is not None
+    assert all(torch.equal(value, whole[name]) for name, value in alignment.tensors().items())
+    with pytest.raises(UserError, match="not of this subject's frames"):
+        made(whole | {"align.factor": torch.zeros(3, 3)})
+    with pytest.raises(UserError, match="lacks a part"):
+        made({name: value for name, value in whole.items() if name != "align.is_over"})
+    monkeypatch.setattr(align_module, "on_gpu", lambda _: True)
+    assert made(dict(plain.tensors)) is None
+    assert made(whole | {"align.moves": torch.zeros_like(whole["align.moves"])}) is None
+    with pytest.raises(UserError, match="which a GPU does not yet: add --device cpu"):
+        made(whole)
