@@ -33,12 +33,11 @@ from avatar.refine.parallel import in_order, read_later
 from avatar.refine.smoothing import smoothed
 from avatar.tracking.descent import Descent, Problem, curvature, descend
 from avatar.tracking.freedom import Freedom, find_freedom
-from avatar.tracking.likeness import Likeness, Measure, Target, head_psnr, targets
+from avatar.tracking.likeness import Likeness, Measure, Target, coarse_levels, head_psnr, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
 from avatar.train.interruption import interruption
 from avatar.train.order import evenly_spread
 
-COARSEST = 224  # pixels of width: on fewer a step takes as long, and finds nothing that one on all does not
 COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
@@ -156,8 +155,7 @@ class _Work:
         self.tracks = subject.recording.tracks
         self.freedom: Freedom = find_freedom(self.tracks, subject.split.train, self.centre)
         self.there = self.freedom if self.waits else self.freedom.on(self.device)
-        width = subject.image_size(size)[0]
-        self.levels = 1 + sum(width >> level >= COARSEST for level in range(1, 16))
+        self.levels = coarse_levels(subject.image_size(size)[0])
 
     def key(self) -> str:
         """Changes with everything that the result depends on."""

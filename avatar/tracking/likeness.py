@@ -32,6 +32,7 @@ from avatar.types import Camera, Frame, Gaussians
 OBSERVATIONS, PIXEL_SIGMA = 60.0, 0.05
 HUBER_DELTA = 0.1
 MARGIN = 8  # pixels around the head mask: what the avatar paints there is wrong
+COARSEST = 224  # pixels of width: on fewer a step takes as long, and finds nothing that one on all does not
 BLUR = 0.3  # pixels^2, that the splatter adds in training
 
 
@@ -59,7 +60,7 @@ def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Tar
     made = []
     for level in range(levels):
         width, height = (max(1, side >> level) for side in (frame.camera.width, frame.camera.height))
-        small, head = (_resized(image, width, height) for image in (picture, mask))
+        small, head = (resized(image, width, height) for image in (picture, mask))
         box = bounding_box(head)
         assert box is not None  # what is there at full size leaves something in the mean
         margin = max(1, MARGIN >> level)
@@ -81,7 +82,12 @@ def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Tar
     return made
 
 
-def _resized(image: Tensor, width: int, height: int) -> Tensor:
+def coarse_levels(width: int) -> int:
+    """Into how many sizes, each half of the one before, a picture of so many pixels' width is worth being divided."""
+    return 1 + sum(width >> level >= COARSEST for level in range(1, 16))
+
+
+def resized(image: Tensor, width: int, height: int) -> Tensor:
     if image.shape[:2] == (height, width):
         return image
     return torch.from_numpy(cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA))

@@ -30,7 +30,16 @@ from avatar.model import Avatar
 from avatar.splat import CannotDraw
 from avatar.tracking.descent import Problem, curvature
 from avatar.tracking.freedom import find_freedom
-from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness, camera_gradient, head_psnr, targets
+from avatar.tracking.likeness import (
+    OBSERVATIONS,
+    PIXEL_SIGMA,
+    Likeness,
+    camera_gradient,
+    coarse_levels,
+    head_psnr,
+    resized,
+    targets,
+)
 from avatar.tracking.motion import HeadPose, head_params, moved_pose, values_of
 from avatar.train.order import evenly_spread
 from avatar.train.posed import PosedMeshes
@@ -236,9 +245,13 @@ class Alignment:
         self._moves = torch.where(trained_on[:, None], centred, self._moves)
 
     def _measure(self, step: int, loader: FrameLoader) -> None:
+        """The curvature, of pictures that are no larger than they need be."""
+
         def measured(frame: Frame, problem: Problem) -> Tensor:
-            weight = 1.0 + self._mouth_weight * frame.mouth_mask[problem.targets[0].box]
-            return curvature(self._likeness, problem, 0, self._moves[frame.index], weight)
+            coarsest = problem.targets[-1]
+            mouth = resized(frame.mouth_mask, coarsest.camera.width, coarsest.camera.height)[coarsest.box]
+            level, moves = len(problem.targets) - 1, self._moves[frame.index]
+            return curvature(self._likeness, problem, level, moves, 1.0 + self._mouth_weight * mouth)
 
         found = self._of_frames(step, loader, SAMPLES, measured)
         if not found:
@@ -267,7 +280,8 @@ class Alignment:
         """Of evenly spread training frames that show a head."""
         found = []
         for frame in loader.frames(evenly_spread(self._train, count)):
-            if (made := targets(frame, self._likeness.background, 1)) is None:
+            levels = coarse_levels(frame.camera.width)
+            if (made := targets(frame, self._likeness.background, levels)) is None:
                 continue
             try:
                 found.append(measured(frame, Problem(self._given(frame.index), made, frame.index, self._freedom)))

@@ -14,9 +14,9 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from avatar.losses.metrics import psnr
 from avatar.model import Avatar
-from avatar.refine import likeness as likeness_module
 from avatar.refine.refine import frozen
 from avatar.splat import splat
+from avatar.tracking import likeness as likeness_module
 from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness, camera_gradient, head_psnr, targets
 from avatar.tracking.likeness import misfit as misfit_of
 from avatar.tracking.motion import HeadPose, head_params, moved_pose, rotation, values_of
