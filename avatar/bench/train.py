@@ -63,11 +63,11 @@ class Trainee:
     meshes: PosedMeshes
     judge: Judge | None  # None: every step is checked at once
 
-    def step(self, number: int) -> None:
+    def step(self, number: int, moves: bool = False) -> None:
         frame = next(self.frames)
         vertices = self.meshes.vertices(frame)
         if self.judge is None:
-            one_step(self.avatar, self.optimizer, self.objective, number, frame, vertices)
+            one_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, moves=moves)
         else:
             training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
 
@@ -139,14 +139,16 @@ def steps_at_once(learner: Trainee) -> int:
 
 
 def run_steps(learner: Trainee, late: bool) -> None:
-    """One step with all degrees of colour but before the perceptual term, or the last ones, as many as hold one with it."""
+    """One step with all degrees of colour but before the perceptual term, which moves its frame's tracking if any does; or
+    the last ones, as many as hold one with it."""
     iterations = learner.config.trainer.iterations
     if late:
         first = iterations // steps_at_once(learner) * steps_at_once(learner)
         for number in range(first, first + steps_at_once(learner)):
             learner.step(number)
     else:
-        learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1)
+        moves = learner.config.trainer.align_rate > 0
+        learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1, moves)
     settle(learner.avatar.code.device)
 
 

@@ -48,11 +48,12 @@ from avatar.types import Frame, Gaussians
 
 BEGIN = 0.1  # share of the steps after which the avatar shows enough
 AGAIN = 0.35  # after which the curvature, of a sharper avatar, is measured anew, and the gain is judged
-END = 0.6  # after which the tracking stays where it is, and posed meshes need not be made again
+END = 0.45  # after which the tracking stays where it is, and posed meshes need not be made again
 LAST_RATE = 0.1  # share of the rate that is left then
 SAMPLES = 6  # training frames whose mean curvature stands for all
 JUDGED = 24  # training frames
 LEAST_GAIN = 0.25  # dB of these
+MOVING_SHARE = END - BEGIN  # of the steps
 # Where refinement moves every frame, and farther than training would; before the user's own overrides.
 UNALIGNED = "trainer.align_rate=0"
 _PREFIX, _NAMES = "align.", ("moves", "factor", "is_over")  # in a checkpoint
@@ -122,10 +123,11 @@ def one_step(
     step: int,
     frame: Frame,
     vertices: Float[Tensor, "V 3"],
+    *,
+    moves: bool,
 ) -> None:
-    """What step number `step` (from 0) takes, for who times it: where frames' tracking is moved, that, by nothing."""
-    config = objective.config
-    if config.align_rate == 0 or not BEGIN <= step / config.iterations < END:
+    """What step number `step` (from 0) takes, for who times it; `moves` its frame's tracking, by nothing, or does not."""
+    if not moves:
         training_step(avatar, optimizer, objective, step, frame, vertices)
         return
     params, given = frame.params, HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)

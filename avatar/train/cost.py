@@ -15,7 +15,7 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.train.align import one_step
+from avatar.train.align import MOVING_SHARE, one_step
 from avatar.train.optim import make_optimizer
 from avatar.train.step import Objective, choose_perceptual
 from avatar.types import Frame
@@ -56,14 +56,20 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
     vertices = avatar.head.vertices(frame.params)
-    total = 0.0
-    for count, step in kinds_of_steps(config.trainer, term.every):
-        seconds = []
+
+    def seconds(step: int, moves: bool = False) -> float:
+        taken = []
         for _ in range(1 + MEASURED_STEPS):
             begin = time.perf_counter()
-            one_step(avatar, optimizer, objective, step, frame, vertices)
-            seconds.append(time.perf_counter() - begin)
-        total += count * float(np.median(seconds[1:]))
+            one_step(avatar, optimizer, objective, step, frame, vertices, moves=moves)
+            taken.append(time.perf_counter() - begin)
+        return float(np.median(taken[1:]))
+
+    kinds = kinds_of_steps(config.trainer, term.every)
+    total = sum(count * seconds(step) for count, step in kinds)
+    if config.trainer.align_rate > 0:
+        first = kinds[0][1]
+        total += MOVING_SHARE * config.trainer.iterations * max(seconds(first, moves=True) - seconds(first), 0.0)
     height, width = frame.image.shape[:2]
     parameters = sum(p.numel() for p in avatar.parameters())
     return Cost(

@@ -83,6 +83,5 @@ def _spread(colours: np.ndarray, part: np.ndarray, reach: int) -> tuple[np.ndarr
     """The mean colour of a part nearby, and where there is any."""
     weight = part.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), reach)
-    return cv2.GaussianBlur(colours * weight[..., None], (0, 0), reach) / np.maximum(total, 1e-6)[
-        ..., None
-    ], total > 1e-3
+    mean = cv2.GaussianBlur(colours * weight[..., None], (0, 0), reach) / np.maximum(total, 1e-6)[..., None]
+    return mean, total > 1e-3
