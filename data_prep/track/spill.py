@@ -22,11 +22,9 @@ _FEW = 20  # pixels
 
 
 class Rim(NamedTuple):
-    """The surroundings of a matte's edge."""
+    """The surroundings of a matte's edge. A pixel's colour lies between the person's and the background's nearby."""
 
-    share: Float32[
-        np.ndarray, "H W"
-    ]  # of the background's colour in the pixel's, of those that the line between both has
+    share: Float32[np.ndarray, "H W"]  # of the way from the person's to the background's
     away: Float32[np.ndarray, "H W 3"]  # from the person's colour to the background's, in [-1, 1]
     known: Bool[np.ndarray, "H W"]  # where both colours are near, and unlike
 
