@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -65,8 +66,8 @@ class TrainingLog:
         self._bar.set_postfix(shown, refresh=False)
 
     def say(self, news: str) -> None:
-        """Above the bar."""
-        self._bar.write(news)
+        """Above the bar, and where it is."""
+        self._bar.write(news, file=sys.stderr)
 
     def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""
