@@ -23,7 +23,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.train.ahead import Guard
-from avatar.train.align import one_step
+from avatar.train.align import moving_step
 from avatar.train.optim import make_optimizer
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Judge, Objective, choose_perceptual, training_step
@@ -65,10 +65,10 @@ class Trainee:
 
     def step(self, number: int, moves: bool = False) -> None:
         frame = next(self.frames)
-        vertices = self.meshes.vertices(frame)
-        if self.judge is None:
-            one_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, moves=moves)
+        if moves:
+            moving_step(self.avatar, self.optimizer, self.objective, number, frame)
         else:
+            vertices = self.meshes.vertices(frame)
             training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
 
 
@@ -147,7 +147,7 @@ def run_steps(learner: Trainee, late: bool) -> None:
         for number in range(first, first + steps_at_once(learner)):
             learner.step(number)
     else:
-        moves = learner.config.trainer.align_rate > 0
+        moves = learner.config.trainer.align_rate > 0 and learner.judge is None  # a GPU moves none
         learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1, moves)
     settle(learner.avatar.code.device)
 

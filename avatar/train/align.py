@@ -44,7 +44,7 @@ from avatar.tracking.motion import HeadPose, head_params, moved_pose, values_of
 from avatar.train.order import evenly_spread
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Objective, stopped, training_step
-from avatar.types import Frame, Gaussians
+from avatar.types import Frame, Gaussians, HeadParams
 
 BEGIN = 0.1  # share of the steps after which the avatar shows enough
 AGAIN = 0.35  # after which the curvature, of a sharper avatar, is measured anew, and the gain is judged
@@ -116,20 +116,8 @@ def make_alignment(
     return alignment
 
 
-def one_step(
-    avatar: Avatar,
-    optimizer: torch.optim.Adam,
-    objective: Objective,
-    step: int,
-    frame: Frame,
-    vertices: Float[Tensor, "V 3"],
-    *,
-    moves: bool,
-) -> None:
-    """What step number `step` (from 0) takes, for who times it; `moves` its frame's tracking, by nothing, or does not."""
-    if not moves:
-        training_step(avatar, optimizer, objective, step, frame, vertices)
-        return
+def moving_step(avatar: Avatar, optimizer: torch.optim.Adam, objective: Objective, step: int, frame: Frame) -> None:
+    """What step number `step` (from 0) takes where it moves its frame's tracking, for who times it; by nothing."""
     params, given = frame.params, HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)
     tracks = {name: getattr(params, name)[None] for name in ("neck", "jaw", "eyes", "eyelids", "expression")}
     values = values_of(tracks | {"t": given.t[None]})[0]
@@ -164,6 +152,7 @@ class Alignment:
         self._freedom = find_freedom(self._tracks, self._train, self._centre)
         self._likeness = Likeness(avatar, background, self._centre)
         self._meshes = PosedMeshes(avatar)
+        self._places: dict[int, tuple[HeadPose, HeadParams]] = {}  # of frames that move no more
         self._moves = torch.zeros(len(subject), len(self._freedom.index))
         self._factor: Float[Tensor, "F F"] | None = None  # of the curvature, lower Cholesky; None: nothing moves
         self._is_over = False
@@ -192,13 +181,12 @@ class Alignment:
         self._prepare(step, loader, say)
         if self._factor is None or not bool(frame.head_mask.any()):
             return Seen(frame, self._meshes.vertices(frame))
+        if step >= self._end:
+            still = self._settled(frame)
+            return Seen(still, self._meshes.vertices(still))
         values = self._freedom.values(frame.index, self._moves[frame.index])
         placed = Placed(frame, values, self._given(frame.index), self._centre)
-        if step < self._end:
-            return Seen(placed.frame, self._likeness.avatar.vertices(placed.frame.params), placed)
-        with torch.no_grad():
-            still = replace(placed.frame, params=head_params(values))
-            return Seen(still, self._meshes.vertices(still))
+        return Seen(placed.frame, self._likeness.avatar.vertices(placed.frame.params), placed)
 
     def learn(self, step: int, seen: Seen) -> None:
         """Move the frame by what step `step` (from 0) has found."""
@@ -236,6 +224,15 @@ class Alignment:
             self._meshes = PosedMeshes(self._likeness.avatar)  # those of before were of the given tracking
         elif (step - self._begin) % len(self._train) == 0:
             self._centre_moves()
+
+    def _settled(self, frame: Frame) -> Frame:
+        """The frame where its tracking was moved to, which is reckoned once."""
+        if frame.index not in self._places:
+            values = self._freedom.values(frame.index, self._moves[frame.index])
+            pose = moved_pose(values, self._given(frame.index), self._centre)
+            self._places[frame.index] = pose, head_params(values)
+        pose, params = self._places[frame.index]
+        return replace(frame, camera=replace(frame.camera, R_cam_world=pose.R, t_cam_world=pose.t), params=params)
 
     def _given(self, frame: int) -> HeadPose:
         return HeadPose(self._tracks["R"][frame], self._tracks["t"][frame])

@@ -15,9 +15,9 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.train.align import MOVING_SHARE, one_step
+from avatar.train.align import MOVING_SHARE, moving_step
 from avatar.train.optim import make_optimizer
-from avatar.train.step import Objective, choose_perceptual
+from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
@@ -61,7 +61,10 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
         taken = []
         for _ in range(1 + MEASURED_STEPS):
             begin = time.perf_counter()
-            one_step(avatar, optimizer, objective, step, frame, vertices, moves=moves)
+            if moves:
+                moving_step(avatar, optimizer, objective, step, frame)
+            else:
+                training_step(avatar, optimizer, objective, step, frame, vertices)
             taken.append(time.perf_counter() - begin)
         return float(np.median(taken[1:]))
 
