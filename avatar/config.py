@@ -94,8 +94,9 @@ class TrainerConfig:
     preview_every: int
     checkpoint_every: int
     keep_checkpoints: int
-    stray_share: float = 0.0  # runs that lack it were made without, as those that lack the next
+    stray_share: float = 0.0  # runs that lack it were made without, as those that lack one of the next
     align_rate: float = 0.0
+    condition_noise: float = 0.0
 
 
 @dataclass
@@ -155,9 +156,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.preview_every": (1, MOST_STEPS),
     "trainer.checkpoint_every": (1, MOST_STEPS),
     "trainer.keep_checkpoints": (1, 10**6),
-    "trainer.stray_share": (0, 1),
-    "trainer.align_rate": (0, 1),
 }
+RANGES |= dict.fromkeys(("trainer.stray_share", "trainer.align_rate", "trainer.condition_noise"), (0.0, 1.0))
 RANGES |= {f"trainer.learning_rates.{f.name}": (0.0, 10.0) for f in dataclasses.fields(LearningRates)}
 
 

@@ -67,6 +67,12 @@ class HeadParams:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""
         return torch.cat((self.expression, self.jaw, self.eyes, self.eyelids))
 
+    def with_condition(self, condition: Float[Tensor, " C"]) -> HeadParams:
+        """The same with another `condition`."""
+        parts = (self.expression, self.jaw, self.eyes, self.eyelids)
+        expression, jaw, eyes, eyelids = condition.split([len(part) for part in parts])
+        return replace(self, expression=expression, jaw=jaw, eyes=eyes, eyelids=eyelids)
+
     def to(self, device: torch.device) -> HeadParams:
         """The same on another device, brought there in one copy."""
         if self.jaw.device == device:

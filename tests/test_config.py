@@ -71,6 +71,7 @@ def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
         "trainer.dssim_weight": 0.2,
         "trainer.stray_share": 0.05,
         "trainer.align_rate": 0.25,
+        "trainer.condition_noise": 0.2,
         "trainer.learning_rates.sh_dc": 1.0e-2,
         "trainer.learning_rates.sh_rest": 2.5e-3,
         "trainer.learning_rates.scale": 2.0e-2,

@@ -23,6 +23,7 @@ from avatar.train.align import Seen, make_alignment
 from avatar.train.colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
+from avatar.train.noise import make_noise
 from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.posed import PosedMeshes
@@ -64,6 +65,7 @@ def train(
     meshes = PosedMeshes(avatar)
     data, is_gpu = config.data, on_gpu(avatar.code)
     alignment = make_alignment(avatar, subject, config, None if resume is None else resume.tensors)
+    noise = make_noise(recording, trainer)
     background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)
     meta = {
@@ -97,9 +99,10 @@ def train(
                         seen = Seen(frame, meshes.vertices(frame))
                     else:
                         seen = alignment.see(step, frame, loader, log.say)
+                    shown = seen.frame if noise is None else noise.on(step, seen.frame)
                     judge = progress.judge(step)
                     outcome = training_step(
-                        avatar, optimizer, objective, step, seen.frame, seen.vertices, judge, seen.watched
+                        avatar, optimizer, objective, step, shown, seen.vertices, judge, seen.watched
                     )
                     if alignment is not None:
                         alignment.learn(step, seen)

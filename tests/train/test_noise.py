@@ -1,0 +1,78 @@
+"""Noise on what the network is told of a training frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_runs import open_small, small_config, train_small
+
+from avatar.data.subject import Subject
+from avatar.model import Avatar
+from avatar.train.noise import ConditionNoise
+
+SHARE = 0.3
+
+
+@pytest.fixture
+def subject(tracked_folder: Path) -> Subject:
+    return open_small(tracked_folder, small_config())[1]
+
+
+def conditions_of(subject: Subject) -> torch.Tensor:
+    return torch.stack([params.condition() for params in subject.recording.motion(subject.split.train)])
+
+
+def test_noise_spreads_as_the_conditions_do(subject: Subject) -> None:
+    conditions = conditions_of(subject)
+    frame, noise = subject.frame(0, 24), ConditionNoise(conditions, SHARE, seed=3)
+    added = torch.stack([noise.on(step, frame).params.condition() for step in range(4000)]) - frame.params.condition()
+    expected = SHARE**2 * np.cov(conditions.numpy().T, bias=True)
+    found = added.double().numpy().T @ added.double().numpy() / len(added)
+    scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+    assert np.isfinite(found).all() and scale.max() > 0
+    assert np.abs(found - expected).max() < 0.1 * scale.max()  # six deviations of chance
+    still = scale.diagonal() < 1e-12
+    assert still.any() and found.diagonal()[still].max() < 1e-10  # what never moves has none
+
+
+def test_noise_is_a_function_of_seed_and_step_and_leaves_the_rest_of_the_frame(subject: Subject) -> None:
+    frame, conditions = subject.frame(1, 24), conditions_of(subject)
+    noise = ConditionNoise(conditions, SHARE, seed=3)
+    told = noise.on(7, frame)
+    assert torch.equal(told.params.condition(), noise.on(7, frame).params.condition())
+    for other in (noise.on(8, frame), ConditionNoise(conditions, SHARE, seed=4).on(7, frame), frame):
+        assert not torch.equal(told.params.condition(), other.params.condition())
+    assert told.params.neck is frame.params.neck
+    for name in ("camera", "image", "alpha", "head_mask", "mouth_mask", "index"):
+        assert getattr(told, name) is getattr(frame, name)
+
+
+@pytest.mark.parametrize("share", [0.0, SHARE])
+def test_training_poses_the_mesh_without_it(
+    share: float, tracked_folder: Path, subject: Subject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network is told of every frame with noise; the mesh is posed, and previews are drawn, without."""
+    known, posed, told = set(), set(), set()
+    for index in range(len(subject)):
+        known.add(tuple(subject.recording.params(index).condition().tolist()))
+    forward, vertices = Avatar.forward, Avatar.vertices
+
+    def listening(self: Avatar, params, given=None):  # type: ignore[no-untyped-def]
+        if torch.is_grad_enabled():
+            told.add(tuple(params.condition().tolist()))
+        else:
+            assert tuple(params.condition().tolist()) in known
+        return forward(self, params, given)
+
+    def posing(self: Avatar, params):  # type: ignore[no-untyped-def]
+        posed.add(tuple(params.condition().tolist()))
+        return vertices(self, params)
+
+    monkeypatch.setattr(Avatar, "forward", listening)
+    monkeypatch.setattr(Avatar, "vertices", posing)
+    train_small(tracked_folder, tmp_path / "run", ["trainer.align_rate=0", f"trainer.condition_noise={share}"])
+    assert told and (told <= known if share == 0 else not told & known)
+    assert posed <= known
