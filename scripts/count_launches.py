@@ -13,7 +13,8 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 from unittest.mock import patch
 
 import torch
@@ -23,6 +24,10 @@ from torch.utils._pytree import tree_leaves
 
 from avatar.bench.scenes import head_camera
 from avatar.config import load_config
+from avatar.data.loader import FrameLoader
+from avatar.data.recording import Recording
+from avatar.data.split import Split
+from avatar.data.subject import Subject
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
@@ -32,7 +37,9 @@ from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
 from avatar.render import Renderer
 from avatar.splat.capacity import fixed_capacity
+from avatar.tracking.freedom import find_freedom
 from avatar.train.ahead import Guard
+from avatar.train.align import Alignment
 from avatar.train.optim import make_optimizer
 from avatar.train.step import Objective, PerceptualTerm, Weighted, training_step
 from avatar.types import IDENTITY_6D, Frame, HeadParams
@@ -99,8 +106,10 @@ class Rehearsal:
         device: torch.device = META,
     ) -> None:
         config = load_config([f"model.uv_size={uv_size}", *overrides])
-        self.avatar = Avatar(assets, torch.zeros(1), config.model).to(device)
-        self.trainer = config.trainer
+        avatar = Avatar(assets, torch.zeros(1), config.model)
+        avatar.embedding.touching(assets.num_vertices)  # made once, and only of numbers that are there
+        self.avatar = avatar.to(device)
+        self.config, self.trainer = config, config.trainer
         with patch("torch.optim.adam._device_dtype_check_for_fused"):  # it knows no meta device
             self.optimizer = make_optimizer(self.avatar, config.trainer)
         self.guard = Guard(self.optimizer, device)
@@ -127,6 +136,51 @@ class Rehearsal:
         number = self.trainer.iterations - self.trainer.lpips_every if late else self.trainer.iterations // 4
         training_step(self.avatar, self.optimizer, objective, number, self.frame, self.vertices, self.guard.judge)
 
+    def moving(self, perceptual: PerceptualTerm) -> Counter[str]:
+        """What a step launches that moves its frame's tracking."""
+        objective, number = Objective(self.trainer, self.background, perceptual), self.trainer.iterations // 4 + 1
+        recording = self.recording()
+        alignment = Alignment(
+            self.avatar, cast(Subject, SimpleNamespace(recording=recording, split=recording.split)), self.config
+        )
+        freedom = find_freedom(recording.tracks, recording.split.train, torch.zeros(3))
+        moves = {"moves": torch.zeros(len(recording), len(freedom.index)), "factor": torch.eye(len(freedom.index))}
+        alignment.load({f"align.{name}": value for name, value in (moves | {"is_over": torch.zeros(())}).items()})
+        with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
+            for _ in range(2):
+                with counting() as launches:
+                    seen = alignment.see(number, self.frame, cast(FrameLoader, None), print)
+                    step = objective, number, seen.frame, seen.vertices, self.guard.judge, seen.watched
+                    training_step(self.avatar, self.optimizer, *step)
+                    alignment.learn(number, seen, self.guard.is_spoilt)
+        return launches
+
+    def recording(self) -> Recording:
+        """Of a few frames in which the whole face moves."""
+        frames, rest, camera = 4, torch.tensor(IDENTITY_6D), self.camera
+        tracks = {
+            "expression": torch.rand(frames, len(self.params.expression)),
+            "jaw": rest.repeat(frames, 1),
+            "eyes": rest.repeat(frames, 2),
+            "eyelids": torch.rand(frames, 2),
+            "neck": rest.repeat(frames, 1),
+            "R": camera.R_cam_world.repeat(frames, 1, 1),
+            "t": camera.t_cam_world.repeat(frames, 1),
+            "shape": torch.zeros(1),
+        }
+        return Recording(
+            name="rehearsed",
+            fps=25.0,
+            width=camera.width,
+            height=camera.height,
+            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+            names=tuple(map(str, range(frames))),
+            split=Split(tuple(range(frames)), ()),
+            tracks=tracks,
+            data_hash="",
+            head_fingerprint=self.avatar.head.assets.fingerprint,
+        )
+
     def rendered(self) -> Counter[str]:
         renderer = Renderer(self.avatar, self.background)
         with fixed_capacity(PAIRS), counting() as launches:
@@ -144,6 +198,7 @@ def count_all(assets: HeadAssets, uv_size: int, size: int) -> dict[str, Counter[
         "step with LPIPS (each tenth of the second half)": rehearsal.step(
             PerceptualTerm("lpips", lpips, rehearsal.trainer.lpips_every, stand_in), late=True
         ),
+        "step that moves its frame": rehearsal.moving(PerceptualTerm("dssim", stand_in)),
         "rendered frame": rehearsal.rendered(),
     }
 

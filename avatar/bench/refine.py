@@ -35,7 +35,7 @@ from avatar.model import Avatar
 from avatar.refine.refine import refine_subject
 from avatar.render import Renderer
 from avatar.tracking.motion import EXPRESSION, values_of
-from avatar.train.align import UNALIGNED
+from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps, within_passes
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
@@ -75,7 +75,7 @@ class Row:
 def run(request: Request) -> None:
     (folder,) = request.inputs
     config = load_config(
-        [UNALIGNED, *(QUICK if request.quick else ()), "trainer.preview_every=1000000", *request.overrides]
+        [*WITH_REFINEMENT, *(QUICK if request.quick else ()), "trainer.preview_every=1000000", *request.overrides]
     )
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     rows = measure(source, config, request.out)

@@ -36,7 +36,7 @@ from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import load_expression_names
-from avatar.train.align import UNALIGNED
+from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
 from data_prep.open import find_head, open_subject
@@ -93,7 +93,7 @@ def run(request: Request) -> None:
     of_demo = (f"data.size={scale.size}", f"trainer.iterations={scale.iterations}")
     config = load_config(
         [
-            UNALIGNED,
+            *WITH_REFINEMENT,
             *(() if request.inputs and not request.quick else of_demo),
             "trainer.preview_every=1000000",
             *(("model.uv_size=24", "model.mlp_width=24") if request.quick else ()),

@@ -22,9 +22,10 @@ from avatar.data.shelf import Shelf, shelf_bytes
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
+from avatar.tracking.likeness import Likeness
 from avatar.train.ahead import Guard
-from avatar.train.align import moving_step
 from avatar.train.optim import make_optimizer
+from avatar.train.placed import moving_step
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Judge, Objective, choose_perceptual, training_step
 from avatar.types import Frame
@@ -61,12 +62,13 @@ class Trainee:
     objective: Objective
     frames: Iterator[Frame]
     meshes: PosedMeshes
+    likeness: Likeness
     judge: Judge | None  # None: every step is checked at once
 
     def step(self, number: int, moves: bool = False) -> None:
         frame = next(self.frames)
         if moves:
-            moving_step(self.avatar, self.optimizer, self.objective, number, frame)
+            moving_step(self.likeness, self.optimizer, self.objective, number, frame, self.judge)
         else:
             vertices = self.meshes.vertices(frame)
             training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
@@ -125,8 +127,9 @@ def trainee(
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
     optimizer = make_optimizer(avatar, config.trainer)
+    likeness = Likeness(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0).to(device))
     judge = Guard(optimizer, device).judge if is_gpu else None
-    return Trainee(config, avatar, optimizer, objective, cycle(frames), meshes, judge)
+    return Trainee(config, avatar, optimizer, objective, cycle(frames), meshes, likeness, judge)
 
 
 def silent(_: str) -> None:
@@ -147,7 +150,7 @@ def run_steps(learner: Trainee, late: bool) -> None:
         for number in range(first, first + steps_at_once(learner)):
             learner.step(number)
     else:
-        moves = learner.config.trainer.align_rate > 0 and learner.judge is None  # a GPU moves none
+        moves = learner.config.trainer.align_rate > 0
         learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1, moves)
     settle(learner.avatar.code.device)
 

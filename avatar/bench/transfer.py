@@ -40,7 +40,7 @@ from avatar.model import Avatar
 from avatar.motion.repertoire import learn_repertoire
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.render import Renderer
-from avatar.train.align import UNALIGNED
+from avatar.train.align import WITH_REFINEMENT
 from avatar.types import Camera, HeadParams
 from data_prep.open import open_subject
 
@@ -97,7 +97,13 @@ def measure(
 ) -> list[Row]:
     """Make both subjects, train the target's avatars, drive them in every way. All lies in a temporary folder."""
     config = load_config(
-        ["experiment=demo", UNALIGNED, f"data.size={scale.size}", f"trainer.iterations={scale.iterations}", *overrides]
+        [
+            "experiment=demo",
+            *WITH_REFINEMENT,
+            f"data.size={scale.size}",
+            f"trainer.iterations={scale.iterations}",
+            *overrides,
+        ]
     )
     performance = perform(DRIVER_SEED, scale.driver_frames, "speech")
     true = [frame_params(performance, i) for i in range(scale.driver_frames)]

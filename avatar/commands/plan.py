@@ -19,7 +19,7 @@ from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.refine.refine import estimated_seconds
-from avatar.train.align import UNALIGNED
+from avatar.train.align import WITH_REFINEMENT
 from avatar.train.cost import measure_cost
 from avatar.train.order import within_passes
 from avatar.train.step import choose_perceptual
@@ -107,11 +107,11 @@ class Plan:
         """Of the run itself."""
         asked = load_config(self.overrides).trainer.iterations
         limit = [] if self.iterations == asked else [f"trainer.iterations={self.iterations}"]
-        return [UNALIGNED, *self.overrides, *limit]
+        return [*WITH_REFINEMENT, *self.overrides, *limit]
 
     def round_overrides(self) -> list[str]:
         """Of the avatars that are only refined through."""
-        return [UNALIGNED, *self.overrides, f"trainer.iterations={self.round_iterations}"]
+        return [*WITH_REFINEMENT, *self.overrides, f"trainer.iterations={self.round_iterations}"]
 
 
 def _whole(value: object) -> int:
@@ -153,7 +153,7 @@ def steps_in_time(
 
     Raises UserError where they allow too few.
     """
-    config = load_config([UNALIGNED, *overrides])
+    config = load_config([*WITH_REFINEMENT, *overrides])
     subject, assets = open_subject(source, split_sizes(config), print)
     frames = len(subject.split.train)
     asked = within_passes(config.trainer, frames).iterations

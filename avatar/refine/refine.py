@@ -29,12 +29,12 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
-from avatar.refine.parallel import in_order, read_later
 from avatar.refine.smoothing import smoothed
 from avatar.tracking.descent import Descent, Problem, curvature, descend
 from avatar.tracking.freedom import Freedom, find_freedom
 from avatar.tracking.likeness import Likeness, Measure, Target, coarse_levels, head_psnr, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
+from avatar.tracking.parallel import in_order, read_later
 from avatar.train.interruption import interruption
 from avatar.train.order import evenly_spread
 
@@ -164,7 +164,7 @@ class _Work:
         return hashlib.sha256(repr(choices).encode()).hexdigest()
 
     def pose(self, frame: int) -> HeadPose:
-        return HeadPose(*(brought(part, self.device) for part in self.given(frame)))
+        return self.given(frame).on(self.device)
 
     def given(self, frame: int) -> HeadPose:
         """On the CPU, where cameras are."""

@@ -53,7 +53,7 @@ def curvature(
     weight   of the pixels besides; None: all are one
     """
     target, freedom = problem.targets[level], problem.freedom
-    moves = torch.zeros(len(freedom.index), device=freedom.unit.device) if moves is None else moves.clone()
+    moves = torch.zeros(len(freedom.index), device=freedom.unit.device) if moves is None else moves
 
     def picture(moves: Tensor) -> Tensor:
         return likeness.picture(freedom.values(problem.frame, moves), problem.given, target)
@@ -63,12 +63,10 @@ def curvature(
     root = torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt()
     if weight is not None:
         root = root * weight.sqrt()[..., None]
-    columns = []
-    for k in range(len(moves)):
-        at = float(moves[k])
-        moves[k] = at + PROBE
-        columns.append(((picture(moves) - before) * root).flatten() / PROBE)
-        moves[k] = at
+    probes = PROBE * torch.eye(len(moves), dtype=torch.float64, device=moves.device)
+    columns = [
+        ((picture((moves.double() + probe).to(moves.dtype)) - before) * root).flatten() / PROBE for probe in probes
+    ]
     jacobian = torch.stack(columns, dim=1)
     return OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian.T @ jacobian) / (3.0 * target.area)
 

@@ -25,7 +25,7 @@ from avatar.model import Avatar
 from avatar.splat import splat
 from avatar.splat.sh import C0, sh_colours
 from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, quaternion
-from avatar.types import Camera, Frame, Gaussians
+from avatar.types import Camera, Frame, Gaussians, HeadParams
 
 # The squared error of a frame counts as this many independent observations with this standard deviation. Errors of
 # neighbouring pixels come from the same fault of the avatar, so that a picture says far less than its pixels would.
@@ -145,7 +145,7 @@ class Likeness:
         """How far the avatar's picture is from the target's, and how that changes with the values."""
         values = values.detach().requires_grad_()
         if on_gpu(values):
-            gaussians = self.avatar(params := head_params(values), self._head.vertices(params))
+            gaussians = self.avatar(params := head_params(values), self.vertices(params))
             picture = self._draw_moved(gaussians, values, given, target)
             error = misfit(picture, target)
             (gradient,) = torch.autograd.grad(error, values)
@@ -172,17 +172,18 @@ class Likeness:
     def _head(self) -> HeadModel:
         return self.avatar.head.on(self.centre.device)
 
+    def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
+        """The posed head where the avatar is, metres; differentiable."""
+        return self._head.vertices(params)
+
     def _draw_moved(
         self, gaussians: Gaussians, values: Tensor, given: HeadPose, target: Target
     ) -> Float[Tensor, "h w 3"]:
         """Moves the head before the target's own camera, which has the given pose: a GPU would have to hand a moved camera
         back. Differentiable by autograd alone."""
         pose = moved_pose(values, given, self.centre)
-        directions = normalize(gaussians.means + (pose.R.T @ pose.t), dim=-1)
-        colours = sh_colours(gaussians.sh, directions, self.avatar.config.sh_degree)
-        means = (gaussians.means @ pose.R.T + (pose.t - given.t)) @ given.R
-        quats = turned(quaternion(given.R.T @ values[TURN]), gaussians.quats)
-        moved = gaussians._replace(means=means, quats=quats, sh=((colours - 0.5) / C0)[:, None])
+        directions = gaussians.means + (pose.R.T @ pose.t)
+        moved = before_camera(gaussians, values[TURN], pose, given, directions, self.avatar.config.sh_degree)
         drawing = splat(moved, target.camera, self.background, region=target.box, blur=target.blur)
         return drawing.image[target.box]
 
@@ -190,6 +191,26 @@ class Likeness:
         camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)
         drawing = splat(gaussians._replace(sh=sh), camera, self.background, region=target.box, blur=target.blur)
         return drawing.image[target.box]
+
+
+def before_camera(
+    gaussians: Gaussians,
+    turn: Float[Tensor, 3],
+    pose: HeadPose,
+    given: HeadPose,
+    directions: Float[Tensor, "N 3"],
+    sh_degree: int,
+) -> Gaussians:
+    """The Gaussians of a head with this pose, moved to before a camera that takes it to have the pose `given`.
+
+    turn         of the pose from the given one, rotation vector, radians, camera axes
+    directions   from the camera, of any length, in the head's space: that in which each is seen, which decides its colour;
+                 what is given back has that colour from everywhere, in one coefficient
+    """
+    colours = sh_colours(gaussians.sh, normalize(directions, dim=-1), sh_degree)
+    means = (gaussians.means @ pose.R.T + (pose.t - given.t)) @ given.R
+    quats = turned(quaternion(given.R.T @ turn), gaussians.quats)
+    return gaussians._replace(means=means, quats=quats, sh=((colours - 0.5) / C0)[:, None])
 
 
 def turned(by: Float[Tensor, 4], quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle, vector_to_skew_symmetric_matrix
 from torch import Tensor
 
+from avatar.compute.device import brought
 from avatar.head.model import matrix_from_6d
 from avatar.types import HeadParams
 
@@ -40,6 +41,9 @@ class HeadPose(NamedTuple):
 
     R: Float[Tensor, "*B 3 3"]
     t: Float[Tensor, "*B 3"]
+
+    def on(self, device: torch.device) -> HeadPose:
+        return HeadPose(brought(self.R, device), brought(self.t, device))
 
 
 def rotation(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:

@@ -82,6 +82,8 @@ class Prompt:
     def __init__(self, log: TrainingLog) -> None:
         self._log = log
 
+    is_spoilt = None  # no step is made after one that was not finite
+
     def judge(self, step: int) -> None:
         """`training_step` is to check step `step` itself."""
 
@@ -102,6 +104,11 @@ class Ahead:
         self._log, self._guard = log, Guard(optimizer, device)
         self._notes: deque[_Note] = deque()
         self._suspect = -1
+
+    @property
+    def is_spoilt(self) -> Float[Tensor, ""]:
+        """1 from the first step on that was not finite, where the GPU is; nothing may move then."""
+        return self._guard.is_spoilt
 
     def judge(self, step: int) -> Judge | None:
         """Who looks at step `step` (from 0) before it moves anything; None: `training_step`, which waits and says why."""

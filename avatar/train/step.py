@@ -64,6 +64,11 @@ class Outcome(NamedTuple):
     target: Float[Tensor, "H W 3"]
 
 
+def sh_degree(step: int, config: TrainerConfig, stored: int) -> int:
+    """The degree of the view-dependent colour that takes part in step `step` (from 0)."""
+    return min(step // config.sh_interval, stored)
+
+
 @dataclass(frozen=True)
 class Objective:
     """What a step minimises, for any frame."""
@@ -71,10 +76,6 @@ class Objective:
     config: TrainerConfig
     background: Float[Tensor, 3]
     perceptual: PerceptualTerm
-
-    def sh_degree(self, step: int, stored: int) -> int:
-        """The degree of the view-dependent colour that takes part in step `step` (from 0)."""
-        return min(step // self.config.sh_interval, stored)
 
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
         start = round(self.config.perceptual_start * self.config.iterations)
@@ -92,7 +93,7 @@ class Objective:
         )
 
     def draw(self, step: int, frame: Frame, gaussians: Gaussians, stored_degree: int) -> Float[Tensor, "H W 3"]:
-        degree = self.sh_degree(step, stored_degree)
+        degree = sh_degree(step, self.config, stored_degree)
         return splat(gaussians, frame.camera, self.background, sh_degree=degree).image
 
 

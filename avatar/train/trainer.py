@@ -98,14 +98,14 @@ def train(
                     if alignment is None:
                         seen = Seen(frame, meshes.vertices(frame))
                     else:
-                        seen = alignment.see(step, frame, loader, log.say)
+                        seen = alignment.see(step, frame, loader, log.say, progress.settle)
                     shown = seen.frame if noise is None else noise.on(step, seen.frame)
                     judge = progress.judge(step)
                     outcome = training_step(
                         avatar, optimizer, objective, step, shown, seen.vertices, judge, seen.watched
                     )
                     if alignment is not None:
-                        alignment.learn(step, seen)
+                        alignment.learn(step, seen, progress.is_spoilt)
                     step += 1
                     progress.note(step, outcome)
                     if step == strays_step(trainer):

@@ -17,7 +17,7 @@ from avatar.train.step import PerceptualTerm, Weighted
 pytest.importorskip("triton", reason="Triton is not installed")
 pytestmark = pytest.mark.without_kernels  # the meta device has none
 
-MOST_IN_A_STEP, MOST_IN_A_FRAME = 150, 60
+MOST_IN_A_STEP, MOST_IN_A_FRAME, MOST_IN_A_MOVING_STEP = 150, 60, 900
 STAND_IN = PerceptualTerm("dssim", Weighted(dssim, 0.05))
 
 
@@ -40,6 +40,7 @@ def test_a_fast_step_and_a_frame_launch_little(counts: dict[str, Counter[str]]) 
     for name in ("step, first half", "step with D-SSIM"):
         assert 50 < counts[name].total() <= MOST_IN_A_STEP, name
     assert 20 < counts["rendered frame"].total() <= MOST_IN_A_FRAME
+    assert MOST_IN_A_STEP < counts["step that moves its frame"].total() <= MOST_IN_A_MOVING_STEP
 
 
 def test_so_does_a_step_on_average_with_lpips_in_every_tenth(counts: dict[str, Counter[str]]) -> None:

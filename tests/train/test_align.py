@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +21,9 @@ from avatar.tracking.freedom import find_freedom
 from avatar.tracking.likeness import Likeness, misfit, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
 from avatar.train import align as align_module
-from avatar.train.align import Alignment, Placed, make_alignment
+from avatar.train.align import Alignment, make_alignment
 from avatar.train.optim import make_optimizer
+from avatar.train.placed import place
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
 
@@ -53,7 +55,7 @@ def test_the_gradient_is_that_of_refinement(avatar: Avatar, view_dependent: floa
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
     given, freedom = HeadPose(tracks["R"][3], tracks["t"][3]), find_freedom(tracks, clip.split.train, centre)
     values = freedom.values(3, torch.full((len(freedom.index),), 0.3))
-    placed = Placed(clip.pictures[3], values, given, centre)
+    placed = place(clip.pictures[3], values, given, centre, avatar.config.sh_degree)
     params = placed.frame.params
     gaussians = placed.watched(avatar(params, avatar.vertices(params)))
     picture = splat(gaussians, placed.frame.camera, BACKGROUND, region=target.box).image[target.box]
@@ -150,7 +152,7 @@ def test_a_resumed_run_has_the_same_bits(tracked_folder: Path, tmp_path: Path, m
 
 
 def test_a_checkpoint_of_another_kind(tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that a GPU began has no moves, and gets none; a GPU does not take one that has; damaged ones are refused."""
+    """One that an earlier version began on a GPU has no moves, and gets none; damaged ones are refused."""
     monkeypatch.setattr(align_module, "LEAST_GAIN", -100.0)
     train_small(tracked_folder, tmp_path / "run", ["trainer.align_rate=0"])
     plain = newest_checkpoint(tmp_path / "run")
@@ -172,8 +174,37 @@ def test_a_checkpoint_of_another_kind(tracked_folder: Path, tmp_path: Path, monk
         made(whole | {"align.factor": torch.zeros(3, 3)})
     with pytest.raises(UserError, match="lacks a part"):
         made({name: value for name, value in whole.items() if name != "align.is_over"})
-    monkeypatch.setattr(align_module, "on_gpu", lambda _: True)
-    assert made(dict(plain.tensors)) is None
-    assert made(whole | {"align.moves": torch.zeros_like(whole["align.moves"])}) is None
-    with pytest.raises(UserError, match="which a GPU does not yet: add --device cpu"):
-        made(whole)
+
+
+class Waiting(Exception):
+    pass
+
+
+def test_what_was_not_finite_moves_nothing_and_is_waited_for(avatar: Avatar) -> None:
+    """A GPU is told of steps after one that has gone wrong; it leaves their frames where they are."""
+    clip = wrongly_tracked(drawn_clip(avatar))
+    config = small_config(f"data.size={SIZE}", "trainer.iterations=100")
+    alignment, loader = Alignment(avatar, clip, config), Pictures(clip)  # type: ignore[arg-type]
+
+    def wait() -> None:
+        raise Waiting
+
+    with pytest.raises(Waiting):
+        alignment.see(10, clip.pictures[0], loader, print, wait)  # type: ignore[arg-type]
+    objective = Objective(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
+    optimizer = make_optimizer(avatar, config.trainer)
+    alignment.see(10, clip.pictures[0], loader, print)  # type: ignore[arg-type]
+
+    def moved(is_spoilt: torch.Tensor | None, factor: float = 1.0) -> bool:
+        seen = alignment.see(11, clip.pictures[1], loader, print, wait)  # type: ignore[arg-type]
+        training_step(avatar, optimizer, objective, 11, seen.frame, seen.vertices, None, seen.watched)
+        assert seen.placed is not None
+        gradient = factor * seen.placed.gradient()
+        seen.placed.gradient = lambda: gradient  # type: ignore[method-assign]
+        before = alignment.tensors()["align.moves"]
+        alignment.learn(11, seen, is_spoilt)
+        return not torch.equal(alignment.tensors()["align.moves"], before)
+
+    assert not moved(torch.ones(()))
+    assert not moved(None, math.nan)
+    assert moved(torch.zeros(())) and moved(None)
