@@ -52,6 +52,7 @@ class ModelConfig:
     sh_degree: int
     initial_opacity: float
     uv_detail: int
+    rigidity: bool = False  # avatars that lack it were made without
 
 
 @dataclass
@@ -65,6 +66,7 @@ class LearningRates:
     rotation: float
     mlp: float
     hyper: float
+    rigidity: float = 0.05
 
 
 @dataclass
@@ -244,8 +246,7 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
-    groups = _groups()
-    keys = _known_keys()
+    groups, keys = _groups(), _known_keys()
     for override in overrides:
         key, separator, value = override.partition("=")
         if not separator or not key:

@@ -11,7 +11,7 @@ from avatar.errors import UserError
 
 DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 _CONSTANTS = {"null": None, "~": None, "true": True, "false": False}
-_KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word"}
+_KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word", bool: "true or false"}
 
 
 def typed_value(text: str) -> int | float | bool | str | None:
@@ -40,7 +40,7 @@ def checked_value(key: str, value: Any, kind: Any) -> Any:
         return None
     if get_origin(wanted) is tuple:
         return checked_colour(key, value)
-    if isinstance(value, wanted) and not isinstance(value, bool):
+    if isinstance(value, wanted) and isinstance(value, bool) == (wanted is bool):
         return value
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         return float(max(min(value, 10**300), -(10**300)))  # beyond that there is no float; every range refuses it

@@ -20,6 +20,7 @@ from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
 from avatar.gaussians.mesh_points import MeshPoints
 from avatar.gaussians.ndgs import NdGaussians
+from avatar.gaussians.rigidity import INITIAL_LOGIT, Skull, held
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, PoseTensors
@@ -81,6 +82,11 @@ class Avatar(nn.Module):
         if config.name in ("hypergaussians", "covariance"):
             self.hyper = (HyperHeads if config.name == "hypergaussians" else CovarianceHeads)(N, config.latent_dim)
         self.ndgs = NdGaussians(N, config.latent_dim) if config.name == "ndgs" else None
+        self.skull: Skull | None = None
+        self.rigidity_logits: nn.Parameter | None = None
+        if config.rigidity and self.mesh_points is None:
+            self.skull = Skull(self.embedding, self.head)
+            self.rigidity_logits = nn.Parameter(torch.full((N,), INITIAL_LOGIT))
 
         initial_scale = torch.log(torch.cat((knn_scales(neutral[:alive]), knn_scales(neutral)[alive:])))
         self.log_scales = nn.Parameter(initial_scale[:, None].repeat(1, 3))
@@ -109,10 +115,11 @@ class Avatar(nn.Module):
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
             grid = None if self.grid is None else self.grid.interpolate
-            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid)
+            on_skull = None if self.skull is None else self.skull.points(params.neck)
+            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid, on_skull, self.rigidity)
         if self.grid is not None:
             values = self.grid.interpolate(values)
-        points = self.points(vertices)
+        points = self.points(vertices, params)
         if self.ndgs is not None:
             return compose_slice(points, *base, *self.ndgs(values))
         if self.hyper is not None:
@@ -129,11 +136,22 @@ class Avatar(nn.Module):
         """Those of the points that are alive."""
         return values if self.count is None else values[: int(self.count)]
 
-    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "alive 3"]:
-        """Where the Gaussians are on the mesh, metres."""
-        if self.mesh_points is None:
-            return self.embedding.points(vertices)
-        return self.living(self.mesh_points.points(vertices))
+    def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "alive 3"]:
+        """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""
+        if self.mesh_points is not None:
+            return self.living(self.mesh_points.points(vertices))
+        return self.held(self.embedding.points(vertices), params)
+
+    def held(self, points: Float[Tensor, "N 3"], params: HeadParams) -> Float[Tensor, "N 3"]:
+        """Points of the mesh posed by `params`, each brought to the skull by its share."""
+        if self.skull is None or self.rigidity is None:
+            return points
+        return held(points, self.skull.points(params.neck), self.rigidity)
+
+    @property
+    def rigidity(self) -> Float[Tensor, " N"] | None:
+        """The share in which each Gaussian keeps with the skull, in [0, 1]; None where none does."""
+        return None if self.rigidity_logits is None else torch.sigmoid(self.rigidity_logits)
 
     def encode_points(self) -> None:
         """Give the network the places that points on the mesh have now."""
@@ -176,6 +194,8 @@ class Avatar(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Avatar:
         super()._apply(fn, recurse)
         self.embedding.move(self.code.device)
+        if self.skull is not None:
+            self.skull.move(self.code.device)
         if self.grid is not None:
             self.grid.interpolate.move(self.code.device)
         return self

@@ -25,6 +25,7 @@ from avatar.errors import UserError
 from avatar.gaussians.compose import compose_carried, compose_raw, compose_slice
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.ndgs import Slice
+from avatar.gaussians.rigidity import held
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
@@ -50,6 +51,8 @@ class Renderer:
         self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
         self._packed = avatar.packed.detach().clone() if self._on_gpu and avatar.packed is not None else None
         self._ndgs, self._mesh_points = deepcopy(avatar.ndgs), deepcopy(avatar.mesh_points)
+        self._skull, logits = avatar.skull, avatar.rigidity_logits
+        self._rigidity = None if logits is None else torch.sigmoid(logits.detach())
         names = ("quats", "log_scales", "opacity_logits", "sh")
         self._base = {name: value.detach().clone() for name, value in zip(names, avatar.base(), strict=True)}
 
@@ -59,7 +62,7 @@ class Renderer:
         if self._network is None:
             assert self._mesh_points is not None
             vertices = self.vertices(params)
-            return compose_carried(self.points(vertices), self._mesh_points.turns(vertices), **self._base)
+            return compose_carried(self.points(vertices, params), self._mesh_points.turns(vertices), **self._base)
         if self._on_gpu:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
@@ -72,8 +75,10 @@ class Renderer:
                 **self._base,
                 embedding=avatar.embedding,
                 grid=None if grid is None else grid.interpolate,
+                on_skull=None if self._skull is None else self._skull.points(params.neck),
+                rigidity=self._rigidity,
             )
-        return self.place(self.points(self.vertices(params)), self.offsets(self.latents(params)))
+        return self.place(self.points(self.vertices(params), params), self.offsets(self.latents(params)))
 
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
@@ -131,12 +136,15 @@ class Renderer:
         """The posed mesh, metres."""
         return self._avatar.vertices(params)
 
-    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
-        """Where the Gaussians are bound on the mesh, metres."""
+    def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "N 3"]:
+        """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""
         if self._mesh_points is not None:
             return self._mesh_points.points(vertices)[: len(self._base["quats"])]
         embedding = self._avatar.embedding
-        return embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
+        points = embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
+        if self._skull is None or self._rigidity is None:
+            return points
+        return held(points, self._skull.points(params.neck), self._rigidity)
 
     def latents(self, params: HeadParams) -> Float[Tensor, "N n"]:
         """The network's output for each Gaussian. Raises ValueError for an avatar without a network."""

@@ -33,8 +33,9 @@ def trained_looking(*overrides: str) -> Avatar:
             avatar.mesh_points.walk()
         if avatar.count is not None:
             avatar.count.fill_(len(avatar) // 2)
-        if avatar.ndgs is not None:  # latents near the mean, so that not all is faded away
-            avatar.deformation.output.weight *= 0.1
+        if avatar.deformation is not None:  # offsets that stay in the picture, and latents near those of NDGS
+            for parameter in avatar.deformation.output.parameters():
+                parameter *= 0.1
     return avatar
 
 
@@ -42,6 +43,7 @@ def trained_looking(*overrides: str) -> Avatar:
     "overrides",
     [
         ("model.latent_grid=4",),
+        ("model.rigidity=true",),
         ("model.latent_grid=null",),
         ("model=flashavatar",),
         ("model=covariance",),

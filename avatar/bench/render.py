@@ -147,11 +147,11 @@ def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callabl
     calls: dict[str, list[Callable[[], object]]] = {name: [] for name in STEPS}
     for params, camera in frames:
         vertices = renderer.vertices(params)
-        points, latents = renderer.points(vertices), renderer.latents(params)
+        points, latents = renderer.points(vertices, params), renderer.latents(params)
         offsets = renderer.offsets(latents)
         gaussians = renderer.place(points, offsets)
         calls["skinning"].append(partial(renderer.vertices, params))
-        calls["embedding"].append(partial(renderer.points, vertices))
+        calls["embedding"].append(partial(renderer.points, vertices, params))
         calls["network"].append(partial(renderer.latents, params))
         calls["heads"].append(partial(renderer.offsets, latents))
         calls["compose"].append(partial(renderer.place, points, offsets))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -71,11 +72,12 @@ class StagedStep:
             heads = avatar.hyper
             (raw,) = self._forward("heads", lambda z: (heads(z),), [raw], list(heads.parameters()))
         base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
+        held = partial(avatar.held, points, frame.params)
         gaussians = self._forward(
             "compose",
-            lambda z: compose_raw(points, *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
+            lambda z: compose_raw(held(), *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
             [raw],
-            base,
+            base if avatar.rigidity_logits is None else [*base, avatar.rigidity_logits],
         )
         degree = avatar.config.sh_degree
         (image,) = self._forward(

@@ -39,6 +39,7 @@ ARRAYS = (
     "log_scales",
     "opacity_logits",
     "sh",
+    "rigidity",
 )
 
 
@@ -84,6 +85,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "log_scales": model.log_scales,
         "opacity_logits": model.opacity_logits,
         "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1),
+        "rigidity": torch.zeros(0) if model.rigidity is None else model.rigidity,
     }
     grid = None if model.grid is None else model.grid.interpolate
     empty = torch.zeros(0)
@@ -101,6 +103,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "coefficients": arrays["sh"].shape[1],
         "has_grid": int(grid is not None),
         "has_heads": int(folded is not None),
+        "has_rigidity": int(model.rigidity is not None),
     }
     return Drawing(
         sizes,

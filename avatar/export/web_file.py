@@ -1,6 +1,6 @@
 """The avatar as browsers read it: a gzip file of a JSON header and arrays, quantised where the picture does not mind.
 
-    bytes 0-3    "AVW1"
+    bytes 0-3    "AVW2"; "AVW1" before there was `rigidity`
     bytes 4-7    length of the header, uint32, little-endian like everything
     header       JSON: sizes, arrays (type, offset, length, columns, scales), motion, camera, names
     arrays       each at a multiple of 4 bytes
@@ -26,7 +26,7 @@ from avatar.motion.controls import expression_controls, joint_ranges
 from avatar.motion.orbit import orbit_limits
 from avatar.runs.trained import TrainedAvatar
 
-FORMAT = "AVW1"
+FORMAT = "AVW2"
 Precision = Literal["float", "small"]
 TYPES = {"f4": np.float32, "i2": np.int16, "i1": np.int8, "u4": np.uint32, "u2": np.uint16}
 # Columns that have a scale of their own, and bits, with precision "small". What is not named stays float32.
@@ -44,6 +44,7 @@ SMALL: dict[str, tuple[str, str]] = {  # array -> type, what a column is
     "log_scales": ("i2", "column"),
     "opacity_logits": ("i2", "all"),
     "sh": ("i1", "last two"),
+    "rigidity": ("i2", "all"),
 }
 MAX_MOTION = 1500  # frames: a minute at 25 a second
 

@@ -40,9 +40,14 @@ def place_gpu(
     sh: Float[Tensor, "N K 3"],
     embedding: Mesh,
     grid: Interpolation | None,
+    on_skull: Float[Tensor, "N 3"] | None = None,
+    rigidity: Float[Tensor, " N"] | None = None,
 ) -> Gaussians:
-    """`compose_raw` of the embedding's points and of the network's `values`, which are brought from the grid's nodes to the
-    Gaussians if there is a grid and through the HyperGaussians `packed` if there are any. Float32 tensors on one GPU.
+    """`compose_raw` of the embedding's points and of the network's `values`, in one launch. Float32 tensors on one GPU.
+
+    on_skull, rigidity  where the points are on the skull and by which share they go there (`held`), or neither
+    The values are brought from the grid's nodes to the Gaussians if there is a grid, and through the HyperGaussians
+    `packed` if there are any.
 
     Differentiable in all tensors. Raises ValueError for tensors whose sizes disagree.
     """
@@ -57,7 +62,11 @@ def place_gpu(
         raise ValueError(f"packed must have shape {list(packed_shape(N, n))}, got {list(packed.shape)}")
     if packed is None and grid is not None:
         raise ValueError("offsets are not smooth over the map: there is no grid without HyperGaussians")
-    given = (vertices, values, packed, quats, log_scales, opacity_logits)
+    if (on_skull is None) != (rigidity is None):
+        raise ValueError("on_skull and rigidity are given together or not at all")
+    if on_skull is not None and rigidity is not None:
+        check_shapes(quats=(quats, "N 4"), on_skull=(on_skull, "N 3"), rigidity=(rigidity, "N"))
+    given = (vertices, on_skull, rigidity, values, packed, quats, log_scales, opacity_logits)
     placed: Any = _Place.apply(*given, embedding, grid)
     means, turned, scales, opacities = placed
     return Gaussians(means, turned, scales, opacities, sh)
@@ -68,10 +77,11 @@ class _Place(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *given, embedding, grid = arguments
         tensors: list[Any] = [None if t is None else t.detach().contiguous() for t in given]
-        vertices, values, packed, quats, log_scales, opacity_logits = tensors
-        N, n = len(quats), values.shape[1]
+        vertices, on_skull, rigidity, values, packed, quats, log_scales, opacity_logits = tensors
+        N, n, has_skull = len(quats), values.shape[1], on_skull is not None
         is_hyper, saves = packed is not None, any(ctx.needs_input_grad)
         raw = torch.empty((N, 10), dtype=torch.float32, device=quats.device) if is_hyper and saves else values
+        away = torch.empty_like(log_scales) if has_skull and saves else log_scales
         placed = [torch.empty_like(t) for t in (log_scales, quats, log_scales, opacity_logits)]
         cells, weights = (values, values) if grid is None else grid.corners
         start(
@@ -80,6 +90,8 @@ class _Place(torch.autograd.Function):
             vertices,
             embedding.corners,
             embedding.barycentric,
+            on_skull if has_skull else vertices,
+            rigidity if has_skull else vertices,
             values,
             cells,
             weights,
@@ -90,27 +102,30 @@ class _Place(torch.autograd.Function):
             N,
             n,
             raw,
+            away,
             *placed,
             warps=LANES // 32,
             HAS_GRID=grid is not None,
             HAS_HYPER=is_hyper,
+            HAS_SKULL=has_skull,
             SAVE=saves,
             BLOCK=LANES,
         )
         ctx.embedding, ctx.grid, ctx.num_vertices = embedding, grid, len(vertices)
-        ctx.save_for_backward(values, packed, raw, quats, log_scales, placed[2], placed[3])
+        ctx.save_for_backward(values, packed, raw, away, rigidity, quats, log_scales, placed[2], placed[3])
         return tuple(placed)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Any, ...] = ctx.saved_tensors
-        values, packed, raw, quats, log_scales, scales, opacities = saved
+        values, packed, raw, away, rigidity, quats, log_scales, scales, opacities = saved
         grid: Interpolation | None = ctx.grid
         by_means, by_quats, by_scales, by_opacities = (gradient.contiguous() for gradient in upstream)
-        N, n, is_hyper = len(quats), values.shape[1], packed is not None
+        N, n, is_hyper, has_skull = len(quats), values.shape[1], packed is not None, rigidity is not None
         own = values if grid is None else values.new_empty(N, n)  # the shape of each Gaussian's own values
-        gradients = [torch.empty_like(t) for t in (own, packed if is_hyper else own, quats, log_scales, opacities)]
+        like = (own, packed if is_hyper else own, quats, log_scales, opacities, rigidity if has_skull else opacities)
+        gradients = [torch.empty_like(t) for t in like]
         cells, weights = (values, values) if grid is None else grid.corners
         start(
             place_backward,
@@ -120,6 +135,7 @@ class _Place(torch.autograd.Function):
             weights,
             packed if is_hyper else values,
             raw,
+            away,
             quats,
             log_scales,
             scales,
@@ -134,15 +150,22 @@ class _Place(torch.autograd.Function):
             warps=LANES // 32,
             HAS_GRID=grid is not None,
             HAS_HYPER=is_hyper,
+            HAS_SKULL=has_skull,
             BLOCK=LANES,
         )
-        by_values, by_packed, *by_base = gradients
+        by_values, by_packed, *by_base, by_rigidity = gradients
         if grid is not None:
             by_values = summed_at_nodes(grid.touching, by_values)
-        by_vertices = None
-        if ctx.needs_input_grad[0]:
-            by_vertices = summed_at_nodes(ctx.embedding.touching(ctx.num_vertices), by_means)
-        return by_vertices, by_values, by_packed if is_hyper else None, *by_base, None, None
+        by_vertices = by_skull = None
+        needs_vertices, needs_skull = ctx.needs_input_grad[:2]
+        if has_skull and needs_skull:
+            by_skull = by_means * rigidity[:, None]
+        if needs_vertices:
+            by_points = by_means * (1.0 - rigidity[:, None]) if has_skull else by_means
+            by_vertices = summed_at_nodes(ctx.embedding.touching(ctx.num_vertices), by_points)
+        by_rigidity = by_rigidity if has_skull else None
+        by_packed = by_packed if is_hyper else None
+        return by_vertices, by_skull, by_rigidity, by_values, by_packed, *by_base, None, None
 
 
 def summed_at_nodes(lists: Touching, gradients: Float[Tensor, "N w"]) -> Float[Tensor, "M w"]:

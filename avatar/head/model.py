@@ -97,6 +97,14 @@ class HeadModel:
         """The identity without expression, joints at rest, in metres."""
         return self._identity_shape.clone()
 
+    def neck(self) -> tuple[Float[Tensor, 3], Float[Tensor, " V"]]:
+        """The joint of the identity's neck, metres, and which share of its turns each vertex takes."""
+        return self._identity_joints[NECK].clone(), self._carried(self._weights, NECK)
+
+    def _carried(self, weights: Float[Tensor, "R J"], joint: int) -> Float[Tensor, " R"]:
+        """How much of vertices with these weights hangs on a joint and on what it carries."""
+        return weights[:, [_follows(self._parents, j, joint) for j in range(len(self._parents))]].sum(dim=1)
+
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
         """The posed head in metres, world space (the root at identity; the head's pose is in the camera).
 
@@ -157,9 +165,7 @@ class HeadModel:
         shape = self._identity_shape[rows] + moved.unflatten(1, (-1, 3))
         pivot = self._identity_joints[JAW] + expression @ self._expression_joints[3 * JAW : 3 * JAW + 3, :E].T
         # All other transforms are the identity, so what the jaw carries turns about its joint and the rest stays.
-        carried = self._weights[rows][:, [_follows(self._parents, j, JAW) for j in range(len(self._parents))]].sum(
-            dim=1
-        )
+        carried = self._carried(self._weights[rows], JAW)
         return shape + carried[:, None] * ((shape - pivot[:, None]) @ turn.mT)
 
     def _joint_transforms(

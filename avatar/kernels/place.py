@@ -1,6 +1,7 @@
 """From the mesh and the network's values to Gaussians, in one launch, one lane for each Gaussian.
 
-What `Embedding.points`, `Interpolation`, `HyperHeads` and `compose_raw` do one after the other; they are the definition.
+What `Embedding.points`, `held`, `Interpolation`, `HyperHeads` and `compose_raw` do one after the other; they are the
+definition.
 """
 
 import triton
@@ -83,6 +84,8 @@ def place(
     vertices,
     corners,
     barycentric,
+    on_skull,
+    rigidity,
     nodes,
     cells,
     weights,
@@ -93,19 +96,23 @@ def place(
     count,
     latents,
     raw,
+    away,
     means,
     out_quats,
     scales,
     opacities,
     HAS_GRID: tl.constexpr,
     HAS_HYPER: tl.constexpr,
+    HAS_SKULL: tl.constexpr,
     SAVE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Write means, quats, scales and opacities of all Gaussians and, with SAVE, their ten raw offsets [N, 10].
+    """Write means, quats, scales and opacities of all Gaussians and, with SAVE, what the gradients take: their ten raw
+    offsets [N, 10] and, with HAS_SKULL, how far their points on the skull are `away` from those on the mesh [N, 3].
 
-    vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; nodes [M, latents] with cells int32 [N, 4] and weights
-    [N, 4], or, without HAS_GRID, [N, latents]; packed: see `hyper`. Without HAS_HYPER the network's values are the offsets.
+    vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; with HAS_SKULL, on_skull [N, 3] and rigidity [N];
+    nodes [M, latents] with cells int32 [N, 4] and weights [N, 4], or, without HAS_GRID, [N, latents]; packed: see `hyper`.
+    Without HAS_HYPER the network's values are the offsets.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -118,6 +125,13 @@ def place(
     else:
         o0, o1, o2, o3, o4, o5, o6, o7, o8, o9 = load10(nodes, i, here)
     x, y, z = point_on_mesh(vertices, corners, barycentric, i, here)
+    if HAS_SKULL:
+        a_x, a_y, a_z = load3(on_skull, i, here)
+        a_x, a_y, a_z = a_x - x, a_y - y, a_z - z
+        if SAVE:
+            store3(away, i, a_x, a_y, a_z, here)
+        share = tl.load(rigidity + i, mask=here, other=0.0)
+        x, y, z = x + share * a_x, y + share * a_y, z + share * a_z
     store3(means, i, x + tanh(o0), y + tanh(o1), z + tanh(o2), here)
     _, _, _, _, _, _, w, x, y, z, _, _ = turned(quats, i, tanh(o3), tanh(o4), tanh(o5), tanh(o6), here)
     store4(out_quats, i, w, x, y, z, here)

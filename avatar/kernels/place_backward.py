@@ -131,6 +131,7 @@ def place_backward(
     weights,
     packed,
     raw,
+    away,
     quats,
     log_scales,
     scales,
@@ -146,15 +147,18 @@ def place_backward(
     out_quats,
     out_log_scales,
     out_logits,
+    out_rigidity,
     HAS_GRID: tl.constexpr,
     HAS_HYPER: tl.constexpr,
+    HAS_SKULL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Write the gradients `out_...` of what `place` takes from those of what it gives.
 
-    raw float32 [N, 10]: the offsets that `place` saved;  out_values [N, latents]: of each Gaussian's own latent (without
-    HAS_HYPER: of its offsets, [N, 10]), before `gather_nodes` brings them to the nodes. Of the mesh's points the
-    gradient is that of the means. In `out_packed`, lanes that stand for no Gaussian are written too, with zeros.
+    raw float32 [N, 10] and, with HAS_SKULL, away [N, 3]: what `place` saved;  out_values [N, latents]: of each Gaussian's
+    own latent (without HAS_HYPER: of its offsets, [N, 10]), before `gather_nodes` brings them to the nodes. The gradient
+    of the means is that of the mesh's points, with HAS_SKULL of those and the skull's by their shares. In `out_packed`,
+    lanes that stand for no Gaussian are written too, with zeros.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -163,6 +167,9 @@ def place_backward(
     t5, t6, t7, t8, t9 = tanh(t5), tanh(t6), tanh(t7), tanh(t8), tanh(t9)
 
     by0, by1, by2 = load3(grad_means, i, here)
+    if HAS_SKULL:
+        a_x, a_y, a_z = load3(away, i, here)
+        tl.store(out_rigidity + i, by0 * a_x + by1 * a_y + by2 * a_z, mask=here)
     bw, bx, by, bz, inverse, is_long, tw, tx, ty, tz, turned_inverse, turned_is_long = turned(
         quats, i, t3, t4, t5, t6, here
     )

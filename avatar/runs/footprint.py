@@ -64,6 +64,8 @@ def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) ->
         shapes |= {"mesh_points.face": (N,), "mesh_points.place": (N, 3)}
     if config.name == "monogaussianavatar":
         shapes["count"] = ()
+    if config.rigidity and config.name not in ("splattingavatar", "monogaussianavatar"):
+        shapes["rigidity_logits"] = (N,)
     if config.name == "ndgs":
         shapes |= {"ndgs.mean": (3 + n, N), "ndgs.root": (triangle_size(n), N), "ndgs.cross": (3, n, N)}
     for name, m in HEADS.items():

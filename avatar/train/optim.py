@@ -24,6 +24,8 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
         {"params": [avatar.log_scales], "lr": rates.scale},
         {"params": [avatar.quats], "lr": rates.rotation},
     ]
+    if avatar.rigidity_logits is not None:
+        groups.append({"params": [avatar.rigidity_logits], "lr": rates.rigidity})
     if avatar.deformation is not None:
         groups.append({"params": list(avatar.deformation.parameters()), "lr": rates.mlp})
     if avatar.mesh_points is not None and avatar.mesh_points.place.requires_grad:

@@ -1,14 +1,17 @@
 // An avatar in memory and the WebAssembly module that draws it. Runs in a page, a worker and node; no DOM.
 
-export const MAGIC = "AVW1";
+export const MAGIC = "AVW2";
+const EARLIER = "AVW1"; // without `rigidity`
 // The arrays that the module takes, in its order (avatar/csrc/web/portrait.h).
 const ARRAYS = [
   "shape", "expression_dirs", "pose_dirs", "weights", "eyelid_dirs", "joints_at_rest", "expression_joints", "barycentric",
   "of_code", "for_condition", "input_bias", "hidden_weights", "hidden_biases", "output_weights", "output_bias",
   "grid_weights", "head_matrix", "head_bias", "quats", "log_scales", "opacity_logits", "sh",
+  "rigidity",
 ];
 const SIZES = [
   "vertices", "expressions", "gaussians", "nodes", "latent", "width", "layers", "coefficients", "has_grid", "has_heads",
+  "has_rigidity",
 ];
 const TYPES = { f4: Float32Array, i2: Int16Array, i1: Int8Array, u4: Uint32Array, u2: Uint16Array };
 const MAX_BYTES = 2 ** 28; // of an unpacked file
@@ -44,7 +47,7 @@ export async function unpack(bytes) {
 export function parse(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const magic = new TextDecoder().decode(bytes.subarray(0, 4));
-  if (magic !== MAGIC) throw new AvatarError(`This is not an avatar of this viewer (it begins with “${printable(magic)}”).`);
+  if (magic !== MAGIC && magic !== EARLIER) throw new AvatarError(`This is not an avatar of this viewer (it begins with “${printable(magic)}”).`);
   const length = bytes.byteLength >= 8 ? view.getUint32(4, true) : 0;
   if (length === 0 || 8 + length > bytes.byteLength) throw new AvatarError("The avatar file is cut short.");
   let header;
@@ -63,6 +66,11 @@ export function parse(bytes) {
     // Copied, so that it is aligned whatever the file's own offset is.
     const data = bytes.slice(start + offset, start + offset + count * type.BYTES_PER_ELEMENT);
     arrays.set(name, new type(data.buffer));
+  }
+  if (magic === EARLIER && header?.sizes) {
+    header.sizes.has_rigidity = 0;
+    header.arrays.rigidity = {};
+    arrays.set("rigidity", new Float32Array(0));
   }
   check(header, arrays);
   return { header, arrays };

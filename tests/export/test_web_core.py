@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,7 @@ MODELS = {
     "no view dependence": ("model.sh_degree=0",),
     "covariance": ("model=covariance",),
     "detail": ("model.uv_detail=2",),
+    "rigidity": ("model.rigidity=true",),
 }
 
 
@@ -46,16 +49,23 @@ def described(camera: Camera) -> dict[str, object]:
 
 
 def chosen_frames(trained: TrainedAvatar) -> list[tuple[HeadParams, Camera]]:
-    """Frames of the video, some of them seen from beside, from above and from near."""
+    """Frames of the video, some of them seen from beside, from above and from near, every other one with a turned neck."""
     recording, frames = trained.recording, []
     for i in range(20):
         camera = recording.camera(i, SIZE)
-        frames.append((recording.params(i), orbited(camera, 4.0 * (i % 5) - 8, 3.0 * (i % 3), 1.0 + 0.2 * (i % 2))))
+        params = recording.params(i)
+        if i % 2:
+            params = replace(params, neck=torch.tensor([1.0, -0.1, 0.3, 0.1, 1.0, 0.0]))
+        frames.append((params, orbited(camera, 4.0 * (i % 5) - 8, 3.0 * (i % 3), 1.0 + 0.2 * (i % 2))))
     return frames
 
 
 def drawn_by_node(trained: TrainedAvatar, precision: str, folder: Path) -> torch.Tensor:
     write_web_avatar(trained, folder / "a.avatar", precision)  # type: ignore[arg-type]
+    return pictures_of_node(trained, folder)
+
+
+def pictures_of_node(trained: TrainedAvatar, folder: Path) -> torch.Tensor:
     frames = [
         {"parameters": parameters(p, trained), "camera": described(c), "width": c.width, "height": c.height}
         for p, c in chosen_frames(trained)
@@ -80,6 +90,20 @@ def test_webassembly_draws_the_same_pictures(model: str, tracked_folder: Path, t
     assert psnr(truth[0], truth[1]) < 30, "frames differ"
     picture = drawn_by_node(trained, "float", tmp_path)
     assert min(psnr(a, b) for a, b in zip(picture, truth, strict=True)) > 60
+
+
+def test_files_from_before_rigidity_are_drawn_as_they_were(tracked_folder: Path, tmp_path: Path) -> None:
+    trained = lively_avatar(tracked_folder, tmp_path / "run", "model.rigidity=false")
+    now = drawn_by_node(trained, "float", tmp_path)
+    raw = gzip.decompress((tmp_path / "a.avatar").read_bytes())
+    length = int.from_bytes(raw[4:8], "little")
+    header = json.loads(raw[8 : 8 + length])
+    del header["sizes"]["has_rigidity"], header["arrays"]["rigidity"]
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    earlier = b"".join((b"AVW1", len(text).to_bytes(4, "little"), text, raw[8 + length :]))
+    (tmp_path / "a.avatar").write_bytes(gzip.compress(earlier))
+    assert (pictures_of_node(trained, tmp_path) == now).all()
 
 
 def test_opacities_that_change_are_refused_in_a_sentence(tracked_folder: Path, tmp_path: Path) -> None:

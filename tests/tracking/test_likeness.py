@@ -133,7 +133,7 @@ def test_the_gradient_is_the_slope(likeness: Likeness, clip: Clip, monkeypatch: 
     found = likeness.fit(values, pose, target)
     assert found.misfit == pytest.approx(likeness.measure(values, pose, target).misfit, rel=1e-5)
     # Turns out of the picture's plane also change which splat is in front of which, in jumps.
-    for k, length in ((2, 1e-3), (3, 2e-4), (4, 2e-4), (5, 2e-4), (9, 3e-4), (20, 1e-3), (21, 1e-3)):
+    for k, length in ((2, 1e-3), (3, 2e-4), (4, 2e-4), (5, 2e-4), (9, 1e-4), (20, 1e-3), (21, 1e-3)):
         step = torch.zeros(VALUES)
         step[k] = length
         high, low = (likeness.measure(values + sign * step, pose, target).misfit for sign in (1, -1))

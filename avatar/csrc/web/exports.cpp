@@ -34,13 +34,15 @@ extern "C" {
 
 // 0 when the sizes are absurd. Takes no memory: a caller compares the lengths with what it has before it allocates.
 EMSCRIPTEN_KEEPALIVE int avatar_measure(int vertices, int expressions, int gaussians, int nodes, int latent, int width,
-                                        int layers, int coefficients, int has_grid, int has_heads) {
+                                        int layers, int coefficients, int has_grid, int has_heads,
+                                        int has_rigidity) {
     for (const int size : {vertices, gaussians, nodes, latent, width, layers, coefficients})
         if (size < 1 || size > 1 << 20) return 0;
     const bool is_square = coefficients == 1 || coefficients == 4 || coefficients == 9 || coefficients == 16;
     if (expressions < 0 || expressions > 4096 || !is_square || (!has_heads && latent != 10)) return 0;
     if (!has_grid && nodes != gaussians) return 0;
-    measured = {vertices, expressions, gaussians, nodes, latent, width, layers, coefficients, has_grid, has_heads};
+    measured = {vertices, expressions, gaussians, nodes, latent, width, layers, coefficients,
+                has_grid, has_heads, has_rigidity};
     avatar::web::array_lengths(measured, lengths);
     return 1;
 }

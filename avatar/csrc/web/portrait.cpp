@@ -17,10 +17,6 @@ void add_scaled(std::vector<float>& y, const float* x, float a) {
     for (std::size_t i = 0; i < count; ++i) to[i] += a * x[i];
 }
 
-struct Rotation {
-    float m[9];
-};
-
 // The first two rows, made orthonormal, and their cross product: matrix_from_6d of avatar/head/model.py.
 Rotation rotation_from_6d(const float* v) {
     Rotation r{};
@@ -55,7 +51,8 @@ void array_lengths(const Sizes& s, std::int64_t lengths[kArrays]) {
     const std::int64_t values[kArrays] = {
         V * 3, E * V * 3, kPoseValues * V * 3, V * kJoints, kEyelids * V * 3, kJoints * 3, E * kJoints * 3, G * 3,
         M * W, condition_count(s) * W, W, H * W * W, H * W, W * s.latent, s.latent, s.has_grid ? G * 4 : 0,
-        s.has_heads ? G * s.latent * kOffsets : 0, s.has_heads ? G * kOffsets : 0, G * 4, G * 3, G, G * s.coefficients * 3};
+        s.has_heads ? G * s.latent * kOffsets : 0, s.has_heads ? G * kOffsets : 0, G * 4, G * 3, G, G * s.coefficients * 3,
+        s.has_rigidity ? G : 0};
     std::copy(values, values + kArrays, lengths);
 }
 
@@ -155,6 +152,37 @@ void Portrait::skin() {
             for (int k = 0; k < 3; ++k) sum += barycentric[3 * g + k] * posed_[3 * corners_[3 * g + k] + i];
             points_[3 * g + i] = sum;
         }
+    if (sizes_.has_rigidity) hold(own[kNeckJoint]);
+}
+
+// Brings the points to the skull by their shares, as avatar/gaussians/rigidity.py. `turn` is the neck's.
+void Portrait::hold(const Rotation& turn) {
+    bool carried[kJoints] = {};
+    for (int joint = kNeckJoint; joint < kJoints; ++joint)
+        carried[joint] = joint == kNeckJoint || (parents[joint] >= 0 && carried[parents[joint]]);
+    const float *barycentric = arrays_[kBarycentric].data(), *shape = arrays_[kShape].data(),
+                *weights = arrays_[kWeights].data(), *pivot = arrays_[kJointsAtRest].data() + 3 * kNeckJoint;
+    for (std::int64_t g = 0; g < sizes_.gaussians; ++g) {
+        float at_rest[3] = {}, arm[3] = {};
+        for (int k = 0; k < 3; ++k) {
+            const float b = barycentric[3 * g + k];
+            const std::int64_t v = corners_[3 * g + k];
+            float share = 0;
+            for (int joint = 0; joint < kJoints; ++joint)
+                if (carried[joint]) share += weights[v * kJoints + joint];
+            for (int i = 0; i < 3; ++i) {
+                at_rest[i] += b * shape[3 * v + i];
+                arm[i] += b * share * (shape[3 * v + i] - pivot[i]);
+            }
+        }
+        const float rigidity = arrays_[kRigidity][g];
+        for (int i = 0; i < 3; ++i) {
+            float on_skull = at_rest[i];
+            for (int k = 0; k < 3; ++k)
+                on_skull += (turn.m[3 * i + k] - (i == k ? 1.0f : 0.0f)) * arm[k];
+            points_[3 * g + i] += rigidity * (on_skull - points_[3 * g + i]);
+        }
+    }
 }
 
 // As FoldedNetwork in avatar/render.py.

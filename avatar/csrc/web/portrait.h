@@ -9,7 +9,7 @@
 // program's own.
 namespace avatar::web {
 
-constexpr int kJoints = 5, kPoseValues = 9 * (kJoints - 1), kOffsets = 10, kJaw = 6, kEyes = 12, kEyelids = 2, kNeck = 6;
+constexpr int kJoints = 5, kNeckJoint = 1, kPoseValues = 9 * (kJoints - 1), kOffsets = 10, kJaw = 6, kEyes = 12, kEyelids = 2, kNeck = 6;
 
 struct Sizes {
     std::int32_t vertices, expressions, gaussians;
@@ -17,7 +17,7 @@ struct Sizes {
     std::int32_t latent;        // values that the network gives; 10 where there are no HyperGaussians
     std::int32_t width, layers; // of the network
     std::int32_t coefficients;  // of the colour
-    std::int32_t has_grid, has_heads;
+    std::int32_t has_grid, has_heads, has_rigidity;
 };
 
 // What moves the head in a frame, as HeadParams, in one array: expression, jaw, eyes, eyelids, neck.
@@ -48,7 +48,12 @@ enum Array {
     kLogScales,          // [G * 3]
     kOpacityLogits,      // [G]
     kSh,                 // [G * K * 3]
+    kRigidity,           // [G] the share of each Gaussian that keeps with the skull
     kArrays
+};
+
+struct Rotation {
+    float m[9];
 };
 
 // How many values each array has. The sizes may be any that fit into 20 bits, without memory being taken.
@@ -86,6 +91,7 @@ public:
 
 private:
     void skin();
+    void hold(const Rotation& turn);
     void evaluate_network();
     void offset();
 

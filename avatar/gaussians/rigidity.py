@@ -1,0 +1,53 @@
+"""Gaussians that keep with the skull in place of the skin that they are bound to, each by a share that is learned.
+
+A FLAME-format mesh is skin and eyeballs. Glasses, hair and the upper teeth are drawn by Gaussians of the skin beside them,
+but do not move with it. With w = sigmoid(logit) of each Gaussian, learned like its opacity, its place is
+
+    point = (1 - w) * (its point on the posed mesh) + w * (its point on the skull)
+
+before the network's offset. The skull is the identity at rest, turned by the neck alone: of the expression, the jaw, the
+eyes and the eyelids it knows nothing.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.compute.device import brought
+from avatar.gaussians.embedding import Embedding
+from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.types import IDENTITY_6D
+
+INITIAL_LOGIT = -2.0  # 12 % of the skull: enough of its gradient to find out
+
+
+class Skull:
+    """Where the points of an embedding are on the skull; not a parameter."""
+
+    def __init__(self, embedding: Embedding, head: HeadModel) -> None:
+        joint, shares = head.neck()
+        neutral = head.neutral_vertices()
+        self.at_rest: Float[Tensor, "N 3"] = embedding.points(neutral)
+        # What the neck turns, from its joint: (turn - 1) of it is how far a point goes.
+        self.arms: Float[Tensor, "N 3"] = embedding.points(shares[:, None] * (neutral - joint))
+
+    def points(self, neck: Float[Tensor, 6]) -> Float[Tensor, "N 3"]:
+        """On the skull turned by `neck`, a 6D rotation, metres; differentiable. On a GPU nothing is read back."""
+        device = self.at_rest.device
+        if neck.is_cpu and not neck.requires_grad and tuple(neck.tolist()) == IDENTITY_6D:
+            return self.at_rest
+        turn = matrix_from_6d(brought(neck, device).to(self.at_rest.dtype)) - torch.eye(3, device=device)
+        return torch.addmm(self.at_rest, self.arms, turn.T)
+
+    def move(self, device: torch.device) -> None:
+        if self.arms.device != device:
+            self.at_rest, self.arms = self.at_rest.to(device), self.arms.to(device)
+
+
+def held(
+    points: Float[Tensor, "N 3"], on_skull: Float[Tensor, "N 3"], rigidity: Float[Tensor, " N"]
+) -> Float[Tensor, "N 3"]:
+    """`points` of the posed mesh, each brought to the skull by its share `rigidity`, in [0, 1]."""
+    return torch.lerp(points, on_skull, rigidity[:, None])
