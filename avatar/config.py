@@ -66,7 +66,6 @@ class LearningRates:
     rotation: float
     mlp: float
     hyper: float
-    rigidity: float = 0.05
 
 
 @dataclass

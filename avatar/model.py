@@ -20,7 +20,7 @@ from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
 from avatar.gaussians.mesh_points import MeshPoints
 from avatar.gaussians.ndgs import NdGaussians
-from avatar.gaussians.rigidity import INITIAL_LOGIT, Skull, held
+from avatar.gaussians.rigidity import INITIAL_LOGIT, Hold, Skull, held
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, PoseTensors
@@ -85,7 +85,7 @@ class Avatar(nn.Module):
         self.skull: Skull | None = None
         self.rigidity_logits: nn.Parameter | None = None
         if config.rigidity and self.mesh_points is None:
-            self.skull = Skull(self.embedding, self.head)
+            self.skull = Skull.of(self.head, self.embedding)
             self.rigidity_logits = nn.Parameter(torch.full((N,), INITIAL_LOGIT))
 
         initial_scale = torch.log(torch.cat((knn_scales(neutral[:alive]), knn_scales(neutral)[alive:])))
@@ -115,8 +115,7 @@ class Avatar(nn.Module):
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
             grid = None if self.grid is None else self.grid.interpolate
-            on_skull = None if self.skull is None else self.skull.points(params.neck)
-            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid, on_skull, self.rigidity)
+            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid, self.hold(params))
         if self.grid is not None:
             values = self.grid.interpolate(values)
         points = self.points(vertices, params)
@@ -140,13 +139,13 @@ class Avatar(nn.Module):
         """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""
         if self.mesh_points is not None:
             return self.living(self.mesh_points.points(vertices))
-        return self.held(self.embedding.points(vertices), params)
+        return held(self.embedding.points(vertices), self.hold(params))
 
-    def held(self, points: Float[Tensor, "N 3"], params: HeadParams) -> Float[Tensor, "N 3"]:
-        """Points of the mesh posed by `params`, each brought to the skull by its share."""
-        if self.skull is None or self.rigidity is None:
-            return points
-        return held(points, self.skull.points(params.neck), self.rigidity)
+    def hold(self, params: HeadParams) -> Hold | None:
+        """What brings the Gaussians' points to the skull in a frame."""
+        if self.skull is None or self.rigidity_logits is None:
+            return None
+        return Hold(self.skull, params.neck, self.rigidity_logits)
 
     @property
     def rigidity(self) -> Float[Tensor, " N"] | None:

@@ -25,7 +25,7 @@ from avatar.errors import UserError
 from avatar.gaussians.compose import compose_carried, compose_raw, compose_slice
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.ndgs import Slice
-from avatar.gaussians.rigidity import held
+from avatar.gaussians.rigidity import Hold, held
 from avatar.model import Avatar
 from avatar.splat import CannotDraw, splat
 from avatar.splat.capacity import with_room
@@ -51,8 +51,7 @@ class Renderer:
         self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
         self._packed = avatar.packed.detach().clone() if self._on_gpu and avatar.packed is not None else None
         self._ndgs, self._mesh_points = deepcopy(avatar.ndgs), deepcopy(avatar.mesh_points)
-        self._skull, logits = avatar.skull, avatar.rigidity_logits
-        self._rigidity = None if logits is None else torch.sigmoid(logits.detach())
+        self._rigidity_logits = deepcopy(avatar.rigidity_logits)
         names = ("quats", "log_scales", "opacity_logits", "sh")
         self._base = {name: value.detach().clone() for name, value in zip(names, avatar.base(), strict=True)}
 
@@ -75,8 +74,7 @@ class Renderer:
                 **self._base,
                 embedding=avatar.embedding,
                 grid=None if grid is None else grid.interpolate,
-                on_skull=None if self._skull is None else self._skull.points(params.neck),
-                rigidity=self._rigidity,
+                hold=self._hold(params),
             )
         return self.place(self.points(self.vertices(params), params), self.offsets(self.latents(params)))
 
@@ -142,9 +140,11 @@ class Renderer:
             return self._mesh_points.points(vertices)[: len(self._base["quats"])]
         embedding = self._avatar.embedding
         points = embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
-        if self._skull is None or self._rigidity is None:
-            return points
-        return held(points, self._skull.points(params.neck), self._rigidity)
+        return held(points, self._hold(params))
+
+    def _hold(self, params: HeadParams) -> Hold | None:
+        hold = self._avatar.hold(params)
+        return None if hold is None or self._rigidity_logits is None else hold._replace(logits=self._rigidity_logits)
 
     def latents(self, params: HeadParams) -> Float[Tensor, "N n"]:
         """The network's output for each Gaussian. Raises ValueError for an avatar without a network."""

@@ -56,7 +56,7 @@ def test_the_papers_networks_have_the_papers_sizes(width: int, layers: int, publ
 def test_the_default_is_the_best_preset_of_the_papers_model() -> None:
     config, paper = load_config(), load_config(["preset=paper"])
     assert config == load_config(["preset=best"]) == load_config(["experiment=best"])
-    assert config.model.latent_grid == 16 and config.trainer.initial_colours == "frames"
+    assert config.model.latent_grid == 8 and config.trainer.initial_colours == "frames"
     assert (config.model.latent_dim, config.model.uv_size) == (paper.model.latent_dim, paper.model.uv_size)
     assert load_config(["preset=fast", "model.latent_grid=null"]).model.latent_grid is None
 
@@ -64,6 +64,7 @@ def test_the_default_is_the_best_preset_of_the_papers_model() -> None:
 def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
     ours, fast = flatten(load_config().to_dict()), flatten(load_config(["preset=fast"]).to_dict())
     assert {key: value for key, value in ours.items() if value != fast[key]} == {
+        "model.latent_grid": 8,
         "model.uv_detail": 2,
         "model.rigidity": True,
         "trainer.iterations": 4000,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.deformation import DeformationMLP
+from avatar.gaussians.rigidity import held
 from avatar.losses.photometric import PhotometricLoss
 from avatar.model import Avatar
 from avatar.train.optim import schedule, set_rates
@@ -72,10 +72,10 @@ class StagedStep:
             heads = avatar.hyper
             (raw,) = self._forward("heads", lambda z: (heads(z),), [raw], list(heads.parameters()))
         base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
-        held = partial(avatar.held, points, frame.params)
+        hold = avatar.hold(frame.params)
         gaussians = self._forward(
             "compose",
-            lambda z: compose_raw(held(), *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
+            lambda z: compose_raw(held(points, hold), *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
             [raw],
             base if avatar.rigidity_logits is None else [*base, avatar.rigidity_logits],
         )

@@ -9,7 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from avatar.compute.device import brought
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
+from avatar.gaussians.rigidity import Hold
+from avatar.head.model import matrix_from_6d
 from avatar.kernels.place import place
 from avatar.kernels.place_backward import gather_nodes, place_backward
 from avatar.kernels.start import start
@@ -40,12 +43,11 @@ def place_gpu(
     sh: Float[Tensor, "N K 3"],
     embedding: Mesh,
     grid: Interpolation | None,
-    on_skull: Float[Tensor, "N 3"] | None = None,
-    rigidity: Float[Tensor, " N"] | None = None,
+    hold: Hold | None = None,
 ) -> Gaussians:
     """`compose_raw` of the embedding's points and of the network's `values`, in one launch. Float32 tensors on one GPU.
 
-    on_skull, rigidity  where the points are on the skull and by which share they go there (`held`), or neither
+    hold  what brings the points to the skull (`held`), if anything does
     The values are brought from the grid's nodes to the Gaussians if there is a grid, and through the HyperGaussians
     `packed` if there are any.
 
@@ -62,12 +64,13 @@ def place_gpu(
         raise ValueError(f"packed must have shape {list(packed_shape(N, n))}, got {list(packed.shape)}")
     if packed is None and grid is not None:
         raise ValueError("offsets are not smooth over the map: there is no grid without HyperGaussians")
-    if (on_skull is None) != (rigidity is None):
-        raise ValueError("on_skull and rigidity are given together or not at all")
-    if on_skull is not None and rigidity is not None:
-        check_shapes(quats=(quats, "N 4"), on_skull=(on_skull, "N 3"), rigidity=(rigidity, "N"))
-    given = (vertices, on_skull, rigidity, values, packed, quats, log_scales, opacity_logits)
-    placed: Any = _Place.apply(*given, embedding, grid)
+    skull = neck = logits = None
+    if hold is not None:
+        skull, logits, neck = hold.skull, hold.logits, brought(hold.neck, quats.device)
+        check_shapes(quats=(quats, "N 4"), at_rest=(skull.at_rest, "N 3"), arms=(skull.arms, "N 3"))
+        check_shapes(quats=(quats, "N 4"), neck=(neck, "6"), rigidity_logits=(logits, "N"))
+    given = (vertices, neck, logits, values, packed, quats, log_scales, opacity_logits)
+    placed: Any = _Place.apply(*given, embedding, grid, skull)
     means, turned, scales, opacities = placed
     return Gaussians(means, turned, scales, opacities, sh)
 
@@ -75,10 +78,10 @@ def place_gpu(
 class _Place(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *given, embedding, grid = arguments
+        *given, embedding, grid, skull = arguments
         tensors: list[Any] = [None if t is None else t.detach().contiguous() for t in given]
-        vertices, on_skull, rigidity, values, packed, quats, log_scales, opacity_logits = tensors
-        N, n, has_skull = len(quats), values.shape[1], on_skull is not None
+        vertices, neck, logits, values, packed, quats, log_scales, opacity_logits = tensors
+        N, n, has_skull = len(quats), values.shape[1], skull is not None
         is_hyper, saves = packed is not None, any(ctx.needs_input_grad)
         raw = torch.empty((N, 10), dtype=torch.float32, device=quats.device) if is_hyper and saves else values
         away = torch.empty_like(log_scales) if has_skull and saves else log_scales
@@ -90,8 +93,10 @@ class _Place(torch.autograd.Function):
             vertices,
             embedding.corners,
             embedding.barycentric,
-            on_skull if has_skull else vertices,
-            rigidity if has_skull else vertices,
+            skull.at_rest if has_skull else vertices,
+            skull.arms if has_skull else vertices,
+            neck if has_skull else vertices,
+            logits if has_skull else vertices,
             values,
             cells,
             weights,
@@ -111,20 +116,20 @@ class _Place(torch.autograd.Function):
             SAVE=saves,
             BLOCK=LANES,
         )
-        ctx.embedding, ctx.grid, ctx.num_vertices = embedding, grid, len(vertices)
-        ctx.save_for_backward(values, packed, raw, away, rigidity, quats, log_scales, placed[2], placed[3])
+        ctx.embedding, ctx.grid, ctx.skull, ctx.num_vertices = embedding, grid, skull, len(vertices)
+        ctx.save_for_backward(values, packed, raw, away, neck, logits, quats, log_scales, placed[2], placed[3])
         return tuple(placed)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Any, ...] = ctx.saved_tensors
-        values, packed, raw, away, rigidity, quats, log_scales, scales, opacities = saved
+        values, packed, raw, away, neck, logits, quats, log_scales, scales, opacities = saved
         grid: Interpolation | None = ctx.grid
         by_means, by_quats, by_scales, by_opacities = (gradient.contiguous() for gradient in upstream)
-        N, n, is_hyper, has_skull = len(quats), values.shape[1], packed is not None, rigidity is not None
+        N, n, is_hyper, has_skull = len(quats), values.shape[1], packed is not None, logits is not None
         own = values if grid is None else values.new_empty(N, n)  # the shape of each Gaussian's own values
-        like = (own, packed if is_hyper else own, quats, log_scales, opacities, rigidity if has_skull else opacities)
+        like = (own, packed if is_hyper else own, quats, log_scales, opacities, opacities)
         gradients = [torch.empty_like(t) for t in like]
         cells, weights = (values, values) if grid is None else grid.corners
         start(
@@ -136,6 +141,7 @@ class _Place(torch.autograd.Function):
             packed if is_hyper else values,
             raw,
             away,
+            logits if has_skull else values,
             quats,
             log_scales,
             scales,
@@ -153,19 +159,27 @@ class _Place(torch.autograd.Function):
             HAS_SKULL=has_skull,
             BLOCK=LANES,
         )
-        by_values, by_packed, *by_base, by_rigidity = gradients
+        by_values, by_packed, *by_base, by_logits = gradients
         if grid is not None:
             by_values = summed_at_nodes(grid.touching, by_values)
-        by_vertices = by_skull = None
-        needs_vertices, needs_skull = ctx.needs_input_grad[:2]
-        if has_skull and needs_skull:
-            by_skull = by_means * rigidity[:, None]
+        by_vertices = by_neck = None
+        needs_vertices, needs_neck = ctx.needs_input_grad[:2]
+        on_skull = by_means * torch.sigmoid(logits)[:, None] if has_skull and (needs_vertices or needs_neck) else None
+        if on_skull is not None and needs_neck:
+            by_neck = _neck_gradient(neck, on_skull.T @ ctx.skull.arms)
         if needs_vertices:
-            by_points = by_means * (1.0 - rigidity[:, None]) if has_skull else by_means
-            by_vertices = summed_at_nodes(ctx.embedding.touching(ctx.num_vertices), by_points)
-        by_rigidity = by_rigidity if has_skull else None
+            on_mesh = by_means if on_skull is None else by_means - on_skull
+            by_vertices = summed_at_nodes(ctx.embedding.touching(ctx.num_vertices), on_mesh)
+        by_logits = by_logits if has_skull else None
         by_packed = by_packed if is_hyper else None
-        return by_vertices, by_skull, by_rigidity, by_values, by_packed, *by_base, None, None
+        return by_vertices, by_neck, by_logits, by_values, by_packed, *by_base, None, None, None
+
+
+def _neck_gradient(neck: Float[Tensor, 6], by_turn: Float[Tensor, "3 3"]) -> Float[Tensor, 6]:
+    with torch.enable_grad():
+        leaf = neck.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(matrix_from_6d(leaf), leaf, by_turn)
+    return gradient
 
 
 def summed_at_nodes(lists: Touching, gradients: Float[Tensor, "N w"]) -> Float[Tensor, "M w"]:

@@ -11,6 +11,9 @@ eyes and the eyelids it knows nothing.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,15 +26,18 @@ from avatar.types import IDENTITY_6D
 INITIAL_LOGIT = -2.0  # 12 % of the skull: enough of its gradient to find out
 
 
+@dataclass
 class Skull:
     """Where the points of an embedding are on the skull; not a parameter."""
 
-    def __init__(self, embedding: Embedding, head: HeadModel) -> None:
+    at_rest: Float[Tensor, "N 3"]  # metres
+    arms: Float[Tensor, "N 3"]  # what the neck turns, from its joint, metres: a turn R moves a point by (R - 1) arm
+
+    @staticmethod
+    def of(head: HeadModel, embedding: Embedding) -> Skull:
         joint, shares = head.neck()
         neutral = head.neutral_vertices()
-        self.at_rest: Float[Tensor, "N 3"] = embedding.points(neutral)
-        # What the neck turns, from its joint: (turn - 1) of it is how far a point goes.
-        self.arms: Float[Tensor, "N 3"] = embedding.points(shares[:, None] * (neutral - joint))
+        return Skull(embedding.points(neutral), embedding.points(shares[:, None] * (neutral - joint)))
 
     def points(self, neck: Float[Tensor, 6]) -> Float[Tensor, "N 3"]:
         """On the skull turned by `neck`, a 6D rotation, metres; differentiable. On a GPU nothing is read back."""
@@ -46,8 +52,16 @@ class Skull:
             self.at_rest, self.arms = self.at_rest.to(device), self.arms.to(device)
 
 
-def held(
-    points: Float[Tensor, "N 3"], on_skull: Float[Tensor, "N 3"], rigidity: Float[Tensor, " N"]
-) -> Float[Tensor, "N 3"]:
-    """`points` of the posed mesh, each brought to the skull by its share `rigidity`, in [0, 1]."""
-    return torch.lerp(points, on_skull, rigidity[:, None])
+class Hold(NamedTuple):
+    """What holds points in a frame."""
+
+    skull: Skull
+    neck: Float[Tensor, 6]
+    logits: Float[Tensor, " N"]  # of the shares that keep with the skull
+
+
+def held(points: Float[Tensor, "N 3"], by: Hold | None) -> Float[Tensor, "N 3"]:
+    """`points` of the posed mesh, each brought to the skull by its share. Differentiable."""
+    if by is None:
+        return points
+    return torch.lerp(points, by.skull.points(by.neck), torch.sigmoid(by.logits)[:, None])

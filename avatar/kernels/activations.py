@@ -19,6 +19,11 @@ def tanh(x):
 
 
 @triton.jit
+def sigmoid(x):
+    return 1.0 / (1.0 + tl.exp(-x))
+
+
+@triton.jit
 def tanh_slope(y):
     """The derivative of tanh where its value is y."""
     return (1.0 - y) * (1.0 + y)

@@ -7,7 +7,7 @@ definition.
 import triton
 import triton.language as tl
 
-from avatar.kernels.activations import normalized, product, tanh
+from avatar.kernels.activations import normalized, product, sigmoid, tanh
 from avatar.kernels.hyper import (
     CONSTANTS,
     DIMENSION,
@@ -20,6 +20,7 @@ from avatar.kernels.hyper import (
     solve3_upper,
     solve4_upper,
 )
+from avatar.kernels.pose import matrix_of_6d, rotated
 from avatar.kernels.rows import load3, load4, load10, store3, store4, store10
 
 
@@ -84,8 +85,10 @@ def place(
     vertices,
     corners,
     barycentric,
-    on_skull,
-    rigidity,
+    at_rest,
+    arms,
+    neck,
+    rigidity_logits,
     nodes,
     cells,
     weights,
@@ -110,7 +113,8 @@ def place(
     """Write means, quats, scales and opacities of all Gaussians and, with SAVE, what the gradients take: their ten raw
     offsets [N, 10] and, with HAS_SKULL, how far their points on the skull are `away` from those on the mesh [N, 3].
 
-    vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; with HAS_SKULL, on_skull [N, 3] and rigidity [N];
+    vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; with HAS_SKULL, at_rest and arms [N, 3] of the skull, the
+    6D rotation `neck` that turns it and rigidity_logits [N];
     nodes [M, latents] with cells int32 [N, 4] and weights [N, 4], or, without HAS_GRID, [N, latents]; packed: see `hyper`.
     Without HAS_HYPER the network's values are the offsets.
     """
@@ -126,11 +130,14 @@ def place(
         o0, o1, o2, o3, o4, o5, o6, o7, o8, o9 = load10(nodes, i, here)
     x, y, z = point_on_mesh(vertices, corners, barycentric, i, here)
     if HAS_SKULL:
-        a_x, a_y, a_z = load3(on_skull, i, here)
-        a_x, a_y, a_z = a_x - x, a_y - y, a_z - z
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = matrix_of_6d(neck)
+        a_x, a_y, a_z = load3(arms, i, here)
+        a_x, a_y, a_z = rotated(r0 - 1.0, r1, r2, r3, r4 - 1.0, r5, r6, r7, r8 - 1.0, a_x, a_y, a_z)
+        n_x, n_y, n_z = load3(at_rest, i, here)
+        a_x, a_y, a_z = n_x + a_x - x, n_y + a_y - y, n_z + a_z - z
         if SAVE:
             store3(away, i, a_x, a_y, a_z, here)
-        share = tl.load(rigidity + i, mask=here, other=0.0)
+        share = sigmoid(tl.load(rigidity_logits + i, mask=here, other=0.0))
         x, y, z = x + share * a_x, y + share * a_y, z + share * a_z
     store3(means, i, x + tanh(o0), y + tanh(o1), z + tanh(o2), here)
     _, _, _, _, _, _, w, x, y, z, _, _ = turned(quats, i, tanh(o3), tanh(o4), tanh(o5), tanh(o6), here)
@@ -138,4 +145,4 @@ def place(
     s0, s1, s2 = load3(log_scales, i, here)
     s0, s1, s2 = s0 * tl.exp(tanh(o7)), s1 * tl.exp(tanh(o8)), s2 * tl.exp(tanh(o9))
     store3(scales, i, tl.exp(s0), tl.exp(s1), tl.exp(s2), here)
-    tl.store(opacities + i, 1.0 / (1.0 + tl.exp(-tl.load(opacity_logits + i, mask=here, other=0.0))), mask=here)
+    tl.store(opacities + i, sigmoid(tl.load(opacity_logits + i, mask=here, other=0.0)), mask=here)

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from avatar.kernels.activations import normalized_backward, product, tanh, tanh_slope
+from avatar.kernels.activations import normalized_backward, product, sigmoid, tanh, tanh_slope
 from avatar.kernels.hyper import (
     CONSTANTS,
     DIMENSION,
@@ -132,6 +132,7 @@ def place_backward(
     packed,
     raw,
     away,
+    rigidity_logits,
     quats,
     log_scales,
     scales,
@@ -147,7 +148,7 @@ def place_backward(
     out_quats,
     out_log_scales,
     out_logits,
-    out_rigidity,
+    out_rigidity_logits,
     HAS_GRID: tl.constexpr,
     HAS_HYPER: tl.constexpr,
     HAS_SKULL: tl.constexpr,
@@ -169,7 +170,9 @@ def place_backward(
     by0, by1, by2 = load3(grad_means, i, here)
     if HAS_SKULL:
         a_x, a_y, a_z = load3(away, i, here)
-        tl.store(out_rigidity + i, by0 * a_x + by1 * a_y + by2 * a_z, mask=here)
+        share = sigmoid(tl.load(rigidity_logits + i, mask=here, other=0.0))
+        by_share = by0 * a_x + by1 * a_y + by2 * a_z
+        tl.store(out_rigidity_logits + i, by_share * share * (1.0 - share), mask=here)
     bw, bx, by, bz, inverse, is_long, tw, tx, ty, tz, turned_inverse, turned_is_long = turned(
         quats, i, t3, t4, t5, t6, here
     )

@@ -11,7 +11,7 @@ FEATURES = tl.constexpr(36)  # four rotations minus the identity
 
 
 @triton.jit
-def _matrix(rotation):
+def matrix_of_6d(rotation):
     """6D rotation (the first two rows) -> matrix, made orthonormal by Gram-Schmidt."""
     a0, a1, a2 = tl.load(rotation), tl.load(rotation + 1), tl.load(rotation + 2)
     b0, b1, b2 = tl.load(rotation + 3), tl.load(rotation + 4), tl.load(rotation + 5)
@@ -42,7 +42,7 @@ def _joint(identity_joints, directions, weights, joint: tl.constexpr, stride, e,
 
 
 @triton.jit
-def _rotated(r0, r1, r2, r3, r4, r5, r6, r7, r8, x, y, z):
+def rotated(r0, r1, r2, r3, r4, r5, r6, r7, r8, x, y, z):
     return r0 * x + r1 * y + r2 * z, r3 * x + r4 * y + r5 * z, r6 * x + r7 * y + r8 * z
 
 
@@ -80,22 +80,22 @@ def pose(
     one, zero = tl.sum(tl.where(e == 0, 1.0, 0.0), 0), tl.sum(tl.where(e == 0, 0.0, 0.0), 0)
     _put_transform(transforms, one, zero, zero, zero, one, zero, zero, zero, one, zero, zero, zero)
 
-    n0, n1, n2, n3, n4, n5, n6, n7, n8 = _matrix(neck)
+    n0, n1, n2, n3, n4, n5, n6, n7, n8 = matrix_of_6d(neck)
     _put_feature(coefficients + stride, n0, n1, n2, n3, n4, n5, n6, n7, n8)
     x, y, z = _joint(identity_joints, joint_directions, weights, 1, stride, e, e < stride)
-    a, b, c = _rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, x, y, z)
+    a, b, c = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, x, y, z)
     t0, t1, t2 = x - a, y - b, z - c
     _put_transform(transforms + TRANSFORM, n0, n1, n2, n3, n4, n5, n6, n7, n8, t0, t1, t2)
     for joint in tl.static_range(2, 5):
         rotation = jaw if joint == 2 else eyes + 6 * (joint - 3)
-        l0, l1, l2, l3, l4, l5, l6, l7, l8 = _matrix(rotation)
+        l0, l1, l2, l3, l4, l5, l6, l7, l8 = matrix_of_6d(rotation)
         _put_feature(coefficients + stride + 9 * (joint - 1), l0, l1, l2, l3, l4, l5, l6, l7, l8)
-        r0, r3, r6 = _rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l0, l3, l6)
-        r1, r4, r7 = _rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l1, l4, l7)
-        r2, r5, r8 = _rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l2, l5, l8)
+        r0, r3, r6 = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l0, l3, l6)
+        r1, r4, r7 = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l1, l4, l7)
+        r2, r5, r8 = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l2, l5, l8)
         x, y, z = _joint(identity_joints, joint_directions, weights, joint, stride, e, e < stride)
-        a, b, c = _rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, x, y, z)
-        u, v, w = _rotated(r0, r1, r2, r3, r4, r5, r6, r7, r8, x, y, z)
+        a, b, c = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, x, y, z)
+        u, v, w = rotated(r0, r1, r2, r3, r4, r5, r6, r7, r8, x, y, z)
         to = transforms + TRANSFORM * joint
         _put_transform(to, r0, r1, r2, r3, r4, r5, r6, r7, r8, a + t0 - u, b + t1 - v, c + t2 - w)
 

@@ -17,15 +17,14 @@ from avatar.model import Avatar
 def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     """Adam with the paper's groups: colour, opacity, scale, rotation, deformation network, HyperGaussian heads."""
     rates = config.learning_rates
+    logits = [avatar.opacity_logits] + ([] if avatar.rigidity_logits is None else [avatar.rigidity_logits])
     groups: list[dict[str, Any]] = [
         {"params": [avatar.sh_dc], "lr": rates.sh_dc},
         {"params": [avatar.sh_rest], "lr": rates.sh_rest},
-        {"params": [avatar.opacity_logits], "lr": rates.opacity},
+        {"params": logits, "lr": rates.opacity},
         {"params": [avatar.log_scales], "lr": rates.scale},
         {"params": [avatar.quats], "lr": rates.rotation},
     ]
-    if avatar.rigidity_logits is not None:
-        groups.append({"params": [avatar.rigidity_logits], "lr": rates.rigidity})
     if avatar.deformation is not None:
         groups.append({"params": list(avatar.deformation.parameters()), "lr": rates.mlp})
     if avatar.mesh_points is not None and avatar.mesh_points.place.requires_grad:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avatar.config import load_config
 from avatar.gaussians.embedding import Embedding
-from avatar.gaussians.rigidity import INITIAL_LOGIT, Skull, held
+from avatar.gaussians.rigidity import INITIAL_LOGIT, Hold, Skull, held
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.model import Avatar
@@ -22,7 +22,7 @@ def parts() -> tuple[HeadModel, Embedding, Skull]:
     assets = grid_head()
     head = HeadModel(assets, torch.tensor([0.5, -0.3, 0.2]))
     embedding = Embedding(assets, uv_texels(assets, 20))
-    return head, embedding, Skull(embedding, head)
+    return head, embedding, Skull.of(head, embedding)
 
 
 def small_avatar() -> Avatar:
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_the_definition() -> None:
         w = 1 / (1 + torch.exp(-logits))[:, None]
         return (1 - w) * points + w * embedding.points((1 - carried) * at_rest + carried * turned)
 
-    found = gradients(lambda neck, points, logits: held(points, skull.points(neck), torch.sigmoid(logits)))
+    found = gradients(lambda neck, points, logits: held(points, Hold(skull, neck, logits)))
     for own, expected in zip(found, gradients(definition), strict=True):
         assert expected.abs().max() > 1e-3
         torch.testing.assert_close(own, expected, rtol=1e-4, atol=1e-5)

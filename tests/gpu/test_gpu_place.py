@@ -15,7 +15,7 @@ from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import latent_grid
-from avatar.gaussians.rigidity import held
+from avatar.gaussians.rigidity import Hold, Skull, held
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel
 from avatar.types import Gaussians
@@ -56,23 +56,23 @@ class Scene:
             "quats": torch.randn(N, 4, generator=g),
             "log_scales": torch.randn(N, 3, generator=g) - 4,
             "opacity_logits": 3 * torch.randn(N, generator=g),
-            "on_skull": neutral + 0.01 * torch.randn(N, 3, generator=g) if has_skull else None,
-            "rigidity": torch.rand(N, generator=g) if has_skull else None,
+            "neck": random_params().neck if has_skull else None,
+            "rigidity_logits": torch.randn(N, generator=g) if has_skull else None,
         }
+        self.skull = Skull.of(head, self.embedding)
         self.heads = heads
         self.sh = torch.randn(N, 4, 3, generator=g)
         self.cotangents = [torch.randn(shape, generator=g) for shape in ((N, 3), (N, 4), (N, 3), (N,))]
 
     def expected(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
-        *base, on_skull, rigidity = rest
+        *base, neck, logits = rest
         with the_cpus_way():
             if self.grid is not None:
                 values = self.grid(values)
             if packed is not None:
                 values = torch.func.functional_call(self.heads, {"packed": packed}, (values,))
-            points = self.embedding.points(vertices)
-            if rigidity is not None:
-                points = held(points, on_skull, rigidity)
+            hold = None if logits is None else Hold(self.skull, neck, logits)
+            points = held(self.embedding.points(vertices), hold)
             return compose_raw(points, *base, self.sh, values)
 
     def found(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
@@ -81,8 +81,10 @@ class Scene:
         self.embedding.move(DEVICE)
         if self.grid is not None:
             self.grid.move(DEVICE)
-        base = (*rest[:3], self.sh.to(DEVICE))
-        return place_gpu(vertices, values, packed, *base, self.embedding, self.grid, *rest[3:])
+        *base, neck, logits = rest
+        skull = Skull(self.skull.at_rest.to(DEVICE), self.skull.arms.to(DEVICE))
+        hold = None if logits is None else Hold(skull, neck, logits)
+        return place_gpu(vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, hold)
 
     def run(self, function: Callable[..., Gaussians], device: torch.device) -> tuple[Gaussians, dict[str, Tensor]]:
         leaves = {n: None if t is None else t.to(device).requires_grad_() for n, t in self.inputs.items()}
@@ -134,13 +136,6 @@ def test_zero_quaternions_and_saturated_offsets_have_finite_gradients() -> None:
     assert error(found.quats, expected.quats) < 1e-6
 
 
-def test_a_share_without_a_skull_is_refused() -> None:
-    scene = Scene(True, True, 8, True)
-    scene.inputs["on_skull"] = None
-    with pytest.raises(ValueError, match="given together or not at all"):
-        scene.run(scene.found, DEVICE)
-
-
 @pytest.mark.parametrize(
     ("name", "shape", "message"),
     [
@@ -148,8 +143,8 @@ def test_a_share_without_a_skull_is_refused() -> None:
         ("packed", (3, 4, 16), "packed must have shape"),
         ("quats", (7, 4), "log_scales has N = |quats has N = 7"),
         ("opacity_logits", (7,), "opacity_logits has N = 7"),
-        ("on_skull", (7, 3), "on_skull has N = 7"),
-        ("rigidity", (7,), "rigidity has N = 7"),
+        ("neck", (5,), "neck"),
+        ("rigidity_logits", (7,), "rigidity_logits has N = 7"),
     ],
 )
 def test_wrong_sizes_are_named(name: str, shape: tuple[int, ...], message: str) -> None:

@@ -71,7 +71,7 @@ def test_the_gradient_is_that_of_refinement(avatar: Avatar, view_dependent: floa
 def aligned(avatar: Avatar, clip: Clip) -> tuple[Alignment, Clip, list[str]]:
     """The clip after so many steps of an avatar that stands still, with the tracking that it then has."""
     config = small_config(f"data.size={SIZE}", f"trainer.iterations={STEPS}", "trainer.align_rate=0.5")
-    for group in ("sh_dc", "sh_rest", "opacity", "scale", "rotation", "mlp", "hyper", "rigidity"):
+    for group in ("sh_dc", "sh_rest", "opacity", "scale", "rotation", "mlp", "hyper"):
         setattr(config.trainer.learning_rates, group, 0.0)
     alignment = Alignment(avatar, clip, config)  # type: ignore[arg-type]
     objective = Objective(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
