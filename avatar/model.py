@@ -39,6 +39,7 @@ class Avatar(nn.Module):
     `name = "flashavatar"`: the network gives the offsets itself; they are not smooth over the map, so no grid is used.
     `name = "monogaussianavatar"`: the same for the first `count` points of a set that grows in training.
     `name = "splattingavatar"`: no network; learned places on the mesh, which alone moves the Gaussians.
+    With `rigidity`, Gaussians that are bound to a texel learn how far they keep with the skull in place of the skin.
 
     `to(device)` moves all that drawing needs. `head` stays on the CPU, for those who look at the mesh; cameras and head
     parameters may be on either side.
