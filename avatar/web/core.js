@@ -67,7 +67,7 @@ export function parse(bytes) {
     const data = bytes.slice(start + offset, start + offset + count * type.BYTES_PER_ELEMENT);
     arrays.set(name, new type(data.buffer));
   }
-  if (magic === EARLIER && header?.sizes) {
+  if (magic === EARLIER && [header?.sizes, header?.arrays].every((part) => part && typeof part === "object")) {
     header.sizes.has_rigidity = 0;
     header.arrays.rigidity = {};
     arrays.set("rigidity", new Float32Array(0));

@@ -27,6 +27,7 @@ function hostileHeader() {
   else parent[key] = EVIL[random(EVIL.length)];
   const text = new TextEncoder().encode(JSON.stringify(copy)), bytes = new Uint8Array(8 + text.length + whole.length - 8 - length);
   bytes.set(whole.subarray(0, 8));
+  bytes[3] = 0x31 + random(2); // of this format or of the one before
   new DataView(bytes.buffer).setUint32(4, text.length, true);
   bytes.set(text, 8);
   bytes.set(whole.subarray(8 + length), 8 + text.length);
