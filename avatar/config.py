@@ -1,8 +1,7 @@
 """The configuration: YAML files under configs/ and `key=value` overrides in, typed dataclasses out.
 
-Hydra composes (groups `data`, `model`, `trainer`, `preset`, `experiment`); the defaults and what each key means stand in
-the YAML files, the dataclasses below are the schema: an unknown key, a wrong type or a value outside its range is refused
-with a sentence that names the key and the nearest one that exists.
+Hydra composes; defaults and what the keys mean stand in the YAML files, the dataclasses below are the schema: an unknown
+key, a wrong type or a value outside its range is refused with a sentence that names the key and the nearest one.
 """
 
 from __future__ import annotations
@@ -53,6 +52,8 @@ class ModelConfig:
     initial_opacity: float
     uv_detail: int
     rigidity: bool = False  # avatars that lack it were made without
+    blur: float = 0.3  # with which those that lack it were trained
+    facing: bool = False
 
 
 @dataclass
@@ -139,11 +140,11 @@ RANGES: dict[str, tuple[float, float]] = {
     "model.frequencies": (0, 30),
     "model.sh_degree": (0, 3),
     "model.initial_opacity": (1e-6, 1 - 1e-6),
+    "model.blur": (0, 100),
     "trainer.iterations": (1, MOST_STEPS),
     "trainer.passes": (1, MOST_STEPS),
     "trainer.seed": (0, 2**31 - 1),
     "trainer.lr_warmup": (0, MOST_STEPS),
-    "trainer.lr_final": (0, 1),
     "trainer.adam_eps": (1e-20, 1),  # float32 has no squares of gradients below 1e-21: less would not bound their steps
     "trainer.sh_interval": (1, MOST_STEPS),
     "trainer.huber_delta": (1e-6, 1000),
@@ -151,14 +152,14 @@ RANGES: dict[str, tuple[float, float]] = {
     "trainer.perceptual_weight": (0, 10**6),
     "trainer.dssim_weight": (0, 10**6),
     "trainer.dssim_early": (0, 10**6),
-    "trainer.perceptual_start": (0, 1),
     "trainer.lpips_every": (1, MOST_STEPS),
     "trainer.log_every": (1, MOST_STEPS),
     "trainer.preview_every": (1, MOST_STEPS),
     "trainer.checkpoint_every": (1, MOST_STEPS),
     "trainer.keep_checkpoints": (1, 10**6),
 }
-RANGES |= dict.fromkeys(("trainer.stray_share", "trainer.align_rate", "trainer.condition_noise"), (0.0, 1.0))
+_SHARES = "lr_final", "perceptual_start", "stray_share", "align_rate", "condition_noise"
+RANGES |= {f"trainer.{name}": (0, 1) for name in _SHARES}
 RANGES |= {f"trainer.learning_rates.{f.name}": (0.0, 10.0) for f in dataclasses.fields(LearningRates)}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from avatar.gaussians.covariance import CovarianceHeads
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size, positional_encoding
+from avatar.gaussians.facing import VALUES, facing, learned_turning
 from avatar.gaussians.growth import alive_after, evenly_ordered
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
@@ -24,7 +26,8 @@ from avatar.gaussians.rigidity import INITIAL_LOGIT, Hold, Skull, held
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, PoseTensors
-from avatar.types import Gaussians, HeadParams
+from avatar.splat import splat
+from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
 WITH_LATENTS = ("hypergaussians", "covariance", "ndgs")
@@ -40,6 +43,7 @@ class Avatar(nn.Module):
     `name = "monogaussianavatar"`: the same for the first `count` points of a set that grows in training.
     `name = "splattingavatar"`: no network; learned places on the mesh, which alone moves the Gaussians.
     With `rigidity`, Gaussians that are bound to a texel learn how far they keep with the skull in place of the skin.
+    With `facing`, the network is told how the head is turned before the camera.
 
     `to(device)` moves all that drawing needs. `head` stays on the CPU, for those who look at the mesh; cameras and head
     parameters may be on either side.
@@ -47,6 +51,7 @@ class Avatar(nn.Module):
 
     code: Tensor
     count: Tensor | None  # of the points that are alive; None: all are
+    turning: Tensor | None  # of `avatar.gaussians.facing`; zeros until `learn_facing`
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__()
@@ -69,11 +74,13 @@ class Avatar(nn.Module):
         if config.name != "splattingavatar":
             self.deformation = DeformationMLP(
                 code_size=encoded_size(config.frequencies),
-                condition_size=assets.num_expressions + CONDITION_EXTRAS,
+                condition_size=assets.num_expressions + CONDITION_EXTRAS + (VALUES if config.facing else 0),
                 out_size=config.latent_dim if has_latents else 10,
                 width=config.mlp_width,
                 layers=config.mlp_layers,
             )
+        tells = config.facing and self.deformation is not None
+        self.register_buffer("turning", torch.zeros(3, 9) if tells else None)
         self.mesh_points: MeshPoints | None = None
         if config.name in ("splattingavatar", "monogaussianavatar"):
             place = self.embedding.texels.face, self.embedding.barycentric
@@ -104,14 +111,23 @@ class Avatar(nn.Module):
         """The number of Gaussians."""
         return len(self.embedding)
 
-    def forward(self, params: HeadParams, vertices: Float[Tensor, "V 3"] | None = None) -> Gaussians:
-        """The Gaussians of one frame, world space. `vertices`: the head posed by `params` already, metres."""
+    def forward(
+        self,
+        params: HeadParams,
+        vertices: Float[Tensor, "V 3"] | None = None,
+        rotation: Float[Tensor, "3 3"] | None = None,
+    ) -> Gaussians:
+        """The Gaussians of one frame, world space.
+
+        vertices  the head posed by `params` already, metres
+        rotation  R_cam_world of the camera that sees it; None: the head is turned as on average in training
+        """
         vertices = self.vertices(params) if vertices is None else vertices
         base = self.base()
         if self.deformation is None:
             assert self.mesh_points is not None
             return compose_carried(self.mesh_points.points(vertices), self.mesh_points.turns(vertices), *base)
-        values = self.deformation(self.living(self.code), self.condition(params))
+        values = self.deformation(self.living(self.code), self.condition(params, rotation))
         if on_gpu(values) and values.dtype == torch.float32 and self.is_fused:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
@@ -200,14 +216,28 @@ class Avatar(nn.Module):
             self.grid.interpolate.move(self.code.device)
         return self
 
-    def condition(self, params: HeadParams) -> Float[Tensor, " D"]:
-        """The network's input, with expression coefficients that the frame does not carry as zeros."""
+    def condition(self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None = None) -> Float[Tensor, " D"]:
+        """The network's input, with expression coefficients that the frame does not carry as zeros. `rotation`: as in
+        `forward`."""
         condition = brought(params.condition(), self.code.device)
-        missing = 0 if self.deformation is None else self.deformation.condition_size - len(condition)
-        if missing == 0:
+        missing = self.head.assets.num_expressions - len(params.expression)
+        if missing > 0:
+            E = len(params.expression)
+            condition = torch.cat((condition[:E], condition.new_zeros(missing), condition[E:]))
+        if self.turning is None:
             return condition
-        E = len(params.expression)
-        return torch.cat((condition[:E], condition.new_zeros(missing), condition[E:]))
+        if rotation is None:
+            return torch.cat((condition, condition.new_zeros(VALUES)))
+        return torch.cat((condition, facing(self.turning, brought(rotation, self.code.device))))
+
+    def learn_facing(self, rotations: Float[Tensor, "T 3 3"]) -> None:
+        """Before training: how heads are turned in its frames, whose R_cam_world these are."""
+        if self.turning is not None:
+            self.turning.copy_(learned_turning(rotations))
+
+    def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
+        """`splat` with this avatar's blur; `options` as there."""
+        return splat(gaussians, camera, background, **{"blur": self.config.blur, **options})
 
 
 def _check_loaded(avatar: Avatar, _: object) -> None:

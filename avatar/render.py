@@ -1,6 +1,7 @@
 """A trained avatar's pictures as fast as possible: what never changes is computed once, and frames are drawn side by side.
 
-`Renderer` gives what `splat(avatar(params), camera, background)` gives, to rounding, without autograd, where the avatar is.
+`Renderer` gives what `avatar.draw(avatar(params, None, camera.R_cam_world), camera, background)` gives, to rounding,
+without autograd, where the avatar is.
 Computed once: the first layer's product with the positional code, the colours and, on a CPU, each HyperGaussian, which for
 inference is an affine map of its latent: n multiply-adds for each of ten offsets remain. On a GPU the launches count, and
 one does all that follows the network.
@@ -27,7 +28,7 @@ from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.ndgs import Slice
 from avatar.gaussians.rigidity import Hold, held
 from avatar.model import Avatar
-from avatar.splat import CannotDraw, splat
+from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
@@ -56,8 +57,8 @@ class Renderer:
         self._base = {name: value.detach().clone() for name, value in zip(names, avatar.base(), strict=True)}
 
     @torch.no_grad()
-    def gaussians(self, params: HeadParams) -> Gaussians:
-        """What `avatar(params)` gives, to rounding."""
+    def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
+        """What `avatar(params)` gives, to rounding, as the head is turned before the camera where one is given."""
         if self._network is None:
             assert self._mesh_points is not None
             vertices = self.vertices(params)
@@ -66,7 +67,7 @@ class Renderer:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
             avatar, grid = self._avatar, self._avatar.grid
-            values = self._network(avatar.condition(params))
+            values = self._network(avatar.condition(params, rotation_of(camera)))
             return place_gpu(
                 self.vertices(params),
                 values,
@@ -76,12 +77,22 @@ class Renderer:
                 grid=None if grid is None else grid.interpolate,
                 hold=self._hold(params),
             )
-        return self.place(self.points(self.vertices(params), params), self.offsets(self.latents(params)))
+        return self.place(self.points(self.vertices(params), params), self.offsets(self.latents(params, camera)))
 
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
         """One frame as soon as possible: each step uses all threads."""
-        return drawn(self.gaussians(params), camera, self.background)
+        return self.draw(self.gaussians(params, camera), camera, self.background)
+
+    def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:
+        """The avatar's Gaussians, with a sentence where its parameters are beyond what can be drawn (UserError)."""
+        try:
+            return self._avatar.draw(gaussians, camera, background)
+        except CannotDraw as error:
+            raise UserError(
+                f"the avatar cannot be drawn: {error}; its training has gone wrong, train again with lower "
+                "trainer.learning_rates"
+            ) from error
 
     def stream(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         """Many frames in order, as many per second as possible: each is drawn by one thread, several at a time.
@@ -146,11 +157,11 @@ class Renderer:
         hold = self._avatar.hold(params)
         return None if hold is None or self._rigidity_logits is None else hold._replace(logits=self._rigidity_logits)
 
-    def latents(self, params: HeadParams) -> Float[Tensor, "N n"]:
-        """The network's output for each Gaussian. Raises ValueError for an avatar without a network."""
+    def latents(self, params: HeadParams, camera: Camera | None = None) -> Float[Tensor, "N n"]:
+        """The network's output for each Gaussian, as in `gaussians`. Raises ValueError for an avatar without a network."""
         if self._network is None:
             raise ValueError(f"model={self._avatar.config.name} has no network")
-        latents, grid = self._network(self._avatar.condition(params)), self._avatar.grid
+        latents, grid = self._network(self._avatar.condition(params, rotation_of(camera))), self._avatar.grid
         if grid is None:
             return latents
         return grid.interpolate(latents)
@@ -168,15 +179,8 @@ class Renderer:
         return compose_raw(points, raw=offsets, **self._base)
 
 
-def drawn(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:
-    """`splat` of a trained avatar, with a sentence where its parameters are beyond what can be drawn (UserError)."""
-    try:
-        return splat(gaussians, camera, background)
-    except CannotDraw as error:
-        raise UserError(
-            f"the avatar cannot be drawn: {error}; its training has gone wrong, train again with lower "
-            "trainer.learning_rates"
-        ) from error
+def rotation_of(camera: Camera | None) -> Float[Tensor, "3 3"] | None:
+    return None if camera is None else camera.R_cam_world
 
 
 class FoldedNetwork:

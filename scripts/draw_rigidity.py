@@ -18,7 +18,6 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.runs.trained import TrainedAvatar, load_avatar
-from avatar.splat import splat
 from avatar.splat.sh import C0
 
 SKIN, SKULL = torch.tensor([0.1, 0.2, 0.9]), torch.tensor([1.0, 0.25, 0.0])
@@ -32,8 +31,8 @@ def draw_shares(trained: TrainedAvatar, frame: int, size: int) -> Float[Tensor, 
         raise UserError(f"{trained.source} has learned no rigidity; train one with model.rigidity=true")
     params, camera = trained.recording.params(frame), trained.recording.camera(frame, size)
     colours = torch.lerp(SKIN, SKULL, rigidity[:, None])
-    gaussians = trained.avatar(params)._replace(sh=((colours - 0.5) / C0)[:, None])
-    shares = splat(gaussians, camera, trained.background).image
+    gaussians = trained.avatar(params, None, camera.R_cam_world)._replace(sh=((colours - 0.5) / C0)[:, None])
+    shares = trained.avatar.draw(gaussians, camera, trained.background).image
     return torch.cat((trained.render(params, camera).image, shares)).clamp(0.0, 1.0)
 
 

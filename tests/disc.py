@@ -109,8 +109,11 @@ class BlobRenderer:
     def __init__(self, avatar: Blob, background: torch.Tensor) -> None:
         self.avatar, self.background = avatar, background
 
-    def gaussians(self, params: HeadParams) -> Gaussians:
+    def gaussians(self, params: HeadParams, camera: Camera) -> Gaussians:
         return self.avatar(params)
+
+    def draw(self, gaussians: Gaussians, camera: Camera, background: torch.Tensor) -> Rendering:
+        return splat(gaussians, camera, background)
 
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
         return splat(self.avatar(params), camera, self.background)

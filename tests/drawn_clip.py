@@ -17,7 +17,6 @@ from tracked_folder import write_head_model
 from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.model import Avatar
-from avatar.splat import splat
 from avatar.splat.sh import C0
 from avatar.tracking.motion import EXPRESSION, EYELIDS, EYES, JAW, POSE, SHIFT, TURN, moved_tracks, values_of
 from avatar.types import IDENTITY_6D, Frame
@@ -115,7 +114,7 @@ def drawn_clip(avatar: Avatar, frames: int = 10, train: int = 7) -> Clip:
 
 def picture(avatar: Avatar, recording: Recording, index: int) -> Frame:
     params, camera = recording.params(index), recording.camera(index)
-    drawing = splat(avatar(params), camera, BACKGROUND)
+    drawing = avatar.draw(avatar(params, None, camera.R_cam_world), camera, BACKGROUND)
     head = (drawing.alpha > 1e-3).float()
     image = torch.lerp(BACKGROUND, drawing.image, head[..., None])
     ones, nothing = torch.ones_like(head), torch.zeros_like(head)

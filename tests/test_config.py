@@ -67,6 +67,8 @@ def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
         "model.latent_grid": 8,
         "model.uv_detail": 2,
         "model.rigidity": True,
+        "model.blur": 0.05,
+        "model.facing": True,
         "trainer.iterations": 4000,
         "trainer.passes": 10,
         "trainer.dssim_early": 0.1,
@@ -225,4 +227,6 @@ def test_a_key_of_any_length_is_answered_in_a_short_sentence() -> None:
 def test_a_configuration_of_an_earlier_version_means_what_it_meant() -> None:
     values = load_config().to_dict()
     assert values["trainer"].pop("stray_share") > 0 and values["model"].pop("rigidity")
-    assert config_from_dict(values) == load_config(["trainer.stray_share=0", "model.rigidity=false"])
+    assert values["model"].pop("facing") and values["model"].pop("blur") < 0.3
+    earlier = ["trainer.stray_share=0", "model.rigidity=false", "model.facing=false", "model.blur=0.3"]
+    assert config_from_dict(values) == load_config(earlier)

@@ -13,7 +13,6 @@ from avatar.config import load_config
 from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.render import AHEAD_PER_WORKER, Renderer
-from avatar.splat import splat
 from avatar.types import Camera, HeadParams
 
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
@@ -44,6 +43,7 @@ def trained_looking(*overrides: str) -> Avatar:
     [
         ("model.latent_grid=4",),
         ("model.rigidity=true",),
+        ("model.blur=1",),
         ("model.latent_grid=null",),
         ("model=flashavatar",),
         ("model=covariance",),
@@ -58,11 +58,11 @@ def test_the_renderer_gives_what_the_avatar_gives(overrides: tuple[str, ...]) ->
     renderer = Renderer(avatar, BACKGROUND)
     for seed in range(3):
         params = random_params(seed)
-        expected, got = avatar(params), renderer.gaussians(params)
+        expected, got = avatar(params, None, CAMERA.R_cam_world), renderer.gaussians(params, CAMERA)
         for name, a, b in zip(expected._fields, got, expected, strict=True):
             torch.testing.assert_close(a, b.detach(), rtol=2e-5, atol=2e-6, msg=lambda m, n=name: f"{n}: {m}")
             assert not a.requires_grad
-        image = splat(expected, CAMERA, BACKGROUND).image.detach()
+        image = avatar.draw(expected, CAMERA, BACKGROUND).image.detach()
         assert (image - BACKGROUND).abs().max() > 0.2, "the scene is empty"
         torch.testing.assert_close(renderer.render(params, CAMERA).image, image, rtol=0, atol=2e-5)
 

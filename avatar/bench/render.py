@@ -27,7 +27,6 @@ from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
 from avatar.render import Renderer
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat import splat
 from avatar.types import Camera, HeadParams, Rendering
 
 STEPS = ("skinning", "embedding", "network", "heads", "compose", "splat")
@@ -130,7 +129,7 @@ def compare(trained: TrainedAvatar, renderer: Renderer, frames: Sequence[Input])
     """Raises UserError, with the figures, above the tolerances."""
     gaussians = mean = largest = 0.0
     for params, camera in frames:
-        truth, found = trained.avatar(params), renderer.gaussians(params)
+        truth, found = trained.avatar(params, None, camera.R_cam_world), renderer.gaussians(params, camera)
         gaussians = max(gaussians, *(float((a - b).norm() / b.norm()) for a, b in zip(found, truth, strict=True)))
         difference = (renderer.render(params, camera).image - draw_unfolded(trained, params, camera).image).abs()
         mean, largest = max(mean, float(difference.mean())), max(largest, float(difference.max()))
@@ -147,21 +146,21 @@ def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callabl
     calls: dict[str, list[Callable[[], object]]] = {name: [] for name in STEPS}
     for params, camera in frames:
         vertices = renderer.vertices(params)
-        points, latents = renderer.points(vertices, params), renderer.latents(params)
+        points, latents = renderer.points(vertices, params), renderer.latents(params, camera)
         offsets = renderer.offsets(latents)
         gaussians = renderer.place(points, offsets)
         calls["skinning"].append(partial(renderer.vertices, params))
         calls["embedding"].append(partial(renderer.points, vertices, params))
-        calls["network"].append(partial(renderer.latents, params))
+        calls["network"].append(partial(renderer.latents, params, camera))
         calls["heads"].append(partial(renderer.offsets, latents))
         calls["compose"].append(partial(renderer.place, points, offsets))
-        calls["splat"].append(partial(splat, gaussians, camera, renderer.background))
+        calls["splat"].append(partial(renderer.draw, gaussians, camera, renderer.background))
     return calls
 
 
 def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
     background = brought(torch.tensor(trained.config.data.background), trained.avatar.code.device)
-    return splat(trained.avatar(params), camera, background)
+    return trained.avatar.draw(trained.avatar(params, None, camera.R_cam_world), camera, background)
 
 
 def settled(device: torch.device, function: Callable[..., object], *arguments: object) -> None:

@@ -59,7 +59,7 @@ class StagedStep:
         target = watch.measure("target", lambda: frame.composite(objective.background))
         vertices = watch.measure("skinning", lambda: avatar.head.vertices(frame.params))
         points = watch.measure("embedding", lambda: avatar.embedding.points(vertices))
-        condition = avatar.condition(frame.params)
+        condition = avatar.condition(frame.params, frame.camera.R_cam_world)
 
         deformation = network_of(avatar)
         (raw,) = self._forward(
@@ -79,9 +79,8 @@ class StagedStep:
             [raw],
             base if avatar.rigidity_logits is None else [*base, avatar.rigidity_logits],
         )
-        degree = avatar.config.sh_degree
         (image,) = self._forward(
-            "splat", lambda *g: (objective.draw(step, frame, Gaussians(*g), degree),), list(gaussians)
+            "splat", lambda *g: (objective.draw(step, frame, Gaussians(*g), avatar),), list(gaussians)
         )
         loss: list[PhotometricLoss] = []
 

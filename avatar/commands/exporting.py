@@ -24,7 +24,7 @@ from avatar.files.atomic import write_atomically
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.trained import TrainedAvatar
-from avatar.types import HeadParams
+from avatar.types import Camera, HeadParams
 
 MIB = 2**20
 TEXTURE, MAX_SIZE = 1024, 4096  # pixels
@@ -101,18 +101,18 @@ def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> Non
     licence = licence_of(NOTHING)
     clip = chosen_clip(trained, arguments)
     if clip is None:
-        write_atomically(out, encode_ply(trained.gaussians(chosen_pose(trained, arguments)), licence))
+        write_atomically(out, encode_ply(trained.gaussians(*chosen_pose(trained, arguments)), licence))
         print(f"Splats   {out} ({out.stat().st_size / MIB:.1f} MiB)")
     else:
-        for number, (params, _) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
-            write_atomically(numbered(out, number), encode_ply(trained.gaussians(params), licence))
+        for number, (params, camera) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
+            write_atomically(numbered(out, number), encode_ply(trained.gaussians(params, camera), licence))
         print(f"Splats   {numbered(out, 0)} to {numbered(out, len(clip) - 1).name}, {clip.fps:g} a second")
     print(f"Licence  {licence}")
 
 
 def write_mesh(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     licence = licence_of(MESH)
-    data, targets = encode_glb(trained, chosen_pose(trained, arguments), arguments.texture or TEXTURE, licence)
+    data, targets = encode_glb(trained, chosen_pose(trained, arguments)[0], arguments.texture or TEXTURE, licence)
     write_atomically(out, data)
     print(f"Mesh     {out} ({len(data) / MIB:.1f} MiB) with {len(targets)} morph targets: {', '.join(targets)}")
     print(f"Licence  {licence}")
@@ -126,14 +126,14 @@ def write_clip(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     print(f"Video    {out}: {len(clip)} frames, camera {path}")
 
 
-def chosen_pose(trained: TrainedAvatar, arguments: Namespace) -> HeadParams:
-    """The frame of --frame, else the neutral face."""
+def chosen_pose(trained: TrainedAvatar, arguments: Namespace) -> tuple[HeadParams, Camera]:
+    """The frame of --frame, else the neutral face, and the camera that sees it."""
     if arguments.frame is None:
-        return trained.rest_params()
+        return trained.rest_params(), trained.rest_camera()
     count = len(trained.recording)
     if not 0 <= arguments.frame < count:
         raise UserError(f"--frame must be from 0 to {count - 1}, not {arguments.frame}")
-    return trained.recording.params(arguments.frame)
+    return trained.recording.params(arguments.frame), trained.recording.camera(arguments.frame)
 
 
 def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | None = None) -> Clip | None:

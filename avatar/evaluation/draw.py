@@ -18,7 +18,7 @@ from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
-from avatar.render import Renderer, drawn
+from avatar.render import Renderer
 from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
 from avatar.types import Frame
@@ -32,13 +32,13 @@ TIMED_FRAMES, WARM_UP = 30, 3
 def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, Pair]:
     """Render and truth of a frame for each look, where the avatar is; looks of one background share the drawing."""
     device = renderer.background.device
-    gaussians = renderer.gaussians(frame.params)
+    gaussians = renderer.gaussians(frame.params, frame.camera)
     images: dict[Colour, Pair] = {}
     pairs = {}
     for look in looks:
         if look.background not in images:
             colour = torch.tensor(look.background)
-            picture = with_room(partial(drawn, gaussians, frame.camera, brought(colour, device)))
+            picture = with_room(partial(renderer.draw, gaussians, frame.camera, brought(colour, device)))
             images[look.background] = Pair(picture.image, brought(frame.composite(colour), device))
         pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
     return pairs

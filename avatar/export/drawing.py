@@ -104,6 +104,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "has_grid": int(grid is not None),
         "has_heads": int(folded is not None),
         "has_rigidity": int(model.rigidity is not None),
+        "has_facing": int(model.turning is not None),
     }
     return Drawing(
         sizes,

@@ -1,6 +1,6 @@
 """The avatar as browsers read it: a gzip file of a JSON header and arrays, quantised where the picture does not mind.
 
-    bytes 0-3    "AVW2"; "AVW1" before there was `rigidity`
+    bytes 0-3    "AVW3"; "AVW2" before there were `blur` and `facing`, "AVW1" before there was `rigidity`
     bytes 4-7    length of the header, uint32, little-endian like everything
     header       JSON: sizes, arrays (type, offset, length, columns, scales), motion, camera, names
     arrays       each at a multiple of 4 bytes
@@ -22,11 +22,12 @@ import torch
 from avatar.export.drawing import ARRAYS, Drawing, reduce_avatar
 from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
+from avatar.gaussians.facing import LIMIT
 from avatar.motion.controls import expression_controls, joint_ranges
 from avatar.motion.orbit import orbit_limits
 from avatar.runs.trained import TrainedAvatar
 
-FORMAT = "AVW2"
+FORMAT = "AVW3"
 Precision = Literal["float", "small"]
 TYPES = {"f4": np.float32, "i2": np.int16, "i1": np.int8, "u4": np.uint32, "u2": np.uint16}
 # Columns that have a scale of their own, and bits, with precision "small". What is not named stays float32.
@@ -126,7 +127,7 @@ def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
     frames = [(recording.camera(i), recording.params(i)) for i in train]
     expressions = recording.tracks["expression"][train]
     rest, camera = trained.rest_params(), trained.rest_camera()
-    names = trained.assets.names.names
+    names, turning = trained.assets.names.names, trained.avatar.turning
     controls = expression_controls(expressions, rest.expression, trained.avatar.head)
     return {
         "name": recording.name,
@@ -134,6 +135,8 @@ def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
         "sizes": drawing.sizes,
         "parents": list(drawing.parents),
         "fps": recording.fps,
+        "blur": trained.config.model.blur,
+        "facing": None if turning is None else {"turning": turning.flatten().tolist(), "limit": LIMIT},
         "background": list(trained.config.data.background),
         "expressions": [names[i] if i < len(names) and names[i] else f"expression {i}" for i in kept],
         "controls": [

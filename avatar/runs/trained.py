@@ -74,9 +74,10 @@ class TrainedAvatar:
         jaw = self.neutral.jaw[:2].reshape(6)
         return HeadParams(self.neutral.expression, jaw, rest.repeat(2), torch.zeros(2), rest)
 
-    def gaussians(self, params: HeadParams) -> Gaussians:
-        """The Gaussians of one frame, activated, world space (metres)."""
-        return self.renderer.gaussians(params)
+    def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
+        """The Gaussians of one frame, activated, world space (metres), as `camera` sees the head; by default turned as on
+        average in training. To avatars without `model.facing` it is the same."""
+        return self.renderer.gaussians(params, camera)
 
     def render(self, params: HeadParams, camera: Camera | None = None) -> Rendering:
         """One picture, by default from the camera of the neutral face; [H, W, 3] and alpha [H, W], not clamped."""

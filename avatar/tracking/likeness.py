@@ -22,7 +22,6 @@ from avatar.compute.device import brought, on_gpu
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.model import Avatar
-from avatar.splat import splat
 from avatar.splat.sh import C0, sh_colours
 from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.types import Camera, Frame, Gaussians, HeadParams
@@ -33,7 +32,6 @@ OBSERVATIONS, PIXEL_SIGMA = 60.0, 0.05
 HUBER_DELTA = 0.1
 MARGIN = 8  # pixels around the head mask: what the avatar paints there is wrong
 COARSEST = 224  # pixels of width: on fewer a step takes as long, and finds nothing that one on all does not
-BLUR = 0.3  # pixels^2, that the splatter adds in training
 
 
 class Target(NamedTuple):
@@ -44,7 +42,7 @@ class Target(NamedTuple):
     picture: Float[Tensor, "h w 3"]  # of the box
     mask: Float[Tensor, "h w"]  # of the head
     area: float  # of the head, pixels
-    blur: float  # for the splatter: as much of the scene as the full size's
+    shrink: float  # of areas, from the full size
 
     def on(self, device: torch.device, given: HeadPose) -> Target:
         """There, but for the camera, which takes the given pose of the head (on the CPU)."""
@@ -76,7 +74,7 @@ def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Tar
                 picture=small[rows, columns].contiguous(),
                 mask=head[rows, columns].contiguous(),
                 area=float(head.sum()),
-                blur=BLUR * (width / frame.camera.width) ** 2,
+                shrink=(width / frame.camera.width) ** 2,
             )
         )
     return made
@@ -127,10 +125,11 @@ class Likeness:
     def picture(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, "h w 3"]:
         """The avatar in the target's box; without a gradient."""
         with torch.no_grad():
-            gaussians = self.avatar(head_params(values))
+            pose = moved_pose(values, given, self.centre)
+            gaussians = self.avatar(head_params(values), None, pose.R)
             if on_gpu(values):
-                return self._draw_moved(gaussians, values, given, target)
-            return self._draw(gaussians, moved_pose(values, given, self.centre), gaussians.sh, target)
+                return self._draw_moved(gaussians, values, pose, given, target)
+            return self._draw(gaussians, pose, gaussians.sh, target)
 
     def measure(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Measure:
         """Without a gradient."""
@@ -144,15 +143,15 @@ class Likeness:
     def fit(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Fit:
         """How far the avatar's picture is from the target's, and how that changes with the values."""
         values = values.detach().requires_grad_()
+        pose = moved_pose(values, given, self.centre)
         if on_gpu(values):
-            gaussians = self.avatar(params := head_params(values), self.vertices(params))
-            picture = self._draw_moved(gaussians, values, given, target)
+            gaussians = self.avatar(params := head_params(values), self.vertices(params), pose.R)
+            picture = self._draw_moved(gaussians, values, pose, given, target)
             error = misfit(picture, target)
             (gradient,) = torch.autograd.grad(error, values)
             return Fit(error.detach(), gradient, picture.detach())
-        pose = moved_pose(values, given, self.centre)
         eye = -(pose.R.T @ pose.t)  # where the camera is, in the head's space
-        gaussians = self.avatar(head_params(values))
+        gaussians = self.avatar(head_params(values), None, pose.R)
         # Leaves and nodes of their own, so that the ways to the picture stay apart: through the drawing and the colours.
         quats = gaussians.quats if gaussians.quats.requires_grad else gaussians.quats.clone().requires_grad_()  # ndgs
         drawn = gaussians._replace(means=gaussians.means.view_as(gaussians.means), quats=quats)
@@ -163,7 +162,7 @@ class Likeness:
         picture = self._draw(drawn, camera, flat, target)
         error = misfit(picture, target)
         sources = (values, drawn.means, drawn.quats, seen_from)
-        by_values, by_means, by_quats, by_eye = torch.autograd.grad(error, sources)
+        by_values, by_means, by_quats, by_eye = torch.autograd.grad(error, sources, retain_graph=True)
         by_pose = camera_gradient(drawn, camera, by_means, by_quats)
         (through_pose,) = torch.autograd.grad((*pose, eye), values, (*by_pose, by_eye))
         return Fit(error.detach(), by_values + through_pose, picture.detach())
@@ -177,20 +176,22 @@ class Likeness:
         return self._head.vertices(params)
 
     def _draw_moved(
-        self, gaussians: Gaussians, values: Tensor, given: HeadPose, target: Target
+        self, gaussians: Gaussians, values: Tensor, pose: HeadPose, given: HeadPose, target: Target
     ) -> Float[Tensor, "h w 3"]:
         """Moves the head before the target's own camera, which has the given pose: a GPU would have to hand a moved camera
         back. Differentiable by autograd alone."""
-        pose = moved_pose(values, given, self.centre)
         directions = gaussians.means + (pose.R.T @ pose.t)
         moved = before_camera(gaussians, values[TURN], pose, given, directions, self.avatar.config.sh_degree)
-        drawing = splat(moved, target.camera, self.background, region=target.box, blur=target.blur)
-        return drawing.image[target.box]
+        return self._drawn(moved, target.camera, target)
 
     def _draw(self, gaussians: Gaussians, pose: HeadPose, sh: Tensor, target: Target) -> Float[Tensor, "h w 3"]:
         camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)
-        drawing = splat(gaussians._replace(sh=sh), camera, self.background, region=target.box, blur=target.blur)
-        return drawing.image[target.box]
+        return self._drawn(gaussians._replace(sh=sh), camera, target)
+
+    def _drawn(self, gaussians: Gaussians, camera: Camera, target: Target) -> Float[Tensor, "h w 3"]:
+        """Blurred by as much of the scene as at full size."""
+        blur = target.shrink * self.avatar.config.blur
+        return self.avatar.draw(gaussians, camera, self.background, region=target.box, blur=blur).image[target.box]
 
 
 def before_camera(

@@ -2,7 +2,8 @@
 
 On a CPU the frame's camera moves, which the splatter does not differentiate: its gradient comes from those of what was
 drawn. On a GPU, which would have to hand a moved camera back, the head moves before it, and autograd does the rest. Both
-leave out how a turn of the head changes the colours that depend on the view.
+leave out how a turn of the head changes the colours that depend on the view and, with `model.facing`, what the network is
+told, which on a GPU is the given turn meanwhile.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from avatar.losses.lpips_network import MIN_SIZE, Net
 from avatar.losses.metrics import SSIM_WINDOW
 from avatar.losses.photometric import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
 from avatar.model import Avatar
-from avatar.splat import CannotDraw, splat
+from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
 from avatar.train.points import move_points
@@ -92,9 +92,9 @@ class Objective:
             delta=self.config.huber_delta,
         )
 
-    def draw(self, step: int, frame: Frame, gaussians: Gaussians, stored_degree: int) -> Float[Tensor, "H W 3"]:
-        degree = sh_degree(step, self.config, stored_degree)
-        return splat(gaussians, frame.camera, self.background, sh_degree=degree).image
+    def draw(self, step: int, frame: Frame, gaussians: Gaussians, avatar: Avatar) -> Float[Tensor, "H W 3"]:
+        degree = sh_degree(step, self.config, avatar.config.sh_degree)
+        return avatar.draw(gaussians, frame.camera, self.background, sh_degree=degree).image
 
 
 def training_step(
@@ -114,9 +114,9 @@ def training_step(
     """
     target = frame.composite(objective.background)
     try:
-        gaussians = avatar(frame.params, vertices)
+        gaussians = avatar(frame.params, vertices, frame.camera.R_cam_world)
         gaussians = gaussians if watched is None else watched(gaussians)
-        image = objective.draw(step, frame, gaussians, avatar.config.sh_degree)
+        image = objective.draw(step, frame, gaussians, avatar)
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
     loss = objective.loss(step, frame, image, target)

@@ -11,7 +11,7 @@ from torch import Tensor
 from avatar.config import TrainerConfig
 from avatar.data.loader import FrameLoader
 from avatar.model import Avatar
-from avatar.splat import CannotDraw, splat
+from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
 from avatar.splat.sh import C0
 from avatar.train.order import evenly_spread
@@ -50,11 +50,11 @@ def cover(avatar: Avatar, frame: Frame, step: int) -> Float[Tensor, "N 2"]:
     A pixel's colour is a sum of the Gaussians' colours by their weights, so that the gradient in the colours is the cover.
     """
     with torch.no_grad():
-        gaussians = avatar(frame.params)
+        gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
     flat = gaussians.means.new_zeros(len(gaussians.means), 1, 3).requires_grad_()
     black = flat.new_zeros(3)
     try:
-        drawn = with_room(lambda: splat(gaussians._replace(sh=flat), frame.camera, black))
+        drawn = with_room(lambda: avatar.draw(gaussians._replace(sh=flat), frame.camera, black))
     except CannotDraw as error:
         raise stopped(step, frame, str(error)) from error
     head = frame.alpha * frame.head_mask

@@ -16,7 +16,7 @@ from avatar.model import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
-from avatar.splat import CannotDraw, splat
+from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
 from avatar.train.ahead import Ahead, Prompt, Spoilt
 from avatar.train.align import Seen, make_alignment
@@ -57,6 +57,8 @@ def train(
     elif trainer.initial_colours == "frames":
         colour_from_frames(avatar, subject, config.data.size)
     recording = subject.recording
+    if resume is None:
+        avatar.learn_facing(recording.tracks["R"][list(recording.split.train)])
     neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
     avatar.to(device)
     optimizer = make_optimizer(avatar, trainer)
@@ -146,7 +148,8 @@ def render_held_out(
     """Truth and render of the first held-out frame after `step` steps. Raises UserError when it cannot be drawn."""
     frame = next(iter(loader.frames([subject.split.test[0]])))
     try:
-        drawn = with_room(lambda: splat(avatar(frame.params), frame.camera, background))
+        gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
+        drawn = with_room(lambda: avatar.draw(gaussians, frame.camera, background))
     except CannotDraw as error:
         raise stopped(step, frame, str(error)) from error
     return frame.composite(background), drawn.image

@@ -19,7 +19,6 @@ from avatar.motion.controls import ExpressionControl, expression_controls, joint
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.report.pictures import UNCERTAINTY_GAIN
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat import splat
 from avatar.splat.capacity import with_room
 from avatar.splat.sh import C0
 from avatar.types import Camera, HeadParams, Rendering
@@ -135,10 +134,10 @@ class Stage:
     @torch.no_grad()
     def rendered(self, params: HeadParams, camera: Camera, overlay: Overlay = "none") -> Rendering:
         """The avatar alone, where it computes; nothing is read back."""
-        gaussians = self.trained.gaussians(params)
+        gaussians = self.trained.gaussians(params, camera)
         if overlay == "uncertainty" and self._uncertainty is not None:
             gaussians = gaussians._replace(sh=self._uncertainty)
-        return splat(gaussians, camera, self.trained.renderer.background)
+        return self.trained.avatar.draw(gaussians, camera, self.trained.renderer.background)
 
 
 def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

@@ -1,7 +1,7 @@
 // An avatar in memory and the WebAssembly module that draws it. Runs in a page, a worker and node; no DOM.
 
-export const MAGIC = "AVW2";
-const EARLIER = "AVW1"; // without `rigidity`
+export const MAGIC = "AVW3";
+const EARLIER = ["AVW1", "AVW2"]; // without `rigidity`; with one blur for all, and without `facing`
 // The arrays that the module takes, in its order (avatar/csrc/web/portrait.h).
 const ARRAYS = [
   "shape", "expression_dirs", "pose_dirs", "weights", "eyelid_dirs", "joints_at_rest", "expression_joints", "barycentric",
@@ -11,7 +11,7 @@ const ARRAYS = [
 ];
 const SIZES = [
   "vertices", "expressions", "gaussians", "nodes", "latent", "width", "layers", "coefficients", "has_grid", "has_heads",
-  "has_rigidity",
+  "has_rigidity", "has_facing",
 ];
 const TYPES = { f4: Float32Array, i2: Int16Array, i1: Int8Array, u4: Uint32Array, u2: Uint16Array };
 const MAX_BYTES = 2 ** 28; // of an unpacked file
@@ -47,7 +47,7 @@ export async function unpack(bytes) {
 export function parse(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const magic = new TextDecoder().decode(bytes.subarray(0, 4));
-  if (magic !== MAGIC && magic !== EARLIER) throw new AvatarError(`This is not an avatar of this viewer (it begins with “${printable(magic)}”).`);
+  if (magic !== MAGIC && !EARLIER.includes(magic)) throw new AvatarError(`This is not an avatar of this viewer (it begins with “${printable(magic)}”).`);
   const length = bytes.byteLength >= 8 ? view.getUint32(4, true) : 0;
   if (length === 0 || 8 + length > bytes.byteLength) throw new AvatarError("The avatar file is cut short.");
   let header;
@@ -67,10 +67,14 @@ export function parse(bytes) {
     const data = bytes.slice(start + offset, start + offset + count * type.BYTES_PER_ELEMENT);
     arrays.set(name, new type(data.buffer));
   }
-  if (magic === EARLIER && [header?.sizes, header?.arrays].every((part) => part && typeof part === "object")) {
-    header.sizes.has_rigidity = 0;
-    header.arrays.rigidity = {};
-    arrays.set("rigidity", new Float32Array(0));
+  if (magic !== MAGIC && [header?.sizes, header?.arrays].every((part) => part && typeof part === "object")) {
+    Object.assign(header, { blur: 0.3, facing: null });
+    header.sizes.has_facing = 0;
+    if (magic === EARLIER[0]) {
+      header.sizes.has_rigidity = 0;
+      header.arrays.rigidity = {};
+      arrays.set("rigidity", new Float32Array(0));
+    }
   }
   check(header, arrays);
   return { header, arrays };
@@ -102,6 +106,9 @@ function check(header, arrays) {
   const c = header.camera;
   need(c && finite(c.rotation, 9) && finite(c.translation, 3), "the camera is missing");
   need(finite(["fx", "fy", "cx", "cy", "aspect"].map((k) => c[k]), 5) && c.aspect > 0.1 && c.aspect < 10, "the camera is missing");
+  need(header.blur >= 0 && header.blur <= 100, "its blur is missing");
+  const f = header.facing;
+  need(s.has_facing ? finite(f?.turning, 27) && f.limit > 0 && f.limit <= 100 : f === null, "how its head is turned is missing");
   need(header.fps > 0 && header.fps <= 1000, "the frame rate is missing");
   need(header.size >= 1 && header.size <= 2 ** 16, "the size is missing");
   for (const name of [...ARRAYS, "corners", "cells", "motion", "poses"]) need(arrays.has(name), `${name} is missing`);
@@ -126,6 +133,13 @@ function scaled(values, { scales, by }, name) {
       for (let k = 0; k < columns; ++k) out[i + k] = values[i + k] * factors[k];
   }
   return out;
+}
+
+/** How the head is turned before a camera, as the network is told: avatar/gaussians/facing.py. */
+function facing(told, rotation) {
+  if (told === null) return [0, 0, 0];
+  const turn = (axis) => rotation.reduce((sum, value, k) => sum + told.turning[9 * axis + k] * value, 0);
+  return [0, 1, 2].map((axis) => Math.min(Math.max(turn(axis), -told.limit), told.limit));
 }
 
 /** The module with one avatar in it. */
@@ -166,6 +180,7 @@ export class AvatarCore {
     ints(module.avatar_corners(), arrays.get("corners"));
     ints(module.avatar_cells(), arrays.get("cells"));
     ints(module.avatar_parents(), header.parents);
+    module.avatar_set_blur(header.blur);
     if (!module.avatar_is_sound()) throw new AvatarError("The avatar file is damaged: an index lies outside.");
     this.motion = arrays.get("motion");
     this.poses = arrays.get("poses");
@@ -177,9 +192,13 @@ export class AvatarCore {
     return new Float32Array(this.#module.memory.buffer, address, length);
   }
 
-  /** Pose head and Gaussians: expression coefficients, jaw, eyes, eyelids, neck, as in `header.rest`. */
-  pose(parameters) {
+  /**
+   * Pose head and Gaussians: expression coefficients, jaw, eyes, eyelids, neck, as in `header.rest`; `rotation` of the camera
+   * that is to see them, row-major.
+   */
+  pose(parameters, rotation) {
     this.#floats(this.#module.avatar_parameters(), parameters.length).set(parameters);
+    this.#floats(this.#module.avatar_facing(), 3).set(facing(this.header.facing, rotation));
     guarded(() => this.#module.avatar_pose());
   }
 

@@ -219,7 +219,7 @@ export class AvatarView extends EventTarget {
     this.#inFlight = false;
     const { camera, width, height } = this.#shown;
     if (data.type === "gaussians") {
-      this.#gpu.draw(data.values, camera, width, height, this.header.background);
+      this.#gpu.draw(data.values, camera, width, height, this.header.background, this.header.blur);
     } else {
       const { canvas } = this;
       if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });

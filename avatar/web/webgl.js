@@ -1,5 +1,5 @@
 // Draws posed Gaussians with WebGL2: one quad each, farthest first, blended. What it draws is packed by the module
-// (avatar/csrc/web/pack.cpp). Semantics as in the program's splatter: 0.3 px^2 of blur, alpha below 1/255 dropped.
+// (avatar/csrc/web/pack.cpp). Semantics as in the program's splatter: variances are blurred, alpha below 1/255 dropped.
 import { PACKED } from "./core.js";
 
 const VERTEX = `#version 300 es
@@ -12,6 +12,7 @@ uniform mat3 rotation;
 uniform vec3 translation;
 uniform vec4 lens; // fx, fy, cx, cy
 uniform vec2 size;
+uniform float blur; // pixels^2
 flat out vec4 colour;
 flat out vec3 conic;
 out vec2 offset;
@@ -28,7 +29,7 @@ void main() {
   mat3 J = mat3(lens.x / p.z, 0, 0, 0, lens.y / p.z, 0, -lens.x * t.x / p.z, -lens.y * t.y / p.z, 0);
   mat3 T = J * rotation;
   mat3 cov = T * sigma * transpose(T);
-  float xx = cov[0][0] + 0.3, xy = cov[0][1], yy = cov[1][1] + 0.3;
+  float xx = cov[0][0] + blur, xy = cov[0][1], yy = cov[1][1] + blur;
   float det = xx * yy - xy * xy;
   if (det <= 0.0) return;
   conic = vec3(yy, -xy, xx) / det;
@@ -85,7 +86,7 @@ export class WebglRenderer {
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program) ?? "no context");
     gl.useProgram(program);
     this.places = Object.fromEntries(
-      ["rotation", "translation", "lens", "size"].map((name) => [name, gl.getUniformLocation(program, name)]),
+      ["rotation", "translation", "lens", "size", "blur"].map((name) => [name, gl.getUniformLocation(program, name)]),
     );
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     [[4, 0], [3, 4], [3, 7], [3, 10]].forEach(([width, first], location) => {
@@ -99,7 +100,7 @@ export class WebglRenderer {
   }
 
   /** Draw what a worker has posed and packed. */
-  draw(packed, camera, width, height, background) {
+  draw(packed, camera, width, height, background, blur) {
     const gl = this.gl, at = this.places;
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     gl.bufferData(gl.ARRAY_BUFFER, packed, gl.STREAM_DRAW);
@@ -107,6 +108,7 @@ export class WebglRenderer {
     gl.uniform3fv(at.translation, camera.translation);
     gl.uniform4f(at.lens, camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(at.size, width, height);
+    gl.uniform1f(at.blur, blur);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);

@@ -20,7 +20,7 @@ self.onmessage = async ({ data }) => {
 
 function draw({ parameters, camera, width, height, background, wants }) {
   const begin = performance.now();
-  core.pose(parameters);
+  core.pose(parameters, camera.rotation);
   const values = (wants === "gaussians" ? core.pack(camera, width, height) : core.draw(camera, width, height, background)).slice();
   self.postMessage({ type: wants, values, milliseconds: performance.now() - begin }, [values.buffer]);
 }

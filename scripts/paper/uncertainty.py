@@ -36,7 +36,6 @@ from avatar.gaussians.hyper import HyperHead, HyperHeads
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.losses.metrics import squared_error
 from avatar.runs.run import RUN_FILE, Run
-from avatar.splat import splat
 from avatar.splat.sh import C0
 from avatar.types import Frame
 
@@ -148,9 +147,9 @@ def gaussian_errors(run: Run, frames: Sequence[Frame]) -> Tensor:
     """
     total = torch.zeros(len(run.avatar), 2)
     for frame in frames:
-        gaussians = run.trained.gaussians(frame.params)
+        gaussians = run.trained.gaussians(frame.params, frame.camera)
         colours = torch.zeros(len(run.avatar), 1, 3, requires_grad=True)
-        painted = splat(gaussians._replace(sh=colours), frame.camera, torch.zeros(3)).image
+        painted = run.avatar.draw(gaussians._replace(sh=colours), frame.camera, torch.zeros(3)).image
         error = squared_error(render(run, frame), frame.composite(run.trained.background)).float()
         mask = frame.head_mask
         (sums,) = torch.autograd.grad(painted, colours, torch.stack((error * mask, mask, torch.zeros_like(mask)), -1))
@@ -169,8 +168,8 @@ def predict(run: Run, frame: Frame, values: Tensor) -> Drawn:
     truth, picture = frame.composite(run.trained.background), render(run, frame)
     scale = values.amax(dim=0).clamp(min=1e-12)
     colours = torch.nn.functional.pad(values / scale, (0, 1))  # within [0, 1], which the splatter does not clamp
-    gaussians = run.trained.gaussians(frame.params)._replace(sh=((colours - 0.5) / C0)[:, None])
-    blended = splat(gaussians, frame.camera, torch.zeros(3))
+    gaussians = run.trained.gaussians(frame.params, frame.camera)._replace(sh=((colours - 0.5) / C0)[:, None])
+    blended = run.avatar.draw(gaussians, frame.camera, torch.zeros(3))
     means = blended.image[..., :2] * scale / blended.alpha.clamp(min=1e-6)[..., None]
     steps = torch.stack(torch.gradient(picture.mean(dim=-1))).square().sum(dim=0)
     maps = {"variance": means[..., 0], "training": means[..., 1], "edges": steps}
@@ -204,12 +203,17 @@ def arbitrariness(run: Run, frame: Frame, variances: Tensor) -> tuple[float, flo
     hyper = run.avatar.hyper
     if not isinstance(hyper, HyperHeads):
         raise TypeError("the variance of a head that is held through its precision was asked for")
-    before, kept = splat(run.avatar(frame.params), frame.camera, run.trained.background).image, hyper.heads()
+    before, kept = picture_of(run, frame), hyper.heads()
     generator = torch.Generator().manual_seed(0)
     hyper.set_heads({name: rescaled(head, generator) for name, head in kept.items()})
-    after, other = splat(run.avatar(frame.params), frame.camera, run.trained.background).image, variance_of(run)
+    after, other = picture_of(run, frame), variance_of(run)
     hyper.set_heads(kept)
     return float((after - before).abs().max()), rank_correlation(other.numpy(), variances.numpy())
+
+
+def picture_of(run: Run, frame: Frame) -> Tensor:
+    gaussians = run.avatar(frame.params, None, frame.camera.R_cam_world)
+    return run.avatar.draw(gaussians, frame.camera, run.trained.background).image
 
 
 def rescaled(head: HyperHead, generator: torch.Generator) -> HyperHead:

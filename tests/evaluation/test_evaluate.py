@@ -11,12 +11,11 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
-from disc import SIZE, TEST, make_run, read_png
+from disc import SIZE, TEST, BlobRenderer, make_run, read_png
 
 from avatar.data.split import Split
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.evaluation import draw as draw_module
 from avatar.evaluation import measure as measure_module
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import builtin_protocols, choose_protocols
@@ -27,12 +26,12 @@ def test_protocols_measure_what_they_share_once(
 ) -> None:
     """Five protocols over three backgrounds: three renderings and, with one masked pair, four SSIM maps a frame."""
     calls: list[str] = []
-    for module, name in ((draw_module, "drawn"), (measure_module, "ssim_map")):
+    for module, name in ((BlobRenderer, "draw"), (measure_module, "ssim_map")):
         real = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, real=real, name=name: (calls.append(name), real(*a))[1])
     evaluate(make_run(tmp_path / "run", subject), say=lambda _: None)
     worst = 3  # drawn again for the contact sheet
-    assert (calls.count("drawn"), calls.count("ssim_map")) == (3 * len(TEST) + worst, 4 * len(TEST))
+    assert (calls.count("draw"), calls.count("ssim_map")) == (3 * len(TEST) + worst, 4 * len(TEST))
 
 
 def test_bins_intervals_worst_frames_and_speed_are_in_the_results(tmp_path: Path, subject: Subject) -> None:
@@ -159,8 +158,8 @@ def test_a_protocol_without_a_frame_is_left_out_before_rendering(
     early = replace(subject, recording=replace(subject.recording, split=Split(tuple(range(3, 10)), (0, 1, 2))))
     run = make_run(tmp_path / "run", early)
     said: list[str] = []
-    real = draw_module.drawn
-    monkeypatch.setattr(draw_module, "drawn", lambda *a: (said.append("drawn"), real(*a))[1])
+    real = BlobRenderer.draw
+    monkeypatch.setattr(BlobRenderer, "draw", lambda *a: (said.append("drawn"), real(*a))[1])
     results = json.loads(evaluate(run, [str(path), "strict"], say=said.append).read_text())
     sentence = "last2 is not measured: none of the last 2 frames of disc is held out"
     assert said[:2] == [f"Note: {sentence}", "drawn"]

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from disc import SIZE, TEST, Blob, make_run, read_png
+from disc import SIZE, TEST, Blob, BlobRenderer, make_run, read_png
 
 from avatar.data.subject import Subject
-from avatar.evaluation import draw as draw_module
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import MEASURES, choose_protocols
 from avatar.evaluation.verify import recompute
@@ -97,9 +96,9 @@ def test_an_avatar_without_error_has_no_worst_frame(
 ) -> None:
     """Infinite PSNR is no figure: results stay valid JSON, and there is nothing to look at."""
     monkeypatch.setattr(
-        draw_module,
-        "drawn",
-        lambda gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE)),
+        BlobRenderer,
+        "draw",
+        lambda self, gaussians, camera, colour: Rendering(colour.expand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE)),
     )
     monkeypatch.setattr(Frame, "composite", lambda self, colour: colour.expand(SIZE, SIZE, 3))
     run = make_run(tmp_path / "run", subject)

@@ -53,7 +53,7 @@ for (let i = 0; i < Number(cases); ++i) {
       continue;
     }
     const core = await AvatarCore.load(wasm, damaged(i % 5));
-    core.pose(core.header.rest);
+    core.pose(core.header.rest, core.header.camera.rotation);
     core.draw({ rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], translation: [0, 0, 1], fx: 32, fy: 32, cx: 8, cy: 8 }, 16, 16);
     ++found.drawn;
   } catch (error) {

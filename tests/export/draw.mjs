@@ -5,7 +5,7 @@ const [web, avatar, frames, out] = process.argv.slice(2);
 const { AvatarCore, unpack } = await import(`${web}/core.js`);
 const core = await AvatarCore.load(readFileSync(new URL(`${web}/avatar.wasm`)), await unpack(readFileSync(avatar)));
 const pictures = JSON.parse(readFileSync(frames)).map(({ parameters, camera, width, height }) => {
-  core.pose(parameters);
+  core.pose(parameters, camera.rotation);
   return Buffer.from(core.draw(camera, width, height).slice().buffer);
 });
 writeFileSync(out, Buffer.concat(pictures));

@@ -20,7 +20,6 @@ from avatar.export.movie import limits_of, path_camera
 from avatar.export.ply import FIELDS, encode_ply
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat import splat
 from avatar.types import Gaussians
 
 
@@ -56,11 +55,11 @@ def read_splats(data: bytes) -> Gaussians:
 def test_splats_read_back_draw_the_same_picture(trained: TrainedAvatar) -> None:
     for i in (0, 7):
         params, camera = trained.recording.params(i), trained.recording.camera(i, 96)
-        again = read_splats(encode_ply(trained.gaussians(params), "a\nb"))
+        again = read_splats(encode_ply(trained.gaussians(params, camera), "a\nb"))
         assert again.sh.shape[1] == 16
-        picture = splat(again, camera, trained.background).image
+        picture = trained.avatar.draw(again, camera, trained.background).image
         assert psnr(picture, trained.render(params, camera).image) > 50
-    other = splat(again, trained.recording.camera(0, 96), trained.background).image
+    other = trained.avatar.draw(again, trained.recording.camera(0, 96), trained.background).image
     assert psnr(other, trained.render(trained.recording.params(0), trained.recording.camera(0, 96)).image) < 40
 
 

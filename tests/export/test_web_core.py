@@ -32,6 +32,8 @@ MODELS = {
     "covariance": ("model=covariance",),
     "detail": ("model.uv_detail=2",),
     "rigidity": ("model.rigidity=true",),
+    "facing": ("model.facing=true",),
+    "blur": ("model.blur=1.5",),
 }
 
 
@@ -92,16 +94,21 @@ def test_webassembly_draws_the_same_pictures(model: str, tracked_folder: Path, t
     assert min(psnr(a, b) for a, b in zip(picture, truth, strict=True)) > 60
 
 
-def test_files_from_before_rigidity_are_drawn_as_they_were(tracked_folder: Path, tmp_path: Path) -> None:
-    trained = lively_avatar(tracked_folder, tmp_path / "run", "model.rigidity=false")
+@pytest.mark.parametrize("magic", [b"AVW1", b"AVW2"])
+def test_files_of_earlier_formats_are_drawn_as_they_were(magic: bytes, tracked_folder: Path, tmp_path: Path) -> None:
+    rigidity = "false" if magic == b"AVW1" else "true"
+    earlier_model = (f"model.rigidity={rigidity}", "model.facing=false", "model.blur=0.3")
+    trained = lively_avatar(tracked_folder, tmp_path / "run", *earlier_model)
     now = drawn_by_node(trained, "float", tmp_path)
     raw = gzip.decompress((tmp_path / "a.avatar").read_bytes())
     length = int.from_bytes(raw[4:8], "little")
     header = json.loads(raw[8 : 8 + length])
-    del header["sizes"]["has_rigidity"], header["arrays"]["rigidity"]
+    del header["sizes"]["has_facing"], header["facing"], header["blur"]
+    if magic == b"AVW1":
+        del header["sizes"]["has_rigidity"], header["arrays"]["rigidity"]
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
-    earlier = b"".join((b"AVW1", len(text).to_bytes(4, "little"), text, raw[8 + length :]))
+    earlier = b"".join((magic, len(text).to_bytes(4, "little"), text, raw[8 + length :]))
     (tmp_path / "a.avatar").write_bytes(gzip.compress(earlier))
     assert (pictures_of_node(trained, tmp_path) == now).all()
 

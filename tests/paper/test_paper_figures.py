@@ -24,7 +24,6 @@ from avatar.commands.opening import open_run
 from avatar.errors import UserError
 from avatar.losses.metrics import squared_error
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
-from avatar.splat import splat
 
 
 def lines(path: Path) -> list[dict[str, str]]:
@@ -129,10 +128,10 @@ def test_maps_are_blended_as_colours_are_and_the_variance_is_arbitrary(folder: P
 
     # A Gaussian's mean error by definition: the pixels' weights are what a picture changes by when it alone is white.
     errors = uncertainty.gaussian_errors(run, [frame])
-    gaussians, number = run.trained.gaussians(frame.params), int(errors.argmax())
+    gaussians, number = run.trained.gaussians(frame.params, frame.camera), int(errors.argmax())
     sh = torch.full((len(run.avatar), 1, 3), -0.5 / uncertainty.C0)
     sh[number] *= -1
-    weight = splat(gaussians._replace(sh=sh), frame.camera, torch.zeros(3)).image[..., 0] * frame.head_mask
+    weight = run.avatar.draw(gaussians._replace(sh=sh), frame.camera, torch.zeros(3)).image[..., 0] * frame.head_mask
     assert float(errors[number]) == pytest.approx(float((weight * drawn.error).sum() / weight.sum()), rel=1e-3)
 
     variances = uncertainty.variance_of(run)

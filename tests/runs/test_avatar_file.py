@@ -16,7 +16,6 @@ import avatar
 from avatar.errors import UserError
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat import splat
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,7 @@ def test_the_file_draws_what_training_ended_with(trained: TrainedAvatar, tracked
     model, _ = train_small(tracked_folder, tmp_path / "again")
     params, camera = trained.recording.params(3), trained.recording.camera(3)
     with torch.no_grad():
-        expected = splat(model(params), camera, trained.background).image
+        expected = model.draw(model(params, None, camera.R_cam_world), camera, trained.background).image
     torch.testing.assert_close(trained.render(params, camera).image, expected, rtol=0, atol=1e-5)
     assert trained.step == 12 and trained.perceptual == "dssim"
 
@@ -55,7 +54,7 @@ def test_gaussians_pictures_and_streams_agree(trained: TrainedAvatar) -> None:
     assert len(pictures) == 4
     for params, picture in zip(motion, pictures, strict=True):
         assert torch.equal(picture, trained.render(params).image)
-        drawn = splat(trained.gaussians(params), camera, trained.background).image
+        drawn = trained.avatar.draw(trained.gaussians(params, camera), camera, trained.background).image
         torch.testing.assert_close(picture, drawn, rtol=0, atol=1e-6)
     moved = trained.recording.camera(0)
     (other,) = trained.stream([(motion[0], moved)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -27,7 +27,7 @@ VALUES = 20 + EXPRESSIONS
 
 @pytest.fixture(scope="module")
 def avatar(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Avatar]:
-    avatar = patterned_avatar(tmp_path_factory.mktemp("head"))
+    avatar = patterned_avatar(tmp_path_factory.mktemp("head"), "model.blur=0.3")
     with frozen(avatar):
         yield avatar
 
@@ -106,6 +106,25 @@ def test_the_gradient_of_gaussians_that_the_mesh_turns_is_that_through_the_refer
         )
 
 
+def test_the_gradient_knows_what_the_network_is_told_of_a_turn(tmp_path: Path) -> None:
+    avatar = patterned_avatar(tmp_path, "model.facing=true")
+    clip = drawn_clip(avatar, 4, 3)
+    avatar.learn_facing(clip.recording.tracks["R"])
+    assert avatar.deformation is not None and avatar.hyper is not None
+    with torch.no_grad():
+        for parameter in (*avatar.hyper.parameters(), *avatar.deformation.parameters()):
+            parameter += 0.03 * torch.randn_like(parameter)
+    likeness = Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
+    (values, pose), target = mistracked(clip), targets(clip.pictures[2], BACKGROUND, 1)
+    assert target is not None
+    with frozen(avatar):
+        check_gradient(likeness, clip)
+        told = likeness.fit(values, pose, target[0]).gradient[:3]
+        avatar.turning *= 0.0
+        untold = likeness.fit(values, pose, target[0]).gradient[:3]
+    assert float((told - untold).norm()) > 0.02 * float(told.norm())
+
+
 def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
     target = targets(clip.pictures[2], BACKGROUND, 2)[level]
     values, pose = mistracked(clip)
@@ -114,8 +133,9 @@ def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
     moving = values.clone().requires_grad_()
     moved = moved_pose(moving, pose, likeness.centre)
     camera = replace(target.camera, R_cam_world=moved.R, t_cam_world=moved.t)
-    gaussians = likeness.avatar(head_params(moving))
-    options = {"backend": "reference", "region": target.box, "blur": target.blur}
+    gaussians = likeness.avatar(head_params(moving), None, moved.R)
+    blur = target.shrink * likeness.avatar.config.blur
+    options = {"backend": "reference", "region": target.box, "blur": blur}
     image = splat(gaussians, camera, BACKGROUND, **options).image[target.box]
     misfit = misfit_of(image, target)
     (expected,) = torch.autograd.grad(misfit, moving)
@@ -127,7 +147,7 @@ def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
 
 def test_the_gradient_is_the_slope(likeness: Likeness, clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     # Where a splat ends makes finite differences jump; without the cut-off they do not.
-    monkeypatch.setattr(likeness_module, "splat", partial(splat, alpha_min=0.0, t_min=0.0))
+    monkeypatch.setattr(Avatar, "draw", partialmethod(Avatar.draw, alpha_min=0.0, t_min=0.0))
     target = targets(clip.pictures[2], BACKGROUND, 1)[0]
     values, pose = mistracked(clip)
     found = likeness.fit(values, pose, target)
@@ -162,8 +182,8 @@ def test_targets_are_the_head_with_a_margin_at_every_size(clip: Clip) -> None:
     full, half = targets(frame, BACKGROUND, 2)
     rows = frame.head_mask.any(dim=1).nonzero()[:, 0]
     assert full.box[0] == slice(max(int(rows[0]) - 8, 0), min(int(rows[-1]) + 9, SIZE))
-    assert torch.equal(full.picture, frame.composite(BACKGROUND)[full.box]) and full.blur == 0.3
-    assert (half.camera.width, half.camera.fx) == (SIZE // 2, frame.camera.fx / 2) and half.blur == 0.075
+    assert torch.equal(full.picture, frame.composite(BACKGROUND)[full.box]) and full.shrink == 1
+    assert (half.camera.width, half.camera.fx) == (SIZE // 2, frame.camera.fx / 2) and half.shrink == 0.25
     assert half.area == pytest.approx(full.area / 4, rel=1e-5)
     assert targets(replace(frame, head_mask=torch.zeros(SIZE, SIZE)), BACKGROUND, 2) is None
 
@@ -173,7 +193,8 @@ def test_a_half_size_picture_looks_like_the_full_one(likeness: Likeness, clip: C
     full, half = targets(clip.pictures[1], BACKGROUND, 2)
     values = values_of(clip.recording.tracks)[1]
     sharp, thick = (
-        head_psnr(likeness.picture(values, given(clip, 1), half._replace(blur=blur)), half) for blur in (half.blur, 0.3)
+        head_psnr(likeness.picture(values, given(clip, 1), half._replace(shrink=shrink)), half)
+        for shrink in (0.25, 1.0)
     )
     assert sharp > thick + 3.0
     assert head_psnr(likeness.picture(values, given(clip, 1), full), full) > 45.0

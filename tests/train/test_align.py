@@ -16,7 +16,6 @@ from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.refine.refine import frozen
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
-from avatar.splat import splat
 from avatar.tracking.freedom import find_freedom
 from avatar.tracking.likeness import Likeness, misfit, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
@@ -57,8 +56,9 @@ def test_the_gradient_is_that_of_refinement(avatar: Avatar, view_dependent: floa
     values = freedom.values(3, torch.full((len(freedom.index),), 0.3))
     placed = place(clip.pictures[3], values, given, centre, avatar.config.sh_degree)
     params = placed.frame.params
-    gaussians = placed.watched(avatar(params, avatar.vertices(params)))
-    picture = splat(gaussians, placed.frame.camera, BACKGROUND, region=target.box).image[target.box]
+    camera = placed.frame.camera
+    gaussians = placed.watched(avatar(params, avatar.vertices(params), camera.R_cam_world))
+    picture = avatar.draw(gaussians, camera, BACKGROUND, region=target.box).image[target.box]
     misfit(picture, target).backward()
     with frozen(avatar):
         expected = Likeness(avatar, BACKGROUND, centre).fit(values, given, target).gradient

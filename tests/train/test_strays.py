@@ -8,7 +8,6 @@ from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
-from avatar.splat import splat
 from avatar.train import trainer as trainer_module
 from avatar.train.strays import HIDDEN, cover, remove_strays, strays_step
 
@@ -23,8 +22,8 @@ def test_cover_is_the_weight_in_the_pixels(tracked_folder: Path) -> None:
     head = frame.alpha * frame.head_mask
     found = cover(avatar, frame, 1)
     with torch.no_grad():
-        gaussians = avatar(frame.params)
-        alpha = splat(gaussians, frame.camera, torch.zeros(3)).alpha
+        gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
+        alpha = avatar.draw(gaussians, frame.camera, torch.zeros(3)).alpha
     whole = torch.stack(((alpha * head).sum(), (alpha * (1.0 - head)).sum()))
     assert whole.min() > 1.0
     torch.testing.assert_close(found.sum(dim=0), whole, rtol=1e-4, atol=1e-4)
@@ -32,7 +31,7 @@ def test_cover_is_the_weight_in_the_pixels(tracked_folder: Path) -> None:
     one = int(found.sum(dim=1).argmax())
     colours = torch.full((len(gaussians.means), 1, 3), -10.0)  # black
     colours[one] = 0.5 / 0.28209479177387814  # white
-    image = splat(gaussians._replace(sh=colours), frame.camera, torch.zeros(3)).image[..., 0]
+    image = avatar.draw(gaussians._replace(sh=colours), frame.camera, torch.zeros(3)).image[..., 0]
     expected = torch.stack(((image * head).sum(), (image * (1.0 - head)).sum()))
     torch.testing.assert_close(found[one], expected, rtol=1e-4, atol=1e-4)
 

@@ -15,7 +15,6 @@ from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
 from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
-from avatar.splat import splat
 from avatar.train import step as step_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import Objective, PerceptualTerm, Weighted, choose_perceptual
@@ -92,7 +91,7 @@ def test_the_papers_other_systems_learn(tracked_folder: Path, tmp_path: Path, mo
 
     def score(avatar: Avatar) -> float:
         with torch.no_grad():
-            image = splat(avatar(frame.params), frame.camera, background).image
+            image = avatar.draw(avatar(frame.params), frame.camera, background).image
         return float(psnr(image, frame.composite(background)))
 
     assert score(trained) > score(untrained) + 2.0

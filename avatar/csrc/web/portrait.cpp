@@ -187,10 +187,12 @@ void Portrait::hold(const Rotation& turn) {
 
 // As FoldedNetwork in avatar/render.py.
 void Portrait::evaluate_network() {
-    const int M = sizes_.nodes, W = sizes_.width, C = condition_count(sizes_);
+    const int M = sizes_.nodes, W = sizes_.width, C = moving_count(sizes_);
     std::vector<float> of_frame = arrays_[kInputBias];
+    const float* weights = arrays_[kForCondition].data();
     for (int c = 0; c < C; ++c)
-        if (parameters_[c] != 0.0f) add_scaled(of_frame, arrays_[kForCondition].data() + std::int64_t{c} * W, parameters_[c]);
+        if (parameters_[c] != 0.0f) add_scaled(of_frame, weights + std::int64_t{c} * W, parameters_[c]);
+    for (int c = C; c < condition_count(sizes_); ++c) add_scaled(of_frame, weights + std::int64_t{c} * W, facing[c - C]);
     const float* of_code = arrays_[kOfCode].data();
     for (std::int64_t m = 0; m < M; ++m)
         for (int j = 0; j < W; ++j) layer_[m * W + j] = std::max(of_code[m * W + j] + of_frame[j], 0.0f);
@@ -230,7 +232,7 @@ bool Portrait::draw(const splat::Camera& camera, const float background[3], std:
                                      arrays_[kSh].data(), sizes_.gaussians, sizes_.coefficients};
     int degree = 0;
     while ((degree + 2) * (degree + 2) <= sizes_.coefficients) ++degree;
-    const splat::Settings settings{degree, 1.0f / 255.0f, 0.999f, 1e-4f, 0.3, 0.01, false, false};
+    const splat::Settings settings{degree, 1.0f / 255.0f, 0.999f, 1e-4f, blur, 0.01, false, false};
     if (!splat::forward(gaussians, camera, settings, {0, 0, camera.width, camera.height}, background,
                         splat::select_kernels(""), 1, image_.data(), alpha_.data()))
         return false;

@@ -9,7 +9,8 @@
 // program's own.
 namespace avatar::web {
 
-constexpr int kJoints = 5, kNeckJoint = 1, kPoseValues = 9 * (kJoints - 1), kOffsets = 10, kJaw = 6, kEyes = 12, kEyelids = 2, kNeck = 6;
+constexpr int kJoints = 5, kNeckJoint = 1, kPoseValues = 9 * (kJoints - 1), kOffsets = 10;
+constexpr int kJaw = 6, kEyes = 12, kEyelids = 2, kNeck = 6, kFacing = 3;
 
 struct Sizes {
     std::int32_t vertices, expressions, gaussians;
@@ -17,12 +18,14 @@ struct Sizes {
     std::int32_t latent;        // values that the network gives; 10 where there are no HyperGaussians
     std::int32_t width, layers; // of the network
     std::int32_t coefficients;  // of the colour
-    std::int32_t has_grid, has_heads, has_rigidity;
+    std::int32_t has_grid, has_heads, has_rigidity, has_facing;
 };
 
 // What moves the head in a frame, as HeadParams, in one array: expression, jaw, eyes, eyelids, neck.
 inline int parameter_count(const Sizes& s) { return s.expressions + kJaw + kEyes + kEyelids + kNeck; }
-inline int condition_count(const Sizes& s) { return s.expressions + kJaw + kEyes + kEyelids; }
+// Of these, what the network is told; after it, with has_facing, how the head is turned.
+inline int moving_count(const Sizes& s) { return s.expressions + kJaw + kEyes + kEyelids; }
+inline int condition_count(const Sizes& s) { return moving_count(s) + (s.has_facing ? kFacing : 0); }
 
 // Every array that does not change, in the order in which a caller fills them.
 enum Array {
@@ -73,6 +76,8 @@ public:
     std::int32_t* cells() { return cells_.data(); }        // [G * 4] nodes around each Gaussian
     float* parameters() { return parameters_.data(); }     // of the next frame
     std::int32_t parents[kJoints] = {-1, 0, 1, 1, 1};
+    float facing[kFacing] = {}; // of the next frame: avatar/gaussians/facing.py
+    double blur = 0.3;          // pixels^2 added to a splat's variances
 
     // False when an index lies outside of what it points into.
     bool is_sound() const;
