@@ -1,14 +1,16 @@
 """Foreground mattes: the person against the background, by a small published network and the colours at its edge.
 
 `selfie_segmentation` gives the probability of the foreground at 256x256, of the picture and of its mirror image;
-`selfie_multiclass` is taken instead where its file is. The network knows where the person ends to a pixel of its own.
-Within that, around the head, closed-form matting says what the colours say (neither a guided filter nor GrabCut did).
+`selfie_multiclass` is taken instead where its file is. The network knows where the person ends to a pixel of its own; it
+fills gaps, which a camera that stands still shows (`plate.py`). Within that, around the head, closed-form matting says what
+the colours say (neither a guided filter nor GrabCut did).
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from jaxtyping import Float, Float32, UInt8
 from avatar.errors import UserError
 from avatar.files.third_party import SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find, require
 from data_prep.track.matting import band_radius, closed_form, within_limits
+from data_prep.track.plate import Plate, shown
 
 SIDE = 256  # of the networks' pictures
 _SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network
@@ -36,20 +39,28 @@ def open_matter() -> tuple[Matter, str]:
 
 
 def sharpened(
-    image: UInt8[np.ndarray, "H W 3"], matte: UInt8[np.ndarray, "H W"], points: Float[np.ndarray, "L 2"]
+    image: UInt8[np.ndarray, "H W 3"],
+    matte: UInt8[np.ndarray, "H W"],
+    points: Float[np.ndarray, "L 2"],
+    plate: Plate | None = None,
 ) -> UInt8[np.ndarray, "H W"]:
-    """A network's matte with the colours' edge around the head, whose landmarks are `points` in pixels of the image."""
-    return within_limits(_sharpened, image, matte, _about_head(points, *matte.shape))
+    """A network's matte with the colours' edge around the head, whose landmarks are `points` in pixels of the image.
+
+    `plate` is what stands behind the person, where it is known.
+    """
+    return within_limits(partial(_sharpened, plate), image, matte, _about_head(points, *matte.shape))
 
 
-def _sharpened(image: np.ndarray, matte: np.ndarray, near_head: np.ndarray) -> np.ndarray:
+def _sharpened(plate: Plate | None, image: np.ndarray, matte: np.ndarray, near_head: np.ndarray) -> np.ndarray:
     probability = matte.astype(np.float32) / 255.0
     person = (probability > 0.5).astype(np.uint8)
+    empty = np.zeros(matte.shape, bool) if plate is None else shown(plate, image, person > 0)
+    person[empty] = 0
     reach = 2 * band_radius(*matte.shape) + 1
     edge = cv2.morphologyEx(person, cv2.MORPH_GRADIENT, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     unsure = (probability > _SURE) & (probability < 1.0 - _SURE)
     near = near_head > 0
-    band = ((edge > 0) | unsure) & near
+    band = ((edge > 0) | unsure) & near & ~empty
     known = np.where(near & ~band, person.astype(np.float32), probability)
     share = closed_form(image, known, band)
     share[band] = np.clip(0.5 + _STEEPER * (share[band] - 0.5), 0.0, 1.0)

@@ -31,12 +31,19 @@ def within_limits(
 ) -> UInt8[np.ndarray, "H W"]:
     """`refine(image, *masks)`, of smaller pictures where these are larger than `LARGEST`."""
     height, width = image.shape[:2]
+    if max(height, width) <= LARGEST:
+        return refine(image, *masks)
+    return cv2.resize(refine(*map(limited, (image, *masks))), (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def limited(pixels: UInt8[np.ndarray, "H W *C"]) -> UInt8[np.ndarray, "h w *C"]:
+    """A picture or mask at the size at which it is matted: a copy, smaller where it is larger than `LARGEST`."""
+    height, width = pixels.shape[:2]
     scale = LARGEST / max(height, width)
     if scale >= 1.0:
-        return refine(image, *masks)
+        return pixels.copy()
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = (cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) for pixels in (image, *masks))
-    return cv2.resize(refine(*small), (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def closed_form(

@@ -11,7 +11,7 @@ import numpy as np
 
 from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
-from data_prep.track import spill
+from data_prep.track import plate, spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
@@ -23,6 +23,7 @@ from data_prep.track.footage.source import Box, Footage, Span, View
 from data_prep.track.frames import (
     FrameImages,
     FrameMattes,
+    ahead,
     in_view,
     write_despilled,
     write_frames,
@@ -109,11 +110,18 @@ class Work:
             rows = {number: row for row, number in enumerate(numbers)}
             own = threading.local()  # a network is for one thread
 
-            def one(number: int) -> np.ndarray:
+            def by_network(number: int) -> tuple[np.ndarray, np.ndarray]:
                 if not hasattr(own, "matter"):
                     own.matter, _ = open_matter()
                 image = images[rows[number]]
-                return sharpened(image, own.matter(image), points[number])  # type: ignore[arg-type]
+                return image, own.matter(image)  # type: ignore[return-value]
+
+            of_clip = numbers[:: -(-len(numbers) // plate.CLIP_FRAMES)]
+            seen = ahead(of_clip, by_network, self._progress, "looking at the background")
+            behind = plate.learn_plate(pair for _, pair in seen)
+
+            def one(number: int) -> np.ndarray:
+                return sharpened(*by_network(number), points[number], behind)
 
             write_masks(folder, numbers, one, self._progress, "making mattes")
             return {}
