@@ -81,6 +81,7 @@ class Avatar(nn.Module):
             )
         tells = config.facing and self.deformation is not None
         self.register_buffer("turning", torch.zeros(3, 9) if tells else None)
+        self._turning_at_hand: Tensor | None = None  # on the CPU, where `turning` is not
         self.mesh_points: MeshPoints | None = None
         if config.name in ("splattingavatar", "monogaussianavatar"):
             place = self.embedding.texels.face, self.embedding.barycentric
@@ -208,7 +209,9 @@ class Avatar(nn.Module):
         return pose_gpu(self._pose, params.to(device))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Avatar:
+        at_hand = self.turning if self._turning_at_hand is None else self._turning_at_hand
         super()._apply(fn, recurse)
+        self._turning_at_hand = None if self.turning is None or self.turning.is_cpu else at_hand
         self.embedding.move(self.code.device)
         if self.skull is not None:
             self.skull.move(self.code.device)
@@ -219,21 +222,34 @@ class Avatar(nn.Module):
     def condition(self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None = None) -> Float[Tensor, " D"]:
         """The network's input, with expression coefficients that the frame does not carry as zeros. `rotation`: as in
         `forward`."""
-        condition = brought(params.condition(), self.code.device)
+        parts = [params.expression, params.jaw, params.eyes, params.eyelids]
         missing = self.head.assets.num_expressions - len(params.expression)
         if missing > 0:
-            E = len(params.expression)
-            condition = torch.cat((condition[:E], condition.new_zeros(missing), condition[E:]))
-        if self.turning is None:
-            return condition
-        if rotation is None:
-            return torch.cat((condition, condition.new_zeros(VALUES)))
-        return torch.cat((condition, facing(self.turning, brought(rotation, self.code.device))))
+            parts.insert(1, params.jaw.new_zeros(missing))
+        if self.turning is not None:
+            told = params.jaw.new_zeros(VALUES) if rotation is None else self._facing(rotation)
+            parts.append(brought(told, params.jaw.device))
+        return brought(torch.cat(parts), self.code.device)
+
+    def _facing(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+        """Where the rotation is, so that a camera on the CPU costs a GPU one copy."""
+        assert self.turning is not None
+        at_hand = self.turning if self._turning_at_hand is None else self._turning_at_hand
+        return facing(at_hand if rotation.is_cpu else self.turning, rotation)
 
     def learn_facing(self, rotations: Float[Tensor, "T 3 3"]) -> None:
         """Before training: how heads are turned in its frames, whose R_cam_world these are."""
         if self.turning is not None:
             self.turning.copy_(learned_turning(rotations))
+            self._keep_at_hand()
+
+    def _keep_at_hand(self) -> None:
+        """Have a copy of `turning` on the CPU where it is elsewhere."""
+        turning = self.turning
+        if turning is None or turning.is_cpu:
+            self._turning_at_hand = None
+        elif not turning.is_meta:
+            self._turning_at_hand = turning.cpu()
 
     def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
         """`splat` with this avatar's blur; `options` as there."""
@@ -242,3 +258,4 @@ class Avatar(nn.Module):
 
 def _check_loaded(avatar: Avatar, _: object) -> None:
     avatar.check_points()
+    avatar._keep_at_hand()

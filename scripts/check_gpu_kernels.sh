@@ -23,7 +23,8 @@ splat=$!
 TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider tests/gpu && gpu=0 || gpu=$?
 wait "$splat" && splat=0 || splat=$?
 cat "$work/splat"
-[ "$gpu" = 0 ] && [ "$splat" = 0 ]
+[ "$gpu" = 0 ] || exit "$gpu" # set -e does not see the first of two tests joined by &&
+[ "$splat" = 0 ] || exit "$splat"
 part "mistakes in the kernels"
 TRITON_INTERPRET=1 "$python" scripts/mutate_kernels.py --jobs "$jobs" --changed-only
 part "launches, and compiling"

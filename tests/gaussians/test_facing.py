@@ -118,3 +118,24 @@ def test_an_avatar_is_drawn_with_its_own_blur() -> None:
     assert (drawn != avatar.draw(gaussians, seen, background, blur=0.05).image).any()
     assert (drawn == Renderer(avatar, background).draw(gaussians, seen, background).image).all()
     assert (drawn == avatar.draw(gaussians, seen, background, blur=2.0).image).all()
+
+
+def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On torch's meta device, where nothing can be read back, what is told is computed beside the camera."""
+    import avatar.model
+
+    R = rotations(turns(), a_mean())
+    avatar_there = small_avatar()
+    avatar_there.learn_facing(R)
+    expected = facing(torch.as_tensor(avatar_there.turning), R[3])
+    told: list[Tensor] = []
+
+    def recorded(turning: Tensor, rotation: Tensor) -> Tensor:
+        told.append(facing(turning, rotation))
+        return told[-1]
+
+    monkeypatch.setattr(avatar.model, "facing", recorded)
+    avatar_there.to("meta")
+    condition = avatar_there.condition(random_params(), R[3])
+    assert condition.is_meta and told[0].is_cpu
+    torch.testing.assert_close(told[0], expected, rtol=0, atol=0)

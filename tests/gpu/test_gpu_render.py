@@ -13,7 +13,6 @@ from avatar.bench.scenes import head_camera
 from avatar.config import load_config
 from avatar.model import Avatar
 from avatar.render import Renderer
-from avatar.splat import splat
 from avatar.types import Gaussians
 
 RECIPES = ("preset=fast", "preset=paper", "model=flashavatar")
@@ -35,7 +34,7 @@ def test_gaussians_and_picture_are_those_of_the_cpu(recipe: str) -> None:
     avatar = avatar_of(recipe)
     with the_cpus_way(), torch.no_grad():
         expected = avatar(params)
-        picture = splat(expected, camera, background)
+        picture = avatar.draw(expected, camera, background)
     renderer = Renderer(avatar.to(DEVICE), background)
     found, drawn = renderer.gaussians(params), renderer.render(params, camera)
     for name, own, wanted in zip(Gaussians._fields, found, expected, strict=True):
