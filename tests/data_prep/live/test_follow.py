@@ -140,4 +140,5 @@ for _ in range(3):
 
 
 def test_a_detector_that_nobody_closed_does_not_wait_forever(tracking_models: None) -> None:
-    subprocess.run([sys.executable, "-c", UNCLOSED], timeout=60, check=True)
+    ended = subprocess.run([sys.executable, "-c", UNCLOSED], timeout=60, check=False)
+    assert ended.returncode == 0
