@@ -42,7 +42,7 @@ from data_prep.track.quality import judge
 from data_prep.track.stages import growing, hash_of
 from data_prep.track.work import DESPILLED, Choices, Work
 
-STAGES_VERSION = 8  # raised when what a stage makes changes
+STAGES_VERSION = 9  # raised when what a stage makes changes
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
 )
