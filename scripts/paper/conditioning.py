@@ -126,23 +126,24 @@ def measure(n: int, count: int, repeats: int) -> list[Point]:
 
 
 def peaks(n: int, counts: dict[str, int]) -> dict[str, int]:
-    """Bytes of each way at its peak, in a process whose allocator gives everything back; empty where Linux is not."""
+    """Bytes of each way at its peak, in a process of its own; empty where Linux is not."""
     if not RESET.exists():
         return {}
+    code = "import sys, conditioning; conditioning.say_peaks(sys.argv[1])"
+    return json.loads(in_a_process_that_frees(code, json.dumps([n, counts])))
+
+
+def in_a_process_that_frees(code: str, *words: str) -> str:
+    """What Python code beside this file prints, where the allocator gives what is freed back to the system at once."""
     done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "import sys, conditioning; conditioning.say_peaks(sys.argv[1])",
-            json.dumps([n, counts]),
-        ],
+        [sys.executable, "-c", code, *words],
         cwd=Path(__file__).parent,
         env={**os.environ, "MALLOC_MMAP_THRESHOLD_": "65536"},
         capture_output=True,
         text=True,
         check=True,
     )
-    return json.loads(done.stdout)
+    return done.stdout
 
 
 def say_peaks(asked: str) -> None:
