@@ -1,6 +1,6 @@
 """Record an avatar's page in headless Chromium as a picture that moves and begins where it ends, for a README.
 
-python scripts/record_page.py RUN --out docs/page.gif [--head PATH] [--seconds 4] [--width 640]
+python scripts/record_page.py RUN --out docs/page.webp [--head PATH] [--seconds 4] [--width 640]
 
 Needs Chromium, and playwright from the extra [test]. The page plays held-out motion, there and back, while the camera goes
 once round within what training showed.
@@ -25,7 +25,7 @@ from avatar.export.web_page import write_page
 from avatar.files.atomic import write_atomically
 
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-FPS, COLOURS = 10, 128  # of the picture; more of either hardly shows and doubles its size
+FPS, QUALITY = 10, 75  # of the picture; more of either hardly shows and makes it half as large again
 LAYOUT = (1000, 628)  # pixels of the window: the avatar beside its sliders
 SHARE = 0.9  # of what training showed; beyond, the avatar guesses
 # Set the view, seek, and wait until that picture is drawn.
@@ -62,17 +62,17 @@ def record(page: Any, seconds: float, width: int) -> list[Image.Image]:
 
 
 def encoded(pictures: list[Image.Image]) -> bytes:
-    """A GIF without end, all pictures in the colours of one palette, so that what stands still takes no room."""
-    strip = Image.new("RGB", (pictures[0].width, sum(picture.height for picture in pictures[::8])))
-    top = 0
-    for picture in pictures[::8]:
-        strip.paste(picture, (0, top))
-        top += picture.height
-    palette = strip.quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
-    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    """A WebP without end."""
     out = io.BytesIO()
-    frames[0].save(
-        out, "GIF", save_all=True, append_images=frames[1:], duration=1000 // FPS, loop=0, optimize=False, disposal=1
+    pictures[0].save(
+        out,
+        "WEBP",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=1000 // FPS,
+        loop=0,
+        quality=QUALITY,
+        method=6,  # the slowest and smallest
     )
     return out.getvalue()
 
@@ -80,13 +80,13 @@ def encoded(pictures: list[Image.Image]) -> bytes:
 def main() -> None:
     parser = argparse.ArgumentParser(description="An avatar's page as a picture that moves.")
     parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.gif")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.webp")
     parser.add_argument("--head", type=Path)
     parser.add_argument("--seconds", type=float, default=4.0)
     parser.add_argument("--width", type=int, default=640)
     arguments = parser.parse_args()
-    if arguments.out.suffix != ".gif":
-        raise UserError(f"--out must be a .gif, not {arguments.out}")
+    if arguments.out.suffix != ".webp":
+        raise UserError(f"--out must be a .webp, not {arguments.out}")
     trained = open_trained(arguments.run, arguments.head)
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         path = write_page(trained, Path(folder) / "page.html", "small").path

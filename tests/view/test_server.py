@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ import pytest
 from browsers import chromium
 from command_line import avatar
 from lively import lively_avatar, lively_run
+from waiting import until
 
 from avatar.motion.orbit import orbited
 from avatar.runs.clips import own_clip
@@ -26,13 +27,6 @@ from avatar.view.stage import Look, Setting, Stage
 
 pytest.importorskip("viser")
 WIDTH = 96
-
-
-def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")

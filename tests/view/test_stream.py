@@ -8,7 +8,7 @@ import random
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import pytest
 import torch
 from lively import lively_run
 from pythonosc.osc_message_builder import OscMessageBuilder
+from waiting import until
 
 from avatar.commands.parser import parse
 from avatar.commands.viewing import run_send
@@ -45,13 +46,6 @@ def receiver(trained: TrainedAvatar) -> Iterator[Receiver]:
     receiver = Receiver(trained, 0)
     yield receiver
     receiver.close()
-
-
-def until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.002)
 
 
 def live_link(values: dict[str, float], subject: bytes = b"phone") -> bytes:

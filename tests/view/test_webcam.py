@@ -12,6 +12,7 @@ import pytest
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from lively import lively_run
+from waiting import until
 
 from avatar.errors import UserError
 from avatar.head.model import matrix_from_6d
@@ -95,13 +96,6 @@ def webcam(trained: TrainedAvatar, script: Script, said: list[str]) -> Iterator[
     webcam = Webcam(trained, script, said.append)
     yield webcam
     webcam.close()
-
-
-def until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.002)
 
 
 def shown(webcam: Webcam) -> Live:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from videos import LOSSLESS, X264, centre_of, encode, ffmpeg, spot
+from waiting import until
 
 from avatar.errors import UserError
 from data_prep.track.footage import ffmpeg as decoding
@@ -203,8 +203,7 @@ def test_only_one_picture_is_held(tmp_path: Path) -> None:
     next(pictures)
     before = threading.active_count()
     pictures.close()  # type: ignore[attr-defined]
-    time.sleep(0.5)
-    assert threading.active_count() < before
+    until(lambda: threading.active_count() < before)
 
 
 def test_a_silent_decoder_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
