@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 from videos import LOSSLESS, X264, centre_of, encode, ffmpeg, spot
-from waiting import until
 
 from avatar.errors import UserError
 from data_prep.track.footage import ffmpeg as decoding
@@ -195,15 +194,23 @@ def test_damage_is_said(tmp_path: Path) -> None:
     assert said[1].startswith("the video says that it is 3.6 s long, but its pictures end after")
 
 
-def test_only_one_picture_is_held(tmp_path: Path) -> None:
-    """Reading stops ffmpeg soon after the reader stops: it cannot run ahead of a full pipe."""
+def test_only_one_picture_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ffmpeg cannot run ahead of a full pipe, and ends when its reader stops."""
     encode(tmp_path / "a.mp4", [np.zeros((480, 640, 3), np.uint8)] * 200)
     video = open_video(tmp_path / "a.mp4")
+    begun = []
+
+    class Noted(subprocess.Popen):
+        def __init__(self, *args, **options) -> None:
+            super().__init__(*args, **options)
+            begun.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Noted)
     pictures = iter(video.read(whole(640, 480), Span(), lambda _: None))
     next(pictures)
-    before = threading.active_count()
+    assert [process.poll() for process in begun] == [None]
     pictures.close()  # type: ignore[attr-defined]
-    until(lambda: threading.active_count() < before)
+    assert begun[0].poll() not in (None, 0)  # ended, and not by itself
 
 
 def test_a_silent_decoder_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
