@@ -54,6 +54,7 @@ class ModelConfig:
     rigidity: bool = False  # avatars that lack it were made without
     blur: float = 0.3  # with which those that lack it were trained
     facing: bool = False
+    teeth: bool = False
 
 
 @dataclass
@@ -231,8 +232,7 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
     kinds = get_type_hints(schema)
     if unknown := [key for key in values if key not in kinds]:
         raise _no_such_key(f"{prefix}{unknown[0]}")
-    defaults = {f.name: f.default for f in dataclasses.fields(schema) if f.default is not dataclasses.MISSING}
-    values = defaults | values
+    values = {f.name: f.default for f in dataclasses.fields(schema) if f.default is not dataclasses.MISSING} | values
     if missing := [key for key in kinds if key not in values]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(

@@ -23,9 +23,10 @@ from avatar.gaussians.latent_grid import LatentGrid, latent_grid
 from avatar.gaussians.mesh_points import MeshPoints
 from avatar.gaussians.ndgs import NdGaussians
 from avatar.gaussians.rigidity import INITIAL_LOGIT, Hold, Skull, held
-from avatar.gaussians.uv import uv_texels
+from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, PoseTensors
+from avatar.head.teeth import with_teeth
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
@@ -44,9 +45,11 @@ class Avatar(nn.Module):
     `name = "splattingavatar"`: no network; learned places on the mesh, which alone moves the Gaussians.
     With `rigidity`, Gaussians that are bound to a texel learn how far they keep with the skull in place of the skin.
     With `facing`, the network is told how the head is turned before the camera.
+    With `teeth`, `mesh`, which Gaussians are bound to, goes on after the vertices and triangles of `head`; else it is
+    `head`.
 
-    `to(device)` moves all that drawing needs. `head` stays on the CPU, for those who look at the mesh; cameras and head
-    parameters may be on either side.
+    `to(device)` moves all that drawing needs. `head` and `mesh` stay on the CPU, for those who look at them; cameras and
+    head parameters may be on either side.
     """
 
     code: Tensor
@@ -56,17 +59,19 @@ class Avatar(nn.Module):
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__()
         self.config = config
+        mesh = with_teeth(assets) if config.teeth else assets
         self.head = HeadModel(assets, identity)
+        self.mesh = self.head if mesh is assets else HeadModel(mesh, identity)
         grows = config.name == "monogaussianavatar"
-        texels = uv_texels(assets, config.uv_size, config.uv_detail)
-        self.embedding = Embedding(assets, evenly_ordered(texels) if grows else texels)
+        texels = bound_texels(assets, mesh, config.uv_size, config.uv_detail)
+        self.embedding = Embedding(mesh, evenly_ordered(texels) if grows else texels)
         N = len(self.embedding)
         alive = alive_after(0, 1, N) if grows else N
-        neutral = self.embedding.points(self.head.neutral_vertices())
+        neutral = self.embedding.points(self.mesh.neutral_vertices())
         has_latents = config.name in WITH_LATENTS
         self.grid: LatentGrid | None = None
         if has_latents and config.latent_grid is not None:
-            self.grid = latent_grid(assets, self.embedding.texels, neutral, config.latent_grid)
+            self.grid = latent_grid(mesh, self.embedding.texels, neutral, config.latent_grid)
         places = neutral if self.grid is None else self.grid.places
         self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
 
@@ -85,7 +90,7 @@ class Avatar(nn.Module):
         self.mesh_points: MeshPoints | None = None
         if config.name in ("splattingavatar", "monogaussianavatar"):
             place = self.embedding.texels.face, self.embedding.barycentric
-            self.mesh_points = MeshPoints(assets.faces, self.head.neutral_vertices(), *place, learned=not grows)
+            self.mesh_points = MeshPoints(mesh.faces, self.mesh.neutral_vertices(), *place, learned=not grows)
         self.register_buffer("count", torch.tensor(alive) if grows else None)
         self.hyper: HyperHeads | CovarianceHeads | None = None
         if config.name in ("hypergaussians", "covariance"):
@@ -94,7 +99,7 @@ class Avatar(nn.Module):
         self.skull: Skull | None = None
         self.rigidity_logits: nn.Parameter | None = None
         if config.rigidity and self.mesh_points is None:
-            self.skull = Skull.of(self.head, self.embedding)
+            self.skull = Skull.of(self.mesh, self.embedding)
             self.rigidity_logits = nn.Parameter(torch.full((N,), INITIAL_LOGIT))
 
         initial_scale = torch.log(torch.cat((knn_scales(neutral[:alive]), knn_scales(neutral)[alive:])))
@@ -174,7 +179,7 @@ class Avatar(nn.Module):
         """Give the network the places that points on the mesh have now."""
         if self.mesh_points is None or self.count is None:
             return
-        vertices = self.head.neutral_vertices().to(self.code.device)
+        vertices = self.mesh.neutral_vertices().to(self.code.device)
         self.code = positional_encoding(self.mesh_points.points(vertices).detach(), self.config.frequencies)
 
     def check_points(self) -> None:
@@ -196,14 +201,14 @@ class Avatar(nn.Module):
         return self.hyper.packed if isinstance(self.hyper, HyperHeads) else None
 
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
-        """The posed head where the avatar is, metres; on a GPU without gradients."""
+        """The posed mesh where the avatar is, metres, the head model's vertices first; on a GPU without gradients."""
         device = self.code.device
         if not on_gpu(self.code):
-            return self.head.vertices(params)
+            return self.mesh.vertices(params)
         if self._pose is None or self._pose.shape.device != device:
-            self._pose = self.head.pose_tensors(device)
+            self._pose = self.mesh.pose_tensors(device)
         if self._pose is None:
-            return brought(self.head.vertices(params.to(torch.device("cpu"))), device)
+            return brought(self.mesh.vertices(params.to(torch.device("cpu"))), device)
         from avatar.head.pose_gpu import pose_gpu
 
         return pose_gpu(self._pose, params.to(device))

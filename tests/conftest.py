@@ -37,3 +37,9 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def tracked_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small tracked folder, image offset 1; do not write into it."""
     return write_tracked_folder(tmp_path_factory.mktemp("tracked") / "someone", frames=30, size=48)
+
+
+@pytest.fixture(scope="session")
+def open_mouth_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, with a head model whose lips are two; do not write into it."""
+    return write_tracked_folder(tmp_path_factory.mktemp("mouth") / "someone", frames=30, size=48, mouth_opening=True)

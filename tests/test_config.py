@@ -69,6 +69,7 @@ def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
         "model.rigidity": True,
         "model.blur": 0.05,
         "model.facing": True,
+        "model.teeth": True,
         "trainer.iterations": 4000,
         "trainer.passes": 10,
         "trainer.dssim_early": 0.1,
@@ -227,6 +228,10 @@ def test_a_key_of_any_length_is_answered_in_a_short_sentence() -> None:
 def test_a_configuration_of_an_earlier_version_means_what_it_meant() -> None:
     values = load_config().to_dict()
     assert values["trainer"].pop("stray_share") > 0 and values["model"].pop("rigidity")
-    assert values["model"].pop("facing") and values["model"].pop("blur") < 0.3
-    earlier = ["trainer.stray_share=0", "model.rigidity=false", "model.facing=false", "model.blur=0.3"]
+    assert values["model"].pop("facing") and values["model"].pop("blur") < 0.3 and values["model"].pop("teeth")
+    earlier = [
+        "trainer.stray_share=0",
+        *(f"model.{key}=false" for key in ("rigidity", "facing", "teeth")),
+        "model.blur=0.3",
+    ]
     assert config_from_dict(values) == load_config(earlier)

@@ -37,6 +37,7 @@ def write_tracked_folder(
     suffix: str = ".jpg",
     expressions: int = 10,
     seed: int = 0,
+    mouth_opening: bool = False,
 ) -> Path:
     """Write `directory` with imgs/, alpha/, parsing/, checkpoint/ and head_model/; image number = tracking + offset.
 
@@ -44,7 +45,7 @@ def write_tracked_folder(
     """
     directory = Path(directory)
     height = height or size
-    assets = write_head_model(directory / "head_model", expressions)
+    assets = write_head_model(directory / "head_model", expressions, mouth_opening)
     for name in ("imgs", "alpha", "parsing", "checkpoint"):
         (directory / name).mkdir(parents=True, exist_ok=True)
     identity = np.zeros(SHAPE_COEFFICIENTS, np.float32)
@@ -143,8 +144,11 @@ def render(head: HeadModel, content: dict, width: int, height: int) -> tuple[np.
     return image.astype(np.uint8), covered.astype(np.uint8), is_lip.astype(np.uint8)
 
 
-def write_head_model(directory: Path, expressions: int = 10) -> HeadAssets:
-    """Write generic_model.pkl, head_template.obj, eyelids and FLAME_masks.pkl; return them as the program reads them."""
+def write_head_model(directory: Path, expressions: int = 10, mouth_opening: bool = False) -> HeadAssets:
+    """Write generic_model.pkl, head_template.obj, eyelids and FLAME_masks.pkl; return them as the program reads them.
+
+    With a mouth opening, the mesh has a hole between the lips.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     theta = np.linspace(0.02, np.pi - 0.45, ROWS)  # from the crown to the open neck
     phi = np.linspace(0, 2 * np.pi, COLUMNS, endpoint=False)  # from the back, where the UV seam is
@@ -174,6 +178,9 @@ def write_head_model(directory: Path, expressions: int = 10) -> HeadAssets:
     uv_quad = np.stack((i * (COLUMNS + 1) + j, (i + 1) * (COLUMNS + 1) + j, (i + 1) * (COLUMNS + 1) + j + 1,
                         i * (COLUMNS + 1) + j + 1), axis=1)  # fmt: skip
     faces, uv_faces = (np.concatenate((q[:, [0, 1, 2]], q[:, [0, 2, 3]])) for q in (quad, uv_quad))
+    if mouth_opening:
+        is_between = lip_distance[faces].max(axis=1) < 0.7
+        faces, uv_faces = faces[~is_between], uv_faces[~is_between]
 
     rng = np.random.default_rng(1)
     directions = np.zeros((V, 3, SHAPE_COEFFICIENTS + expressions))

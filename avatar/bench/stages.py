@@ -57,7 +57,7 @@ class StagedStep:
         self._chain.clear()
         frame = watch.measure("frame", make_frame)
         target = watch.measure("target", lambda: frame.composite(objective.background))
-        vertices = watch.measure("skinning", lambda: avatar.head.vertices(frame.params))
+        vertices = watch.measure("skinning", lambda: avatar.mesh.vertices(frame.params))
         points = watch.measure("embedding", lambda: avatar.embedding.points(vertices))
         condition = avatar.condition(frame.params, frame.camera.R_cam_world)
 

@@ -121,7 +121,7 @@ def trainee(
     shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
     with FrameLoader(subject, config.data.size, shelf=shelf) as loader:
         frames = list(loader.frames(chosen))
-    meshes = PosedMeshes(avatar if is_gpu else avatar.head)
+    meshes = PosedMeshes(avatar if is_gpu else avatar.mesh)
     for frame in frames:
         meshes.vertices(frame)
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)

@@ -64,7 +64,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
 
     Raises UserError for an avatar that does not fold.
     """
-    model, assets = trained.avatar, trained.assets
+    model, assets = trained.avatar, trained.avatar.mesh.assets
     if model.ndgs is not None:
         raise UserError(
             "an avatar of model=ndgs cannot be exported for browsers, which do not know its opacities; train one with "
@@ -120,7 +120,7 @@ def _head_arrays(
     model: Avatar, assets: HeadAssets, used: Int[Tensor, " v"], moved: Int[Tensor, " e"]
 ) -> dict[str, Tensor]:
     """Skinning of the vertices that Gaussians are bound to; joints with the expressions folded in."""
-    identity = model.head.neutral_vertices()
+    identity = model.mesh.neutral_vertices()
     directions = assets.expression_dirs[:, :, moved]
     expression_joints = torch.einsum("jv,vce->ejc", assets.joint_regressor, directions)
     pose_dirs = assets.pose_dirs.reshape(len(assets.template), 3, 9 * (len(JOINT_NAMES) - 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +25,10 @@ FINEST = 2048  # texels a side, of a raster and of a detailed one
 
 
 class UVTexels(NamedTuple):
-    """The covered texels of a raster of the UV map, row by row from the top; where it is finer, after the others."""
+    """The covered texels of a raster of the UV map, row by row from the top; where it is finer, after the others.
+
+    Those whose row is at or beyond `side` lie below the map.
+    """
 
     row: Int[Tensor, " N"]
     column: Int[Tensor, " N"]
@@ -40,6 +45,8 @@ def uv_texels(assets: HeadAssets, size: int, detail: int = 1) -> UVTexels:
     left out, as in FlashAvatar. Raises ValueError when nothing is covered, UserError for a raster that is too fine.
     """
     coarse = _raster(assets, size)
+    if len(coarse.row) == 0:
+        raise ValueError(f"no texel of a {size} x {size} raster lies in the head model's UV layout")
     if detail == 1:
         return coarse
     if size * detail > FINEST:
@@ -50,6 +57,17 @@ def uv_texels(assets: HeadAssets, size: int, detail: int = 1) -> UVTexels:
     fine, is_detailed = _raster(assets, size * detail), detailed_faces(assets)
     outside, inside = ~is_detailed[coarse.face], is_detailed[fine.face]
     return UVTexels(*(torch.cat((a[outside], b[inside])) for a, b in zip(coarse, fine, strict=True)))
+
+
+def bound_texels(assets: HeadAssets, mesh: HeadAssets, size: int, detail: int) -> UVTexels:
+    """What an avatar's Gaussians are bound to: `uv_texels`, and of a `mesh` that goes on after the head model's triangles
+    (`avatar.head.teeth`) the texels of those, as fine as about the mouth."""
+    texels, first = uv_texels(assets, size, detail), len(assets.faces)
+    if len(mesh.faces) == first:
+        return texels
+    added = replace(mesh, faces=mesh.faces[first:], uv_faces=mesh.uv_faces[first:])
+    more = _raster(added, size * detail, 1.0 - float(mesh.uvs[added.uv_faces, 1].min()))
+    return UVTexels(*(torch.cat(both) for both in zip(texels, more._replace(face=more.face + first), strict=True)))
 
 
 def detailed_faces(assets: HeadAssets) -> Bool[Tensor, " F"]:
@@ -77,12 +95,13 @@ def painted(
 ) -> tuple[Shaped[np.ndarray, "S S C"], Bool[np.ndarray, "S S"]]:
     """The values as a map, S the side of the finest raster, and where there are any; 0 elsewhere.
 
-    A coarse texel whose centre lies where the raster is finer has no Gaussian, so half of one may stay empty beside it.
+    Texels below the map are left out. A coarse texel whose centre lies where the raster is finer has no Gaussian, so half
+    of one may stay empty beside it.
     """
     size = int(texels.side.max())
     image, covered = np.zeros((size, size, values.shape[1]), values.dtype), np.zeros((size, size), bool)
     for side in texels.side.unique().tolist():
-        own, times = (texels.side == side).numpy(), size // side
+        own, times = ((texels.side == side) & (texels.row < side)).numpy(), size // side
         for i in range(times):
             for j in range(times):
                 place = texels.row.numpy()[own] * times + i, texels.column.numpy()[own] * times + j
@@ -90,20 +109,18 @@ def painted(
     return image, covered
 
 
-def _raster(assets: HeadAssets, size: int) -> UVTexels:
-    """The texels of one raster."""
+def _raster(assets: HeadAssets, size: int, sides: float = 1.0) -> UVTexels:
+    """The texels of one raster, which reaches down so many sides of the map."""
     if size < 1:
         raise ValueError(f"the UV raster must have at least one texel a side, got {size}")
     uv = assets.uvs.numpy()
     flat = np.stack((uv[:, 0] * size, (1.0 - uv[:, 1]) * size, np.ones(len(uv), np.float32)), axis=1)
-    raster = rasterize_mesh(flat, assets.uv_faces.numpy(), size, size)
+    raster = rasterize_mesh(flat, assets.uv_faces.numpy(), math.ceil(sides * size), size)
     covered = raster.face_id >= 0
     if "boundary" in assets.regions:
         on_rim = np.isin(assets.faces.numpy(), assets.regions["boundary"].numpy()).max(axis=1)
         covered &= ~on_rim[raster.face_id]
     row, column = np.nonzero(covered)
-    if len(row) == 0:
-        raise ValueError(f"no texel of a {size} x {size} raster lies in the head model's UV layout")
     return UVTexels(
         torch.from_numpy(row),
         torch.from_numpy(column),

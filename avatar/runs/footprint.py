@@ -15,8 +15,9 @@ from avatar.gaussians.covariance import triangle_size
 from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.facing import VALUES
 from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
-from avatar.gaussians.uv import uv_texels
+from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
+from avatar.head.teeth import with_teeth
 from avatar.model import CONDITION_EXTRAS, WITH_LATENTS
 
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
@@ -40,8 +41,9 @@ _OTHERS = ("colours and shapes of the Gaussians", "model.uv_size")
 
 def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
     """How many Gaussians an avatar of this head has. Raises UserError where the UV raster is too coarse to have any."""
+    mesh = with_teeth(assets) if config.teeth else assets
     try:
-        return len(uv_texels(assets, config.uv_size, config.uv_detail).face)
+        return len(bound_texels(assets, mesh, config.uv_size, config.uv_detail).face)
     except ValueError as error:
         raise UserError(f"model.uv_size={config.uv_size} is too small: {error}") from None
 

@@ -168,12 +168,12 @@ class Likeness:
         return Fit(error.detach(), by_values + through_pose, picture.detach())
 
     @cached_property
-    def _head(self) -> HeadModel:
-        return self.avatar.head.on(self.centre.device)
+    def _mesh(self) -> HeadModel:
+        return self.avatar.mesh.on(self.centre.device)
 
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
-        """The posed head where the avatar is, metres; differentiable."""
-        return self._head.vertices(params)
+        """The posed mesh where the avatar is, metres; differentiable."""
+        return self._mesh.vertices(params)
 
     def _draw_moved(
         self, gaussians: Gaussians, values: Tensor, pose: HeadPose, given: HeadPose, target: Target

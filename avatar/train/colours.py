@@ -37,7 +37,7 @@ def colour_from_frames(avatar: Avatar, subject: Subject, size: int | None, frame
 
 def seen_colours(avatar: Avatar, frame: Frame) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
     """The frame's colour at each Gaussian's place on the mesh, and how far the frame shows that place, in [0, 1]."""
-    vertices = avatar.head.vertices(frame.params)
+    vertices = avatar.mesh.vertices(frame.params)
     points = avatar.embedding.points(vertices)
     camera = frame.camera
     screen = camera.project(points)
@@ -46,7 +46,7 @@ def seen_colours(avatar: Avatar, frame: Frame) -> tuple[Float[Tensor, "N 3"], Fl
     eye = -camera.R_cam_world.T @ camera.t_cam_world
     facing = torch.nn.functional.cosine_similarity(normals, eye - points, dim=-1).clamp(min=0)
 
-    raster = rasterize_mesh(camera.project(vertices).numpy(), avatar.head.faces.numpy(), camera.height, camera.width)
+    raster = rasterize_mesh(camera.project(vertices).numpy(), avatar.mesh.faces.numpy(), camera.height, camera.width)
     surface = torch.from_numpy(raster.depth).where(torch.from_numpy(raster.face_id) >= 0, torch.inf)
     nearest = sample(surface[..., None], screen, "nearest")[:, 0]  # 0 outside the image: nothing is seen there
     in_front = (screen[:, 2] > 0) & (screen[:, 2] <= nearest + DEPTH_TOLERANCE)

@@ -58,7 +58,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
     likeness = Likeness(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0))
-    vertices = avatar.head.vertices(frame.params)
+    vertices = avatar.mesh.vertices(frame.params)
 
     def seconds(step: int, moves: bool = False) -> float:
         taken = []

@@ -28,9 +28,17 @@ def run(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return lively_run(tracked_folder, tmp_path_factory.mktemp("runs") / "run")
 
 
-@pytest.fixture(scope="module")
-def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
-    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run")
+@pytest.fixture(scope="module", params=["plain", "teeth"])
+def trained(
+    request: pytest.FixtureRequest,
+    tracked_folder: Path,
+    open_mouth_folder: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> TrainedAvatar:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    if request.param == "teeth":
+        return lively_avatar(open_mouth_folder, run, "model.teeth=true")
+    return lively_avatar(tracked_folder, run)
 
 
 def read_splats(data: bytes) -> Gaussians:
@@ -146,7 +154,7 @@ def lively_copy(trained: TrainedAvatar) -> TrainedAvatar:
     from dataclasses import replace
 
     model = copy.deepcopy(trained.avatar)
-    points = model.embedding.points(model.head.neutral_vertices())
+    points = model.embedding.points(model.mesh.neutral_vertices())
     model.sh_dc[:, 0] = 1.5 * torch.sin(points * 60)
     model.sh_rest.zero_()
     for parameter in (*model.deformation.parameters(), *model.hyper.parameters()):  # on the mesh

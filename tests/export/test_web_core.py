@@ -34,6 +34,7 @@ MODELS = {
     "rigidity": ("model.rigidity=true",),
     "facing": ("model.facing=true",),
     "blur": ("model.blur=1.5",),
+    "teeth": ("model.teeth=true",),
 }
 
 
@@ -85,8 +86,11 @@ def drawn_here(trained: TrainedAvatar) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_webassembly_draws_the_same_pictures(model: str, tracked_folder: Path, tmp_path: Path) -> None:
-    trained = lively_avatar(tracked_folder, tmp_path / "run", *MODELS[model])
+def test_webassembly_draws_the_same_pictures(
+    model: str, tracked_folder: Path, open_mouth_folder: Path, tmp_path: Path
+) -> None:
+    folder = open_mouth_folder if model == "teeth" else tracked_folder
+    trained = lively_avatar(folder, tmp_path / "run", *MODELS[model])
     truth = drawn_here(trained)
     assert 0.1 < float((truth != trained.background).float().mean()) < 0.95, "something to see, and something around it"
     assert psnr(truth[0], truth[1]) < 30, "frames differ"
