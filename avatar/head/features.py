@@ -27,7 +27,7 @@ def openings(assets: HeadAssets) -> Int[Tensor, " R"]:
 
 
 def mouth_rim(assets: HeadAssets) -> Int[np.ndarray, " R"]:
-    """The vertices on the rim of the mouth: of the holes in the face below the eyes the widest; none where there is none."""
+    """The vertices on the rim of the mouth: of the holes in the face below the eyes the widest; none without one."""
     points = assets.template.double().numpy()
     lower = [rim for rim in _rims(assets) if points[rim, 1].mean() < _between_eyes(assets)[1] - BELOW_EYES]
     return max(lower, key=lambda rim: np.ptp(points[rim, 0]), default=np.zeros(0, np.int64))

@@ -23,9 +23,7 @@ BEHIND = 0.014  # metres from the lips' foremost point in the middle back to the
 ARCH = 25.0  # per metre: so much times x^2 is a row set back beside the middle, 7 mm at the canines
 CHIN = 0.032  # metres below the middle of the mouth
 AROUND_CHIN = 0.010  # metres about that within which skin follows the lower row
-SIDE = (
-    0.4  # metres of a row that the side of the UV map stands for: 1.6 mm a texel of the default recipe's finer raster
-)
+SIDE = 0.33  # metres of a row that the side of the UV map stands for: 1.3 mm a texel of the default's finer raster
 GRID = 13, 5  # vertices of a row, sideways and from top to bottom
 
 
