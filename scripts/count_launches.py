@@ -107,7 +107,7 @@ class Rehearsal:
     ) -> None:
         config = load_config([f"model.uv_size={uv_size}", *overrides])
         avatar = Avatar(assets, torch.zeros(1), config.model)
-        avatar.embedding.touching(assets.num_vertices)  # made once, and only of numbers that are there
+        avatar.embedding.touching(avatar.mesh.assets.num_vertices)  # made once, and only of numbers that are there
         self.avatar = avatar.to(device)
         self.config, self.trainer = config, config.trainer
         with patch("torch.optim.adam._device_dtype_check_for_fused"):  # it knows no meta device
