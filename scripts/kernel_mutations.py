@@ -183,8 +183,8 @@ MUTATIONS = [
     Mutation(
         "project_backward",
         "a splat's first slot is left out",
-        "range(tl.max(count, 0))",
-        "range(1, tl.max(count, 0))",
+        "range(0, tl.max(tiles, 0), LANES)",
+        "range(1, tl.max(tiles, 0), LANES)",
         first="reference[17x33",
     ),
     Mutation(

@@ -37,7 +37,8 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     from avatar.losses import gpu as losses_gpu
     from avatar.splat import gpu_draw
 
-    wide = gpu_draw.Tuning(tile=16, step=32, backward_step=32, lanes=1024, backward_lanes=1024)
+    lanes = {"lanes": 1024, "backward_lanes": 1024, "summed": 256, "summed_lanes": 4}
+    wide = gpu_draw.Tuning(tile=16, step=32, backward_step=32, **lanes)
     patch.setattr(gpu_draw, "TUNING", wide)
     patch.setattr(place_gpu, "LANES", 1024)
     patch.setattr(place_gpu, "ENTRIES", 256)

@@ -27,67 +27,91 @@ from avatar.kernels.rows import load3, store3, store4
 HALF_LOG2E = tl.constexpr(0.72134752044448170368)
 
 
-@triton.jit
-def _sums(moments, places, begin, count, capacity, COLOURS: tl.constexpr, BLOCK: tl.constexpr):
-    """Moments of each splat, summed over its slots in their order: the six of its place, or the three of its colour."""
-    m0, m1, m2 = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
-    m3, m4, m5 = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
-    for j in range(tl.max(count, 0)):
-        slot = begin + j
-        live = (j < count) & (slot < capacity)
-        place = tl.load(places + slot, mask=live, other=-1)
-        live &= place >= 0
-        at = moments + MOMENTS * place
-        if COLOURS:
-            m0 += tl.load(at + 6, mask=live, other=0.0).to(tl.float64)
-            m1 += tl.load(at + 7, mask=live, other=0.0).to(tl.float64)
-            m2 += tl.load(at + 8, mask=live, other=0.0).to(tl.float64)
-        else:
-            m0 += tl.load(at, mask=live, other=0.0).to(tl.float64)
-            m1 += tl.load(at + 1, mask=live, other=0.0).to(tl.float64)
-            m2 += tl.load(at + 2, mask=live, other=0.0).to(tl.float64)
-            m3 += tl.load(at + 3, mask=live, other=0.0).to(tl.float64)
-            m4 += tl.load(at + 4, mask=live, other=0.0).to(tl.float64)
-            m5 += tl.load(at + 5, mask=live, other=0.0).to(tl.float64)
-    return m0, m1, m2, m3, m4, m5
+@triton.jit(do_not_specialize=["count", "capacity"])
+def sum_moments(
+    order,
+    ends,
+    boxes,
+    places,
+    moments,
+    count,
+    capacity,
+    sums,
+    LANES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Sum each splat's moments over its slots, in a fixed order: sums [9, count], float64; LANES slots at a time.
 
-
-@triton.jit
-def _slots(order, ends, boxes, count, capacity, BLOCK: tl.constexpr):
-    """The Gaussian of each lane, front to back, whether there is one, its first slot and how many it has."""
+    A kernel of its own, whose lanes share a splat's slots: a few splats have hundreds, and a lane for each would wait for
+    the longest.
+    """
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = rank < count
     i = tl.load(order + rank, mask=here, other=0).to(tl.int32)
     spoilt = tl.load(ends + count - 1) > capacity
     tiles = tl.where(spoilt, 0, tl.load(boxes + 3 * count + i, mask=here, other=0))
     begin = tl.where(spoilt, 0, tl.load(ends + rank, mask=here, other=0)).to(tl.int32) - tiles
-    return i, here, begin, tiles
+    zero = tl.zeros([BLOCK, LANES], tl.float64)
+    m0, m1, m2, m3, m4, m5, m6, m7, m8 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for first in range(0, tl.max(tiles, 0), LANES):
+        j = first + tl.arange(0, LANES)[None, :]
+        slot = begin[:, None] + j
+        live = (j < tiles[:, None]) & (slot < capacity)
+        place = tl.load(places + slot, mask=live, other=-1)
+        live &= place >= 0
+        at = moments + MOMENTS * place
+        m0 += tl.load(at, mask=live, other=0.0).to(tl.float64)
+        m1 += tl.load(at + 1, mask=live, other=0.0).to(tl.float64)
+        m2 += tl.load(at + 2, mask=live, other=0.0).to(tl.float64)
+        m3 += tl.load(at + 3, mask=live, other=0.0).to(tl.float64)
+        m4 += tl.load(at + 4, mask=live, other=0.0).to(tl.float64)
+        m5 += tl.load(at + 5, mask=live, other=0.0).to(tl.float64)
+        m6 += tl.load(at + 6, mask=live, other=0.0).to(tl.float64)
+        m7 += tl.load(at + 7, mask=live, other=0.0).to(tl.float64)
+        m8 += tl.load(at + 8, mask=live, other=0.0).to(tl.float64)
+    out = sums + i
+    tl.store(out, tl.sum(m0, 1), mask=here)
+    tl.store(out + count, tl.sum(m1, 1), mask=here)
+    tl.store(out + 2 * count, tl.sum(m2, 1), mask=here)
+    tl.store(out + 3 * count, tl.sum(m3, 1), mask=here)
+    tl.store(out + 4 * count, tl.sum(m4, 1), mask=here)
+    tl.store(out + 5 * count, tl.sum(m5, 1), mask=here)
+    tl.store(out + 6 * count, tl.sum(m6, 1), mask=here)
+    tl.store(out + 7 * count, tl.sum(m7, 1), mask=here)
+    tl.store(out + 8 * count, tl.sum(m8, 1), mask=here)
 
 
-# Two kernels, because Triton's compilers take time by the cube of a kernel's length: together they took five times as long.
+@triton.jit
+def _own(count, BLOCK: tl.constexpr):
+    """The Gaussian of each lane, and whether there is one."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    return i, i < count
 
 
-@triton.jit(do_not_specialize=["degree", "count", "capacity"])
+@triton.jit
+def _sum(sums, k: tl.constexpr, count, i, here):
+    return tl.load(sums + k * count + i, mask=here, other=0.0)
+
+
+# Two more, because Triton's compilers take time by the cube of a kernel's length: together they took five times as long.
+
+
+@triton.jit(do_not_specialize=["degree", "count"])
 def colour_of_backward(
     means,
     sh,
     view,
-    order,
-    ends,
-    boxes,
-    places,
-    moments,
+    sums,
     degree,
     count,
-    capacity,
     grad_means,
     grad_sh,
     STORED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Write the gradients of the coefficients, and that of the means by way of the direction they are seen from."""
-    i, here, begin, tiles = _slots(order, ends, boxes, count, capacity, BLOCK)
-    m_red, m_green, m_blue, _, _, _ = _sums(moments, places, begin, tiles, capacity, True, BLOCK)
+    i, here = _own(count, BLOCK)
+    m_red, m_green, m_blue = _sum(sums, 6, count, i, here), _sum(sums, 7, count, i, here), _sum(sums, 8, count, i, here)
     # Where all moments are zero, so must be all that follows: values that cannot overflow stand in there.
     shown = here & ((m_red != 0.0) | (m_green != 0.0) | (m_blue != 0.0))
     mean_x, mean_y, mean_z = load3(means, i, shown)
@@ -103,20 +127,15 @@ def colour_of_backward(
     store3(grad_means, i, m_x.to(tl.float32), m_y.to(tl.float32), m_z.to(tl.float32), here)
 
 
-@triton.jit(do_not_specialize=["count", "capacity"])
+@triton.jit(do_not_specialize=["count"])
 def project_backward(
     means,
     quats,
     scales,
     opacities,
     view,
-    order,
-    ends,
-    boxes,
-    places,
-    moments,
+    sums,
     count,
-    capacity,
     grad_means,
     grad_quats,
     grad_scales,
@@ -124,10 +143,11 @@ def project_backward(
     ANTIALIASED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Write the other gradients of all Gaussians; one lane for each, front to back. `grad_means` is added to what
-    `colour_of_backward` wrote there; see `project` and `bin` for the other buffers."""
-    i, here, begin, tiles = _slots(order, ends, boxes, count, capacity, BLOCK)
-    weight, m_u, m_uu, m_v, m_uv, m_vv = _sums(moments, places, begin, tiles, capacity, False, BLOCK)
+    """Write the other gradients of all Gaussians; one lane for each. `grad_means` is added to what `colour_of_backward`
+    wrote there; see `project` for the other buffers."""
+    i, here = _own(count, BLOCK)
+    weight, m_u, m_uu = _sum(sums, 0, count, i, here), _sum(sums, 1, count, i, here), _sum(sums, 2, count, i, here)
+    m_v, m_uv, m_vv = _sum(sums, 3, count, i, here), _sum(sums, 4, count, i, here), _sum(sums, 5, count, i, here)
     shown = (weight != 0.0) | (m_u != 0.0) | (m_uu != 0.0) | (m_v != 0.0) | (m_uv != 0.0) | (m_vv != 0.0)
     shown = here & shown
 

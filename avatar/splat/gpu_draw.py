@@ -14,7 +14,7 @@ from avatar.kernels.bin import FIELDS, expand, gather
 from avatar.kernels.composite import composite
 from avatar.kernels.composite_backward import MOMENTS, composite_backward
 from avatar.kernels.project import POISON, project
-from avatar.kernels.project_backward import colour_of_backward, project_backward
+from avatar.kernels.project_backward import colour_of_backward, project_backward, sum_moments
 from avatar.kernels.start import start
 from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Kind
 from avatar.splat.cpu import CannotDraw
@@ -36,6 +36,8 @@ class Tuning:
     backward_warps: int = 1
     lanes: int = 128  # Gaussians or pairs of a program
     backward_lanes: int = 32
+    summed: int = 4  # Gaussians of a program that sums their pairs, `summed_lanes` at a time
+    summed_lanes: int = 8
 
     @property
     def chunk(self) -> int:
@@ -202,7 +204,7 @@ def backward(
     grad_image: Float[Tensor, "H W 3"] | None,
     grad_alpha: Float[Tensor, "H W"] | None,
 ) -> Gaussians:
-    """The gradients of all fields; three launches."""
+    """The gradients of all fields; four launches."""
     s, d, N, tuning = settings, drawing, len(gaussians.means), drawing.tuning
     stride = d.records.shape[1]
     moments = torch.empty((stride, MOMENTS.value), dtype=torch.float32, device=background.device)
@@ -221,13 +223,21 @@ def backward(
         STEP=tuning.backward_step,
         FORWARD_STEP=tuning.step,
     )
+    sums = torch.empty((MOMENTS.value, N), dtype=torch.float64, device=background.device)
+    start(
+        sum_moments,
+        programs(N, tuning.summed),
+        *(d.order, d.ends, d.boxes, d.places, moments, N, d.capacity, sums),
+        warps=1,
+        LANES=tuning.summed_lanes,
+        BLOCK=tuning.summed,
+    )
     gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
-    lists = d.order, d.ends, d.boxes, d.places, moments
     warps = max(tuning.backward_lanes // 32, 1)
     start(
         colour_of_backward,
         programs(N, tuning.backward_lanes),
-        *(gaussians.means, gaussians.sh, s.view, *lists, s.sh_degree, N, d.capacity, gradients.means, gradients.sh),
+        *(gaussians.means, gaussians.sh, s.view, sums, s.sh_degree, N, gradients.means, gradients.sh),
         warps=warps,
         STORED=gaussians.sh.shape[1],
         BLOCK=tuning.backward_lanes,
@@ -235,7 +245,7 @@ def backward(
     start(
         project_backward,
         programs(N, tuning.backward_lanes),
-        *(*gaussians[:4], s.view, *lists, N, d.capacity, *gradients[:4]),
+        *(*gaussians[:4], s.view, sums, N, *gradients[:4]),
         warps=warps,
         ANTIALIASED=s.antialiased,
         BLOCK=tuning.backward_lanes,

@@ -21,7 +21,13 @@ def test_a_scene_agrees_with_the_reference(name: str, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize(
     "change",
-    [{"tile": 8}, {"tile": 32, "step": 16}, {"step": 4, "backward_step": 8}, {"lanes": 64, "backward_lanes": 128}],
+    [
+        {"tile": 8},
+        {"tile": 32, "step": 16},
+        {"step": 4, "backward_step": 8},
+        {"lanes": 64, "backward_lanes": 128},
+        {"summed": 1, "summed_lanes": 32},
+    ],
     ids=str,
 )
 def test_any_other_way_agrees_too(change: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
