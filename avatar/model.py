@@ -122,18 +122,21 @@ class Avatar(nn.Module):
         params: HeadParams,
         vertices: Float[Tensor, "V 3"] | None = None,
         rotation: Float[Tensor, "3 3"] | None = None,
+        *,
+        told: Float[Tensor, " 3"] | None = None,
     ) -> Gaussians:
         """The Gaussians of one frame, world space.
 
         vertices  the head posed by `params` already, metres
         rotation  R_cam_world of the camera that sees it; None: the head is turned as on average in training
+        told      what `told` gave for that rotation, if it is there already
         """
         vertices = self.vertices(params) if vertices is None else vertices
         base = self.base()
         if self.deformation is None:
             assert self.mesh_points is not None
             return compose_carried(self.mesh_points.points(vertices), self.mesh_points.turns(vertices), *base)
-        values = self.deformation(self.living(self.code), self.condition(params, rotation))
+        values = self.deformation(self.living(self.code), self.condition(params, rotation, told))
         if on_gpu(values) and values.dtype == torch.float32 and self.is_fused:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
@@ -224,20 +227,24 @@ class Avatar(nn.Module):
             self.grid.interpolate.move(self.code.device)
         return self
 
-    def condition(self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None = None) -> Float[Tensor, " D"]:
-        """The network's input, with expression coefficients that the frame does not carry as zeros. `rotation`: as in
-        `forward`."""
+    def condition(
+        self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None = None, told: Float[Tensor, " 3"] | None = None
+    ) -> Float[Tensor, " D"]:
+        """The network's input, with expression coefficients that the frame does not carry as zeros. `rotation` and `told`:
+        as in `forward`."""
         parts = [params.expression, params.jaw, params.eyes, params.eyelids]
         missing = self.head.assets.num_expressions - len(params.expression)
         if missing > 0:
             parts.insert(1, params.jaw.new_zeros(missing))
         if self.turning is not None:
-            told = params.jaw.new_zeros(VALUES) if rotation is None else self._facing(rotation)
+            if told is None:
+                told = params.jaw.new_zeros(VALUES) if rotation is None else self.told(rotation)
             parts.append(brought(told, params.jaw.device))
         return brought(torch.cat(parts), self.code.device)
 
-    def _facing(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
-        """Where the rotation is, so that a camera on the CPU costs a GPU one copy."""
+    def told(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+        """What the network of an avatar with `facing` is told of a camera's R_cam_world; where that is, so that a camera on
+        the CPU costs a GPU one copy."""
         assert self.turning is not None
         at_hand = self.turning if self._turning_at_hand is None else self._turning_at_hand
         return facing(at_hand if rotation.is_cpu else self.turning, rotation)

@@ -152,7 +152,7 @@ class Rehearsal:
                     seen = alignment.see(number, self.frame, cast(FrameLoader, None), print)
                     step = objective, number, seen.frame, seen.vertices, self.guard.judge, seen.watched
                     training_step(self.avatar, self.optimizer, *step)
-                    alignment.learn(number, seen, self.guard.is_spoilt)
+                    alignment.learn(seen, self.guard.is_spoilt)
         return launches
 
     def recording(self) -> Recording:

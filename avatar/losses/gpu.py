@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -132,7 +132,7 @@ def gaussian_window() -> tuple[float, ...]:
     return tuple(weight / sum(weights) for weight in weights)
 
 
-@lru_cache(maxsize=64)
+@cache  # for good: a CUDA graph may read them
 def constants(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Numbers that kernels read, brought to the GPU once."""
     return torch.tensor(values, dtype=dtype).to(device)

@@ -23,6 +23,7 @@ __all__ = ["CannotDraw", "Counters", "counters", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
+NEAR = 0.01  # metres
 
 
 def splat(
@@ -36,7 +37,7 @@ def splat(
     alpha_max: float = 0.999,
     t_min: float = 1e-4,
     blur: float = 0.3,
-    near: float = 0.01,
+    near: float = NEAR,
     antialiased: bool = False,
     region: tuple[slice, slice] | None = None,
 ) -> Rendering:

@@ -6,6 +6,8 @@ that overflows or more pairs of tile and splat than there is room for cannot rai
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -31,7 +33,23 @@ def splat_gpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 
 def settings_of(
     camera: Camera, device: torch.device, *, blur: float, near: float, region: Region, **options: Any
 ) -> Settings:
-    return Settings(view_block(camera, blur, near, device), camera.width, camera.height, region, **options)
+    view = view_block(camera, blur, near, device) if _fixed_view is None else _fixed_view
+    return Settings(view, camera.width, camera.height, region, **options)
+
+
+_fixed_view: Float[Tensor, " 25"] | None = None
+
+
+@contextmanager
+def fixed_view(view: Float[Tensor, " 25"]) -> Iterator[None]:
+    """Draw from where `view` says, which `view_block` made; of the camera only its size counts. So a CUDA graph that has
+    captured a drawing can draw from elsewhere."""
+    global _fixed_view
+    before, _fixed_view = _fixed_view, view
+    try:
+        yield
+    finally:
+        _fixed_view = before
 
 
 def view_block(camera: Camera, blur: float, near: float, device: torch.device) -> Float[Tensor, " 25"]:

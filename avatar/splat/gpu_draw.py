@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -263,9 +263,13 @@ def tile_grid(region: Region, tile: int) -> Grid:
     return Grid(first_x, first_y, (region.right - 1) // tile - first_x + 1, (region.bottom - 1) // tile - first_y + 1)
 
 
-@lru_cache(maxsize=16)
 def tile_numbers(tiles: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " tiles+1"]:
-    return torch.arange(tiles + 1, dtype=dtype, device=device)
+    return _numbers(tiles.bit_length(), dtype, device)[: tiles + 1]
+
+
+@cache  # for good: a CUDA graph may read them
+def _numbers(bits: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " 2^bits"]:
+    return torch.arange(1 << bits, dtype=dtype, device=device)
 
 
 def needed_pairs(

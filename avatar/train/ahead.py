@@ -42,8 +42,8 @@ class Guard:
 
     def judge(self, loss: PhotometricLoss, gradients: list[Tensor]) -> None:
         """Before the optimizer's step."""
-        norms = torch.stack(torch._foreach_norm(gradients))  # pyright: ignore
-        self._sum.add_((norms.sum() + loss.total.detach()) * 0.0)
+        norms = torch._foreach_norm(gradients)  # pyright: ignore
+        self._sum.add_(torch.stack((*norms, loss.total.detach())).sum(), alpha=0.0)
         torch.ne(self._sum, self._sum, out=self.is_spoilt)
 
     def forgive(self) -> None:

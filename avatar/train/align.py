@@ -13,7 +13,7 @@ it was compared with the whole (docs/best.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,24 +27,13 @@ from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.splat import CannotDraw
-from avatar.tracking.descent import Problem, curvature
-from avatar.tracking.freedom import find_freedom
-from avatar.tracking.likeness import (
-    OBSERVATIONS,
-    PIXEL_SIGMA,
-    Likeness,
-    coarse_levels,
-    head_psnr,
-    resized,
-    targets,
-)
+from avatar.tracking.freedom import Freedom, find_freedom
+from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness
 from avatar.tracking.motion import HeadPose, head_params, moved_pose
-from avatar.tracking.parallel import read_later
-from avatar.train.order import evenly_spread
+from avatar.train.inquiry import Inquiry
 from avatar.train.placed import Placed, place
 from avatar.train.posed import PosedMeshes
-from avatar.train.step import sh_degree, stopped
+from avatar.train.step import sh_degree
 from avatar.types import Frame, Gaussians, HeadParams
 
 BEGIN = 0.1  # share of the steps after which the avatar shows enough
@@ -76,12 +65,25 @@ def make_alignment(
     return alignment
 
 
+class Row(NamedTuple):
+    """What a frame's move in one step is made from, where the avatar is; see `Freedom`."""
+
+    given: Float[Tensor, " P"]
+    lowest: Float[Tensor, " P"]
+    highest: Float[Tensor, " P"]
+    moves: Float[Tensor, " F"]
+    R: Float[Tensor, "3 3"]  # of the given head pose
+    t: Float[Tensor, 3]
+    rate: float | Float[Tensor, ""]
+
+
 class Seen(NamedTuple):
     """What a step sees."""
 
     frame: Frame
     vertices: Float[Tensor, "V 3"]
     placed: Placed | None = None  # the frame's tracking may move
+    row: Row | None = None  # from which
 
     @property
     def watched(self) -> Callable[[Gaussians], Gaussians] | None:
@@ -93,7 +95,7 @@ class Alignment:
 
     def __init__(self, avatar: Avatar, subject: Subject, config: Config) -> None:
         trainer, device = config.trainer, avatar.code.device
-        self._trainer, self._size, self._subject, self._device = trainer, config.data.size, subject, device
+        self._trainer, self._device = trainer, device
         self._begin = round(BEGIN * trainer.iterations)
         self._again = max(round(AGAIN * trainer.iterations), self._begin + 1)
         self._end = max(round(END * trainer.iterations), self._again + 1)
@@ -104,14 +106,17 @@ class Alignment:
         self._freedom = find_freedom(tracks, self._train, centre)
         self._freedom_there = self._freedom.on(device)
         self._centre = centre
-        self._background = torch.tensor(config.data.background)
-        self._likeness = Likeness(avatar, brought(self._background, device), brought(centre, device))
+        background = torch.tensor(config.data.background)
+        self._likeness = Likeness(avatar, brought(background, device), brought(centre, device))
+        there = self._likeness, self._given_there, self._freedom_there
+        self._inquiry = Inquiry(subject, config.data.size, background, *there)
         self._meshes = PosedMeshes(avatar)
         self._places: dict[int, tuple[HeadPose, HeadParams]] = {}  # of frames that move no more
         self._moves = torch.zeros(len(subject.recording), len(self._freedom.index), device=device)
         self._last_moves: Float[Tensor, "T F"] | None = None  # on the CPU, once they move no more
         self._factor: Float[Tensor, "F F"] | None = None  # of the curvature, lower Cholesky; None: nothing moves
         self._is_over = False
+        self.measured = 0  # times that the curvature was
 
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""
@@ -144,44 +149,72 @@ class Alignment:
         `settle` waits for all steps before this one and raises when one was not finite; it is called where what they made
         of the avatar is looked at. Raises UserError, naming step and frame, when the Gaussians cannot be drawn.
         """
-        self._prepare(step, loader, say, settle)
-        if self._factor is None or not self._shows_head(frame):
-            return Seen(frame, self._meshes.vertices(frame))
-        if step >= self._end:
-            still = self._settled(frame)
-            return Seen(still, self._meshes.vertices(still))
-        values = self._freedom_there.values(frame.index, self._moves[frame.index])
-        degree = sh_degree(step, self._trainer, self._likeness.avatar.config.sh_degree)
-        placed = place(frame, values, self._given_of(frame.index), self._likeness.centre, degree)
-        return Seen(placed.frame, self._likeness.vertices(placed.frame.params), placed)
+        self.prepare(step, loader, say, settle)
+        row = self.row(step, frame)
+        return self.still(step, frame) if row is None else self.placed(step, frame, row)
 
-    def learn(self, step: int, seen: Seen, is_spoilt: Float[Tensor, ""] | None = None) -> None:
-        """Move the frame by what step `step` (from 0) has found, unless that is not finite or `is_spoilt` is 1."""
-        if seen.placed is None or self._factor is None:
-            return
-        frame, freedom = seen.frame, self._freedom_there
-        moves = self._moves[frame.index]
+    def still(self, step: int, frame: Frame) -> Seen:
+        """A frame that does not move in step `step`."""
+        if self._factor is not None and step >= self._end and self._shows_head(frame):
+            frame = self._settled(frame)
+        return Seen(frame, self._meshes.vertices(frame))
+
+    def row(self, step: int, frame: Frame) -> Row | None:
+        """Of a frame that moves in step `step`; None: it does not."""
+        if self._factor is None or step >= self._end or not self._shows_head(frame):
+            return None
+        of = self._freedom_there
+        given, lowest, highest, moves, R, t = (
+            part[frame.index] for part in (of.given, of.lowest, of.highest, self._moves, *self._given_there)
+        )
+        way = (step - self._begin) / max(self._end - self._begin, 1)
+        return Row(given, lowest, highest, moves, R, t, self._trainer.align_rate * LAST_RATE**way)
+
+    def placed(self, step: int, frame: Frame, row: Row) -> Seen:
+        """The frame where `row` has it, in a step with the colours of step `step`."""
+        degree = sh_degree(step, self._trainer, self._likeness.avatar.config.sh_degree)
+        values = self._freedom_of(row).values(0, row.moves)
+        placed = place(frame, values, HeadPose(row.R, row.t), self._likeness.centre, degree)
+        return Seen(placed.frame, self._likeness.vertices(placed.frame.params), placed, row)
+
+    def learn(self, seen: Seen, is_spoilt: Float[Tensor, ""] | None = None) -> None:
+        """Move the frame by what the step that saw it has found, unless that is not finite or `is_spoilt` is 1."""
+        if seen.placed is not None:
+            self.keep(seen.frame.index, self.moved(seen, is_spoilt))
+
+    def keep(self, frame: int, moves: Float[Tensor, " F"]) -> None:
+        self._moves[frame] = moves
+
+    def moved(self, seen: Seen, is_spoilt: Float[Tensor, ""] | None = None) -> Float[Tensor, " F"]:
+        """The frame's moves after a step that saw it; see `learn`."""
+        frame, row = seen.frame, seen.row
+        assert seen.placed is not None and row is not None and self._factor is not None
+        freedom, moves = self._freedom_of(row), row.moves
         # The loss is a mean over the frame; the misfit counts a number of observations on the head.
         area = frame.head_mask.sum().double()
         scale = OBSERVATIONS / PIXEL_SIGMA**2 * frame.head_mask.numel() / area
         gradient = scale * seen.placed.gradient()[freedom.index] * freedom.unit + moves
-        way = (step - self._begin) / max(self._end - self._begin, 1)
         direction = torch.cholesky_solve(gradient[:, None], self._factor)[:, 0]
-        low, high = freedom.bounds(frame.index)
-        moved = moves - self._trainer.align_rate * LAST_RATE**way * direction
+        low, high = freedom.bounds(0)
+        moved = moves - row.rate * direction
         moved = torch.minimum(torch.maximum(moved, low), high)
         is_sound = torch.isfinite(gradient).all()
         if is_spoilt is not None:
             is_sound = is_sound & (is_spoilt == 0)
-        self._moves[frame.index] = torch.where(is_sound, moved, moves)
+        return torch.where(is_sound, moved, moves)
+
+    def _freedom_of(self, row: Row) -> Freedom:
+        """Of one frame, number 0."""
+        return replace(self._freedom_there, given=row.given[None], lowest=row.lowest[None], highest=row.highest[None])
 
     def _shows_head(self, frame: Frame) -> bool:
         """On a GPU, which is not asked, true: the gradient of a frame without a head is not finite, and moves nothing."""
         return on_gpu(frame.head_mask) or bool(frame.head_mask.any())
 
-    def _prepare(
+    def prepare(
         self, step: int, loader: FrameLoader, say: Callable[[str], object], settle: Callable[[], object]
     ) -> None:
+        """Before step `step`; `settle`: as in `see`."""
         if self._is_over or not self._begin <= step <= self._end:
             return
         if step == self._begin:
@@ -189,7 +222,7 @@ class Alignment:
             self._measure(step, loader)
         elif step == self._again:
             settle()
-            gain = self._gain(step, loader)
+            gain = self._inquiry.gain(step, loader, self._moves, JUDGED)
             if not gain >= LEAST_GAIN:
                 self._is_over, self._factor = True, None
                 self._moves.zero_()
@@ -216,10 +249,6 @@ class Alignment:
         pose, params = self._places[frame.index]
         return replace(frame, camera=replace(frame.camera, R_cam_world=pose.R, t_cam_world=pose.t), params=params)
 
-    def _given_of(self, frame: int) -> HeadPose:
-        """Where the avatar is."""
-        return HeadPose(*(part[frame] for part in self._given_there))
-
     def _centre_moves(self) -> None:
         trained_on = torch.zeros(len(self._moves), dtype=torch.bool)
         trained_on[list(self._train)] = True
@@ -228,57 +257,9 @@ class Alignment:
         self._moves = torch.where(trained_on[:, None], centred, moves).to(self._device)
 
     def _measure(self, step: int, loader: FrameLoader) -> None:
-        """The curvature, of pictures that are no larger than they need be."""
-
-        def measured(frame: Frame, problem: Problem) -> Tensor:
-            coarsest = problem.targets[-1]
-            mouth = resized(frame.mouth_mask, coarsest.camera.width, coarsest.camera.height)[coarsest.box]
-            weight = brought(1.0 + self._trainer.mouth_weight * mouth, self._device)
-            return curvature(self._likeness, problem, len(problem.targets) - 1, self._moves[frame.index], weight)
-
-        found = self._of_frames(step, loader, SAMPLES, measured)
-        if not found:
+        self.measured += 1
+        mean = self._inquiry.curvature(step, loader, self._moves, SAMPLES, self._trainer.mouth_weight)
+        if mean is None:
             self._is_over = True
             return
-        prior = torch.eye(self._moves.shape[1])
-        self._factor = torch.linalg.cholesky(torch.stack(found).mean(dim=0) + prior).to(self._device)
-
-    def _gain(self, step: int, loader: FrameLoader) -> float:
-        """What the moves gain on training frames, dB."""
-
-        def measured(frame: Frame, problem: Problem) -> Tensor:
-            target, moves = problem.targets[0], self._moves[frame.index]
-            moved, still = (
-                head_psnr(
-                    self._likeness.picture(problem.freedom.values(frame.index, at), problem.given, target), target
-                )
-                for at in (moves, torch.zeros_like(moves))
-            )
-            return moved - still
-
-        found = self._of_frames(step, loader, JUDGED, measured)
-        return float(torch.stack(found).mean()) if found else 0.0
-
-    def _of_frames(
-        self, step: int, loader: FrameLoader, count: int, measured: Callable[[Frame, Problem], Tensor]
-    ) -> list[Tensor]:
-        """Of evenly spread training frames that show a head, on the CPU."""
-        chosen = evenly_spread(self._train, count)
-        if on_gpu(self._moves):  # whose loader's frames are there
-            frames: Iterable[Frame] = (self._subject.frame(index, self._size) for index in chosen)
-        else:
-            frames = loader.frames(chosen)
-
-        def begun(frame: Frame) -> Tensor | None:
-            made = targets(frame, self._background, coarse_levels(frame.camera.width))
-            if made is None:
-                return None
-            given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)
-            there = [target.on(self._device, given) for target in made] if on_gpu(self._moves) else made
-            problem = Problem(self._given_of(frame.index), there, frame.index, self._freedom_there)
-            try:
-                return measured(frame, problem)
-            except CannotDraw as error:
-                raise stopped(step, frame, str(error)) from error
-
-        return [found for found in read_later(begun, frames) if found is not None]
+        self._factor = torch.linalg.cholesky(mean + torch.eye(len(mean))).to(self._device)  # with the prior's

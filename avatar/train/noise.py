@@ -31,11 +31,18 @@ class ConditionNoise:
 
     def on(self, step: int, frame: Frame) -> Frame:
         """The frame as step `step` (from 0) tells the network of it: a function of seed and step."""
+        return noisy(frame, brought(self.of(step), frame.params.expression.device))
+
+    def of(self, step: int) -> Float[Tensor, " C"]:
+        """What is added in step `step`; on the CPU."""
         generator = np.random.default_rng([self._seed, step, _STREAM])
         # A sum of deviations with weights that are independent and normal has their covariance.
         weights = generator.standard_normal(len(self._deviations), dtype=np.float32)
-        noise = brought(torch.from_numpy(weights) @ self._deviations, frame.params.expression.device)
-        return replace(frame, params=frame.params.with_condition(frame.params.condition() + noise))
+        return torch.from_numpy(weights) @ self._deviations
+
+
+def noisy(frame: Frame, noise: Float[Tensor, " C"]) -> Frame:
+    return replace(frame, params=frame.params.with_condition(frame.params.condition() + noise))
 
 
 def make_noise(recording: Recording, config: TrainerConfig) -> ConditionNoise | None:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avatar.compute.device import brought, on_gpu
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.model import Avatar
@@ -35,7 +36,12 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     for group in groups:
         group["full_lr"] = group["lr"]
     # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.
-    return torch.optim.Adam(groups, eps=config.adam_eps, fused=True, capturable=avatar.code.is_cuda)
+    optimizer = torch.optim.Adam(groups, eps=config.adam_eps, fused=True, capturable=avatar.code.is_cuda)
+    if on_gpu(avatar.code) and not avatar.code.is_meta:  # where they are read: a graph is for any step's rates
+        rates_there = torch.zeros(len(groups), device=avatar.code.device)
+        for group, rate in zip(optimizer.param_groups, rates_there, strict=True):
+            group["lr"] = rate
+    return optimizer
 
 
 def schedule(step: int, config: TrainerConfig) -> float:
@@ -51,8 +57,14 @@ def schedule(step: int, config: TrainerConfig) -> float:
 
 def set_rates(optimizer: torch.optim.Adam, share: float) -> None:
     """Give every group this share of the learning rate that it was made with."""
-    for group in optimizer.param_groups:
-        group["lr"] = group["full_lr"] * share
+    groups = optimizer.param_groups
+    rates = [group["full_lr"] * share for group in groups]
+    if isinstance(first := groups[0]["lr"], Tensor):
+        assert first._base is not None  # the groups' rates are views of one tensor
+        first._base.copy_(brought(torch.tensor(rates), first.device))
+        return
+    for group, rate in zip(groups, rates, strict=True):
+        group["lr"] = rate
 
 
 def optimizer_tensors(optimizer: torch.optim.Adam, avatar: Avatar) -> dict[str, Tensor]:

@@ -57,7 +57,7 @@ class PerceptualTerm:
 
 
 class Outcome(NamedTuple):
-    """What a step saw and what it cost, before its update; without a graph, apart from the loss."""
+    """What a step saw and what it cost, before its update; without a graph."""
 
     loss: PhotometricLoss
     render: Float[Tensor, "H W 3"]
@@ -77,9 +77,12 @@ class Objective:
     background: Float[Tensor, 3]
     perceptual: PerceptualTerm
 
+    def term(self, step: int) -> Weighted | None:
+        """The third term of step `step`."""
+        return self.perceptual.at(step, round(self.config.perceptual_start * self.config.iterations))
+
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
-        start = round(self.config.perceptual_start * self.config.iterations)
-        term = self.perceptual.at(step, start)
+        term = self.term(step)
         function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
         return photometric_loss(
             image,
@@ -112,9 +115,27 @@ def training_step(
     Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
     is not finite; with a `judge` the latter is for it to see to.
     """
+    set_rates(optimizer, schedule(step, objective.config))
+    outcome = descend(avatar, optimizer, objective, step, frame, vertices, judge, watched)
+    move_points(avatar, optimizer, step + 1, objective.config)
+    return outcome
+
+
+def descend(
+    avatar: Avatar,
+    optimizer: torch.optim.Adam,
+    objective: Objective,
+    step: int,
+    frame: Frame,
+    vertices: Float[Tensor, "V 3"],
+    judge: Judge | None = None,
+    watched: Callable[[Gaussians], Gaussians] | None = None,
+    told: Float[Tensor, " 3"] | None = None,
+) -> Outcome:
+    """What of `training_step` a GPU does by itself, at the rates that the optimizer has; `told` as in `Avatar.forward`."""
     target = frame.composite(objective.background)
     try:
-        gaussians = avatar(frame.params, vertices, frame.camera.R_cam_world)
+        gaussians = avatar(frame.params, vertices, frame.camera.R_cam_world, told=told)
         gaussians = gaussians if watched is None else watched(gaussians)
         image = objective.draw(step, frame, gaussians, avatar)
     except CannotDraw as error:
@@ -126,10 +147,8 @@ def training_step(
         check_step(step, frame, loss, avatar)
     else:
         judge(loss, [parameter.grad for parameter in avatar.parameters() if parameter.grad is not None])
-    set_rates(optimizer, schedule(step, objective.config))
     optimizer.step()
-    move_points(avatar, optimizer, step + 1, objective.config)
-    return Outcome(loss, image.detach(), target)
+    return Outcome(PhotometricLoss(*(term.detach() for term in loss)), image.detach(), target)
 
 
 def choose_perceptual(

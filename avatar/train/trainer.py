@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from avatar.compute.device import CPU, on_gpu
+from avatar.compute.replay import own_stream
 from avatar.config import Config
 from avatar.data.loader import FrameLoader
 from avatar.data.shelf import Shelf, shelf_bytes
@@ -19,15 +20,15 @@ from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save
 from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
 from avatar.train.ahead import Ahead, Prompt, Spoilt
-from avatar.train.align import Seen, make_alignment
+from avatar.train.align import make_alignment
 from avatar.train.colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
 from avatar.train.noise import make_noise
 from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
-from avatar.train.posed import PosedMeshes
-from avatar.train.step import Objective, PerceptualTerm, stopped, training_step
+from avatar.train.step import Objective, PerceptualTerm, stopped
+from avatar.train.steps import Steps
 from avatar.train.strays import remove_strays, strays_step
 
 
@@ -64,10 +65,8 @@ def train(
     optimizer = make_optimizer(avatar, trainer)
     if resume is not None:
         load_optimizer(optimizer, avatar, resume.tensors)
-    meshes = PosedMeshes(avatar)
     data, is_gpu = config.data, on_gpu(avatar.code)
     alignment = make_alignment(avatar, subject, config, None if resume is None else resume.tensors)
-    noise = make_noise(recording, trainer)
     background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)
     meta = {
@@ -88,26 +87,20 @@ def train(
     shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
     step = saved = start
     with (
+        own_stream(device),
         FrameLoader(subject, data.size, data.cache_mb << 20, data.workers, shelf) as loader,
         TrainingLog(run, start, trainer.iterations, trainer.log_every) as log,
         interruption() as interrupted,
     ):
         progress = Ahead(log, optimizer, device) if is_gpu else Prompt(log)
+        steps = Steps(avatar, optimizer, objective, make_noise(recording, trainer), alignment, log.say)
         while step < trainer.iterations and not interrupted():
             order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
             try:
                 for frame in loader.frames(order):
-                    if alignment is None:
-                        seen = Seen(frame, meshes.vertices(frame))
-                    else:
-                        seen = alignment.see(step, frame, loader, log.say, progress.settle)
-                    shown = seen.frame if noise is None else noise.on(step, seen.frame)
-                    judge = progress.judge(step)
-                    outcome = training_step(
-                        avatar, optimizer, objective, step, shown, seen.vertices, judge, seen.watched
-                    )
                     if alignment is not None:
-                        alignment.learn(step, seen, progress.is_spoilt)
+                        alignment.prepare(step, loader, log.say, progress.settle)
+                    outcome = steps.make(step, frame, progress.judge(step), progress.is_spoilt)
                     step += 1
                     progress.note(step, outcome)
                     if step == strays_step(trainer):

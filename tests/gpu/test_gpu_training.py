@@ -18,6 +18,7 @@ from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.splat import capacity as capacity_module
 from avatar.splat import gpu_draw
+from avatar.train import steps as steps_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
@@ -73,6 +74,12 @@ def test_thirty_steps_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path:
     assert all(tensor.is_cpu for tensor in saved.tensors.values())
 
 
+@pytest.fixture
+def launched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No step is replayed, so that Python sees what each does."""
+    monkeypatch.setattr(steps_module, "WARM", 1000)
+
+
 def poison_gradient_at(step: int) -> Callable[[Avatar], object]:
     """The gradient of the colours is NaN at its `step`-th use (from 0), and at each that repeats it."""
     seen = {"step": 0}
@@ -84,6 +91,7 @@ def poison_gradient_at(step: int) -> Callable[[Avatar], object]:
     return lambda avatar: avatar.sh_dc.register_hook(poison)
 
 
+@pytest.mark.usefixtures("launched")
 def test_a_gradient_that_is_not_finite_is_named_and_has_moved_nothing(tracked_folder: Path, tmp_path: Path) -> None:
     steps = ("trainer.iterations=9", "trainer.checkpoint_every=3", "trainer.preview_every=9")
     with pytest.raises(UserError) as caught:
@@ -93,6 +101,7 @@ def test_a_gradient_that_is_not_finite_is_named_and_has_moved_nothing(tracked_fo
     assert [load_checkpoint(path).step for path in list_checkpoints(tmp_path / "run" / "checkpoints")] == [3]
 
 
+@pytest.mark.usefixtures("launched")
 def test_a_drawing_without_room_is_repeated_and_leaves_no_trace(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

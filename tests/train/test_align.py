@@ -80,7 +80,7 @@ def aligned(avatar: Avatar, clip: Clip) -> tuple[Alignment, Clip, list[str]]:
         frame = clip.pictures[clip.split.train[step % len(clip.split.train)]]
         seen = alignment.see(step, frame, loader, said.append)  # type: ignore[arg-type]
         training_step(avatar, optimizer, objective, 2000, seen.frame, seen.vertices, None, seen.watched)
-        alignment.learn(step, seen)
+        alignment.learn(seen)
     moves = alignment.tensors()["align.moves"]
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
     freedom = find_freedom(tracks, clip.split.train, centre)
@@ -202,7 +202,7 @@ def test_what_was_not_finite_moves_nothing_and_is_waited_for(avatar: Avatar) -> 
         gradient = factor * seen.placed.gradient()
         seen.placed.gradient = lambda: gradient  # type: ignore[method-assign]
         before = alignment.tensors()["align.moves"]
-        alignment.learn(11, seen, is_spoilt)
+        alignment.learn(seen, is_spoilt)
         return not torch.equal(alignment.tensors()["align.moves"], before)
 
     assert not moved(torch.ones(()))

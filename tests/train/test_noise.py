@@ -60,12 +60,12 @@ def test_training_poses_the_mesh_without_it(
         known.add(tuple(subject.recording.params(index).condition().tolist()))
     forward, vertices = Avatar.forward, Avatar.vertices
 
-    def listening(self: Avatar, params, *given):  # type: ignore[no-untyped-def]
+    def listening(self: Avatar, params, *given, **named):  # type: ignore[no-untyped-def]
         if torch.is_grad_enabled():
             told.add(tuple(params.condition().tolist()))
         else:
             assert tuple(params.condition().tolist()) in known
-        return forward(self, params, *given)
+        return forward(self, params, *given, **named)
 
     def posing(self: Avatar, params):  # type: ignore[no-untyped-def]
         posed.add(tuple(params.condition().tolist()))

@@ -1,0 +1,163 @@
+"""Replayed steps: what launched ones make, to the bit; and when they are not replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from interpreter import DEVICE
+from small_runs import new_avatar, open_small, small_config
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton is not installed")
+
+from avatar.compute.replay import Replay, own_stream
+from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
+from avatar.splat.capacity import CAPACITIES, Capacities, Kind
+from avatar.train import align as align_module
+from avatar.train import steps as steps_module
+from avatar.train import trainer as trainer_module
+from avatar.train.step import choose_perceptual
+from avatar.train.steps import Steps
+from avatar.train.trainer import train
+
+# Degrees of the colours change at steps 7 and 14, the third term at step 10; previews and checkpoints come in between.
+TINY = (
+    "model.uv_size=10",
+    "model.latent_grid=4",
+    "data.size=24",
+    "trainer.perceptual=dssim",
+    "trainer.iterations=20",
+    "trainer.sh_interval=7",
+    "trainer.preview_every=9",
+    "trainer.checkpoint_every=8",
+    "trainer.stray_share=0",
+)
+STILL = (*TINY, "trainer.align_rate=0")
+
+
+def trained(
+    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int
+) -> tuple[Checkpoint, Steps, list[float]]:
+    """The last checkpoint, what made the steps, and the loss of each."""
+    config = small_config(*overrides)
+    _, subject, assets = open_small(folder, config)
+    losses: list[float] = []
+    makers: list[Steps] = []
+
+    class Noting(Steps):
+        def __init__(self, *arguments: object, **named: object) -> None:
+            super().__init__(*arguments, **named)  # type: ignore[arg-type]
+            makers.append(self)
+
+        def make(self, *arguments: object, **named: object):  # type: ignore[no-untyped-def]
+            outcome = super().make(*arguments, **named)  # type: ignore[arg-type]
+            losses.append(float(outcome.loss.total))
+            return outcome
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer_module, "Steps", Noting)
+        patch.setattr(steps_module, "WARM", warm)
+        term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
+        train(new_avatar(assets, subject, config), subject, config, run, term, device=DEVICE)
+    return newest_checkpoint(run), makers[0], losses
+
+
+def assert_same(found: Checkpoint, expected: Checkpoint) -> None:
+    assert found.step == expected.step and found.tensors.keys() == expected.tensors.keys()
+    for name, value in expected.tensors.items():
+        assert torch.equal(found.tensors[name], value), name
+
+
+@pytest.mark.parametrize(
+    "overrides", [(), ("trainer.condition_noise=0.3", "model.facing=true", "model.rigidity=true")], ids=["plain", "all"]
+)
+def test_replayed_steps_have_the_bits_of_launched_ones(
+    overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected, launching, losses = trained(
+        tracked_folder, tmp_path / "launched", monkeypatch, *STILL, *overrides, warm=99
+    )
+    found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *STILL, *overrides, warm=1)
+    assert launching.replayed == 0
+    assert replaying.replayed == 20 - 4  # the first of each kind: degrees 0, 1, 1 with a third term, 2
+    assert same == losses and len(set(losses)) == 20
+    assert_same(found, expected)
+
+
+def test_so_have_those_that_move_their_frame(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("LEAST_GAIN", -100.0), ("SAMPLES", 1), ("JUDGED", 2), ("BEGIN", 0.2), ("END", 0.8)):
+        monkeypatch.setattr(align_module, name, value)
+    expected, _, losses = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, warm=99)
+    found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, warm=1)
+    assert replaying.replayed >= 12
+    assert expected.tensors["align.moves"].any()
+    assert same == losses
+    assert_same(found, expected)
+
+
+def test_what_cannot_be_captured_is_launched_and_said(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)
+
+    def refuse(*_: object) -> None:
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(steps_module, "Replay", refuse)
+    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *STILL, warm=1)
+    said = capsys.readouterr().err
+    assert said.count("because they cannot be replayed: operation not permitted") == 1
+    assert steps.replayed == 0
+    assert_same(found, expected)
+
+
+def test_a_script_without_todays_room_is_written_anew(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the drawings' numbers of pairs came back, and one of them was large."""
+    asked = {"times": 0}
+    known = Capacities.known
+
+    def growing(self: Capacities, kind: Kind) -> int | None:
+        if self.fixed is not None:
+            return known(self, kind)
+        asked["times"] += 1
+        return 4096 if asked["times"] < 12 else 8192
+
+    written: list[int | None] = []
+    replay = steps_module.Replay
+
+    def counting(*arguments: object) -> object:
+        written.append(CAPACITIES.known(CAPACITIES.last[0]) if CAPACITIES.last else None)
+        return replay(*arguments)  # type: ignore[arg-type]
+
+    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)
+    monkeypatch.setattr(Capacities, "known", growing)
+    monkeypatch.setattr(steps_module, "Replay", counting)
+    one_kind = ("trainer.sh_interval=99", "trainer.perceptual_start=1.0", "trainer.iterations=12")
+    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *STILL, *one_kind, warm=1)
+    assert found.step == 12 and steps.replayed == 11
+    assert written == [4096, 8192]
+    assert expected.step == 20
+
+
+def test_a_replay_reads_what_it_is_given_each_time() -> None:
+    weight = torch.full((3,), 2.0, device=DEVICE)
+
+    def function(inputs: Sequence[Tensor]) -> Tensor:
+        values, index = inputs
+        return (weight * values)[index]
+
+    inputs = torch.arange(3.0, device=DEVICE), torch.tensor([2, 0], device=DEVICE)
+    with own_stream(DEVICE):
+        function(inputs)
+        replay = Replay(function, inputs)
+        assert replay(inputs).tolist() == [4.0, 0.0]
+        assert replay((inputs[0] + 1.0, inputs[1].flip(0))).tolist() == [2.0, 6.0]
+        weight.fill_(3.0)
+        assert replay(inputs).tolist() == [6.0, 0.0]
