@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,9 @@ from avatar.runs.trained import TrainedAvatar
 
 RUN_FILE = "run.json"
 RUN_FORMAT = 2
-VERSIONED = ("torch", "numpy", "opencv-contrib-python-headless", "kornia")
+# The names under which a library may be installed; the first is what it is called here.
+_OPENCV = tuple(f"opencv-{part}python{end}" for end in ("-headless", "") for part in ("contrib-", ""))
+VERSIONED = (("torch",), ("numpy",), _OPENCV, ("kornia",))
 
 
 @dataclass(frozen=True)
@@ -140,5 +142,15 @@ def versions() -> dict[str, str]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "threads": str(torch.get_num_threads()),
-        **{name: version(name) for name in VERSIONED},
+        **{names[0]: version_of(names) for names in VERSIONED},
     }
+
+
+def version_of(names: Sequence[str]) -> str:
+    """Of the first of these packages that is installed; "unknown" where none is under its name."""
+    for name in names:
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            continue
+    return "unknown"

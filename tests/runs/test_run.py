@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 from small_runs import run_info
 
 from avatar.errors import UserError
+from avatar.runs import run as run_module
 from avatar.runs.run import read_run_info, write_run_info
 
 
@@ -35,3 +37,16 @@ def test_a_run_that_lacks_something_is_damaged(tmp_path: Path, key: str) -> None
     write_run_info(tmp_path, info)
     with pytest.raises(UserError, match=f"run.json is damaged .*{key}.* is missing"):
         read_run_info(tmp_path)
+
+
+def test_a_library_under_another_name_has_its_version_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV comes as four packages, and any of them will do."""
+
+    def only_the_plain_one(name: str) -> str:
+        if name != "opencv-python":
+            raise PackageNotFoundError(name)
+        return "4.0"
+
+    monkeypatch.setattr(run_module, "version", only_the_plain_one)
+    assert run_module.versions()["opencv-contrib-python-headless"] == "4.0"
+    assert run_module.versions()["kornia"] == "unknown"
