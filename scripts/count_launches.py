@@ -133,8 +133,12 @@ class Rehearsal:
 
     def train(self, perceptual: PerceptualTerm, late: bool) -> None:
         objective = Objective(self.trainer, self.background, perceptual)
-        number = self.trainer.iterations - self.trainer.lpips_every if late else self.trainer.iterations // 4
-        training_step(self.avatar, self.optimizer, objective, number, self.frame, self.vertices, self.guard.judge)
+        step = objective, self.number(late), self.frame, self.vertices
+        training_step(self.avatar, self.optimizer, *step, self.guard.judge)
+
+    def number(self, late: bool) -> int:
+        """Of a step in the second half, or in the first."""
+        return self.trainer.iterations - self.trainer.lpips_every if late else self.trainer.iterations // 4
 
     def moving(self, perceptual: PerceptualTerm) -> Counter[str]:
         """What a step launches that moves its frame's tracking."""

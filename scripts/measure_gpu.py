@@ -24,13 +24,15 @@ from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.bench.splat_gpu import device_of, settle
 from avatar.compute.choose import choose_device
 from avatar.compute.device import interpreted
+from avatar.compute.replay import own_stream
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.losses.photometric import dssim
 from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
-from avatar.train.step import PerceptualTerm, Weighted
+from avatar.train.step import Objective, PerceptualTerm, Weighted
+from avatar.train.steps import WARM, Steps
 from avatar.types import Gaussians
 
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # mean over the pixels, of a field's norm; cut-offs may decide a pixel
@@ -113,6 +115,36 @@ def check_capture(scene: Scene) -> str:
     return "a drawing and its gradients can be captured and replayed"
 
 
+class Replays:
+    """The steps of a rehearsal, which are replayed after the first ones."""
+
+    def __init__(self, rehearsal: Rehearsal) -> None:
+        self.rehearsal = rehearsal
+        objective = Objective(rehearsal.trainer, rehearsal.background, STAND_IN)
+        self.steps = Steps(rehearsal.avatar, rehearsal.optimizer, objective)
+
+    def train(self, late: bool) -> None:
+        r = self.rehearsal
+        self.steps.make(r.number(late), r.frame, r.guard.judge, r.guard.is_spoilt)
+
+
+def check_replays(make: Callable[[], Rehearsal]) -> str:
+    """As many steps launched as replayed, from the same values."""
+    torch.manual_seed(0)
+    launched = make()
+    torch.manual_seed(0)
+    replays = Replays(make())
+    for late in (False, True):
+        for _ in range(2 * WARM):
+            launched.train(STAND_IN, late)
+            replays.train(late)
+    states = launched.avatar.state_dict().items(), replays.rehearsal.avatar.state_dict().values()
+    different = [name for (name, own), other in zip(*states, strict=True) if not torch.equal(own, other)]
+    assert replays.steps.replayed == 2 * WARM, f"{replays.steps.replayed} of {4 * WARM} steps were replayed"
+    assert not different, f"the bits differ in {', '.join(different)}"
+    return f"{replays.steps.replayed} replayed training steps, the bits of launched ones"
+
+
 def tune(scene: Scene, repeats: int, quick: bool) -> list[tuple[gpu_draw.Tuning, Time, Time]]:
     """Tile, steps and warps, each with the times of both directions, fastest sum first."""
     usual = gpu_draw.TUNING
@@ -134,7 +166,7 @@ def tune(scene: Scene, repeats: int, quick: bool) -> list[tuple[gpu_draw.Tuning,
 
 
 def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: int) -> dict[str, Time]:
-    renderer = Renderer(rehearsal.avatar, rehearsal.background)
+    renderer, replays = Renderer(rehearsal.avatar, rehearsal.background), Replays(rehearsal)
 
     def settled(function: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -151,8 +183,9 @@ def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: 
         "a rendered frame": settled(lambda: renderer.render(rehearsal.params, rehearsal.camera)),
         "a training step, first half": settled(lambda: rehearsal.train(STAND_IN, late=False)),
         "a training step with D-SSIM": settled(lambda: rehearsal.train(STAND_IN, late=True)),
+        "the same two, replayed": settled(lambda: (replays.train(False), replays.train(True))),
     }
-    return paired_medians(functions, repeats, warm_up=min(3, repeats - 1))
+    return paired_medians(functions, repeats, warm_up=min(WARM + 1, repeats - 1))
 
 
 def report(
@@ -196,13 +229,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     device = device_of("gpu") if interpreted() else choose_device("cuda", print)
     name = "Triton's interpreter" if interpreted() else torch.cuda.get_device_name(device)
+    with own_stream(device):
+        return measure(arguments, device, name)
+
+
+def measure(arguments: argparse.Namespace, device: torch.device, name: str) -> int:
+    assets = head_assets(demo_head())
     scene = Scene(arguments.splats, arguments.size, device)
-    rehearsal = Rehearsal(head_assets(demo_head()), arguments.uv_size, arguments.size, device=device)
+
+    def rehearse() -> Rehearsal:
+        return Rehearsal(assets, arguments.uv_size, arguments.size, device=device)
+
+    rehearsal = rehearse()
     tries: dict[str, Callable[[], str]] = {
         "parity with the CPU": lambda: check_parity(scene, arguments.splats, arguments.size),
         "repeatability": lambda: check_repeats(scene, min(arguments.repeats, 20)),
         "waiting": lambda: check_no_waiting(rehearsal, device),
         "graph capture": lambda: check_capture(scene),
+        "replaying": lambda: check_replays(rehearse),
     }
     checks, failed = {}, 0
     for check, attempt in tries.items():

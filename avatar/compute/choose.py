@@ -16,7 +16,7 @@ from avatar.compute.device import CPU
 from avatar.config_values import check_device
 from avatar.errors import UserError
 
-LEAST_TRITON = (3, 7, 1)  # what the kernels are verified with
+LEAST_TRITON = (3, 6, 0)  # the oldest that the kernels have run with
 LEAST_CAPABILITY = (8, 0)  # of NVIDIA's devices: the oldest that the kernels are compiled for
 INSTALL = "pip install 'hyperavatar[gpu]'"
 
@@ -126,7 +126,7 @@ def _check_triton() -> None:
     if tuple(int(part) for part in found.split("+")[0].split(".")[:3] if part.isdigit()) < LEAST_TRITON:
         wanted = ".".join(map(str, LEAST_TRITON))
         raise NoGpu(
-            f"Triton {found} is older than {wanted}, with which the kernels are verified; it comes with torch 2.13: "
+            f"Triton {found} is older than {wanted}, the oldest that the kernels have run with; it comes with torch 2.11: "
             f"install that or a newer one, and then {INSTALL}"
         )
 

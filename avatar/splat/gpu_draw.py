@@ -36,8 +36,8 @@ class Tuning:
     backward_warps: int = 1
     lanes: int = 128  # Gaussians or pairs of a program
     backward_lanes: int = 32
-    summed: int = 4  # Gaussians of a program that sums their pairs, `summed_lanes` at a time
-    summed_lanes: int = 8
+    summed: int = 1  # Gaussians of a program that sums their pairs, `summed_lanes` at a time
+    summed_lanes: int = 64
 
     @property
     def chunk(self) -> int:

@@ -84,8 +84,8 @@ MISSING: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], str]] = {
     ),
     "no Triton": (attribute(choose, "version", raising(PackageNotFoundError())), r"not installed: pip install"),
     "an old Triton": (
-        attribute(choose, "version", lambda _: "3.7.0+git1"),
-        r"Triton 3\.7\.0\+git1 is older than 3\.7\.1",
+        attribute(choose, "version", lambda _: "3.5.1+git1"),
+        r"Triton 3\.5\.1\+git1 is older than 3\.6\.0",
     ),
     "no compiler": (lacks_compiler, r"needs a C compiler .*apt install gcc.* or name one with CC"),
     "no memory": (

@@ -28,7 +28,8 @@ def test_checks_times_and_tunings_are_written(measure_gpu: ModuleType, tmp_path:
     assert measure_gpu.main([*SMALL, "--out", str(tmp_path)]) == 0
     text = (tmp_path / "gpu.md").read_text()
     assert "parity with the CPU: image off by " in text and "the same bits" in text and "FAILED" not in text
-    for what in ("splatting, backward", "a rendered frame", "a training step with D-SSIM"):
+    assert "replaying: 6 replayed training steps, the bits of launched ones" in text
+    for what in ("splatting, backward", "a rendered frame", "a training step with D-SSIM", "the same two, replayed"):
         assert f"| {what} | " in text
     assert "| 8 | 8 | 4 | 2 | 1 | " in text or "| 16 | 32 | 32 | 2 | 1 | " in text
 
@@ -37,7 +38,7 @@ def test_a_check_that_fails_is_the_exit_status(
     measure_gpu: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measure_gpu, "IMAGE_TOLERANCE", -1.0)
-    for name in ("check_repeats", "check_no_waiting"):
+    for name in ("check_repeats", "check_no_waiting", "check_replays"):
         monkeypatch.setattr(measure_gpu, name, lambda *_: "not tried")
     monkeypatch.setattr(measure_gpu, "time_all", lambda *_: {})
     monkeypatch.setattr(measure_gpu, "tune", lambda *_: [])
