@@ -16,6 +16,7 @@ from avatar.bench.splat_gpu import settle
 from avatar.bench.stages import StagedStep, network_of
 from avatar.commands.opening import split_sizes
 from avatar.compute.device import on_gpu
+from avatar.compute.replay import own_stream
 from avatar.config import Config, load_config
 from avatar.data.loader import FrameLoader
 from avatar.data.shelf import Shelf, shelf_bytes
@@ -26,8 +27,8 @@ from avatar.tracking.likeness import Likeness
 from avatar.train.ahead import Guard
 from avatar.train.optim import make_optimizer
 from avatar.train.placed import moving_step
-from avatar.train.posed import PosedMeshes
-from avatar.train.step import Judge, Objective, choose_perceptual, training_step
+from avatar.train.step import Judge, Objective, choose_perceptual
+from avatar.train.steps import WARM, Steps
 from avatar.types import Frame
 from data_prep.open import find_head, open_subject
 
@@ -61,7 +62,7 @@ class Trainee:
     optimizer: torch.optim.Adam
     objective: Objective
     frames: Iterator[Frame]
-    meshes: PosedMeshes
+    steps: Steps
     likeness: Likeness
     judge: Judge | None  # None: every step is checked at once
 
@@ -70,8 +71,7 @@ class Trainee:
         if moves:
             moving_step(self.likeness, self.optimizer, self.objective, number, frame, self.judge)
         else:
-            vertices = self.meshes.vertices(frame)
-            training_step(self.avatar, self.optimizer, self.objective, number, frame, vertices, self.judge)
+            self.steps.make(number, frame, self.judge)
 
 
 def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:
@@ -92,7 +92,8 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     for preset, learner in trainees.items():
         for late in (False, True):
             steps[preset, late] = lambda learner=learner, late=late: run_steps(learner, late)
-    times = paired_medians(steps, repeats, warm_up=3)
+    with own_stream(torch.device(request.device)):
+        times = paired_medians(steps, repeats, warm_up=WARM + 1)
     return [
         Row(
             preset,
@@ -121,15 +122,14 @@ def trainee(
     shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
     with FrameLoader(subject, config.data.size, shelf=shelf) as loader:
         frames = list(loader.frames(chosen))
-    meshes = PosedMeshes(avatar if is_gpu else avatar.mesh)
-    for frame in frames:
-        meshes.vertices(frame)
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
     optimizer = make_optimizer(avatar, config.trainer)
     likeness = Likeness(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0).to(device))
     judge = Guard(optimizer, device).judge if is_gpu else None
-    return Trainee(config, avatar, optimizer, objective, cycle(frames), meshes, likeness, judge)
+    steps = Steps(avatar, optimizer, objective, say=say)
+    steps.pose(frames)
+    return Trainee(config, avatar, optimizer, objective, cycle(frames), steps, likeness, judge)
 
 
 def silent(_: str) -> None:

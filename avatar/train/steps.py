@@ -8,7 +8,7 @@ takes part (LPIPS, whose crop has another size each time; a step that is repeate
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from typing import NamedTuple
@@ -74,6 +74,11 @@ class Steps:
         self._launched: Counter[Kind] = Counter()
         self._scripts: OrderedDict[Kind, Script] = OrderedDict()
         self.replayed = 0  # steps so far
+
+    def pose(self, frames: Iterable[Frame]) -> None:
+        """Have their meshes ready, as long as there is room."""
+        for frame in frames:
+            self._meshes.vertices(frame)
 
     def make(self, step: int, frame: Frame, judge: Judge | None, is_spoilt: Float[Tensor, ""] | None = None) -> Outcome:
         """Step number `step` (from 0) on one frame. See `training_step` for `judge` and what is raised, and
