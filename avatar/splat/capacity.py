@@ -50,7 +50,8 @@ class Capacities:
         self._pending: dict[Kind, _Pending] = {}
         self._lock = threading.Lock()
         self.fixed: int | None = None
-        self.last: tuple[Kind, Int[Tensor, " N"]] | None = None  # drawing, as `watch` was told of it
+        self.last_kind: Kind  # of the last drawing, as `watch` was told of it
+        self.last_ends: Int[Tensor, " N"]
 
     def known(self, kind: Kind) -> int | None:
         """What the next drawing of this kind is to use; None: it has to wait for its own number."""
@@ -78,7 +79,7 @@ class Capacities:
 
     def watch(self, kind: Kind, ends: Int[Tensor, " N"]) -> None:
         """Let the number of pairs of a drawing, the last of `ends`, come back when the GPU gets there."""
-        self.last = kind, ends
+        self.last_kind, self.last_ends = kind, ends
         if self.fixed is not None or kind.device.type != "cuda":
             return
         with self._lock:

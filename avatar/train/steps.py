@@ -72,6 +72,7 @@ class Steps:
         self._meshes = PosedMeshes(avatar)
         self._replays = on_gpu(avatar.code) and not avatar.code.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
+        self._drawings: dict[Kind, DrawingKind] = {}  # of those that were launched
         self._scripts: OrderedDict[Kind, Script] = OrderedDict()
         self.replayed = 0  # steps so far
 
@@ -92,7 +93,9 @@ class Steps:
             script = self._capture(kind, step, frame, row, judge, is_spoilt)
         if script is None:
             self._launched[kind] += 1
-            return self._launch(step, frame, row, judge, is_spoilt)
+            outcome = self._launch(step, frame, row, judge, is_spoilt)
+            self._drawings[kind] = CAPACITIES.last_kind
+            return outcome
         set_rates(self._optimizer, schedule(step, self._objective.config))
         seen = self._still(step, frame) if row is None else None
         outcome, moves = script.replay(self._inputs(step, frame, seen, row))
@@ -142,8 +145,7 @@ class Steps:
         self, kind: Kind, step: int, frame: Frame, row: Row | None, judge: Judge, is_spoilt: Tensor | None
     ) -> Script | None:
         """A script of steps like this one, which it does not make; None: it has to be launched."""
-        assert CAPACITIES.last is not None  # the steps before have drawn
-        drawing = CAPACITIES.last[0]
+        drawing = self._drawings[kind]
         capacity = CAPACITIES.known(drawing)
         if capacity is None and drawing.device.type == "cuda":
             return None
@@ -162,7 +164,7 @@ class Steps:
             return None
         while len(self._scripts) >= KEPT:
             self._scripts.popitem(last=False)
-        self._scripts[kind] = Script(replay, capacity, *CAPACITIES.last)
+        self._scripts[kind] = Script(replay, capacity, drawing, CAPACITIES.last_ends)
         return self._scripts[kind]
 
     def _inputs(self, step: int, frame: Frame, seen: Seen | None, row: Row | None) -> list[Tensor]:

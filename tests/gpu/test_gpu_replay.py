@@ -133,7 +133,7 @@ def test_a_script_without_todays_room_is_written_anew(
     replay = steps_module.Replay
 
     def counting(*arguments: object) -> object:
-        written.append(CAPACITIES.known(CAPACITIES.last[0]) if CAPACITIES.last else None)
+        written.append(CAPACITIES.known(CAPACITIES.last_kind))
         return replay(*arguments)  # type: ignore[arg-type]
 
     expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)

@@ -4,21 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 
-from avatar.demo.head import demo_head
-from avatar.demo.head_files import write_head_model
 from avatar.gaussians.uv import detailed_faces, uv_texels
-from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.assets import HeadAssets
 from avatar.head.features import eyeballs, openings
-
-
-@pytest.fixture(scope="module")
-def assets(tmp_path_factory: pytest.TempPathFactory) -> HeadAssets:
-    folder = tmp_path_factory.mktemp("head")
-    write_head_model(folder, demo_head())
-    return load_head_assets(folder)
 
 
 def test_what_turns_with_the_eyes_are_the_eyeballs(assets: HeadAssets) -> None:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
-import pytest
 import torch
 from heads import grid_head
 from torch import Tensor
 
 from avatar.config import load_config
-from avatar.demo.head import demo_head
-from avatar.demo.head_files import write_head_model
 from avatar.gaussians.embedding import knn_scales
 from avatar.gaussians.uv import bound_texels, painted, uv_texels
-from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.head.assets import HeadAssets
 from avatar.head.features import mouth_rim
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.head.teeth import GRID, ROWS, with_teeth
@@ -22,13 +19,6 @@ from avatar.model import Avatar
 from avatar.types import IDENTITY_6D, HeadParams
 
 COUNT = GRID[0] * GRID[1]  # vertices of a row
-
-
-@pytest.fixture(scope="module")
-def assets(tmp_path_factory: pytest.TempPathFactory) -> HeadAssets:
-    folder = tmp_path_factory.mktemp("head")
-    write_head_model(folder, demo_head())
-    return load_head_assets(folder)
 
 
 def test_all_that_the_head_model_has_stays_as_it_is(assets: HeadAssets) -> None:
