@@ -37,6 +37,7 @@ class Request:
     frame_offset: int | None
     seeds: list[int]
     side_by_side: bool
+    gpus: float | None
 
     def subjects(self) -> list[dict[str, Any]]:
         return [subject(folder, self.head, self.frame_offset) for folder in self.folders]
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--side-by-side", action="store_true", help="a job for each processor; times do not compare")
+    parser.add_argument("--gpus", type=float, help="of a job; 0.25 lets four share one, and times do not compare")
 
 
 def folders_and_overrides(words: Sequence[str]) -> tuple[list[Path], list[str]]:
@@ -72,6 +74,7 @@ def request_of(given: argparse.Namespace) -> Request:
         frame_offset=given.frame_offset,
         seeds=given.seeds,
         side_by_side=given.side_by_side,
+        gpus=given.gpus,
     )
 
 
@@ -101,6 +104,9 @@ def train(request: Request, title: str, rows: Rows) -> tuple[int, Spec]:
 def write_sweep(path: Path, request: Request, rows: Rows) -> None:
     spec = sweep_spec(rows, request.subjects(), request.seeds, request.overrides)
     spec["threads"] = 1 if request.side_by_side else os.cpu_count() or 1
+    if request.gpus is not None:
+        spec["gpus"] = request.gpus
+        spec["threads"] = max(1, int((os.cpu_count() or 1) * min(request.gpus, 1.0)))
     write_atomically(path, yaml.safe_dump(spec, sort_keys=False).encode())
 
 

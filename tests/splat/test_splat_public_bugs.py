@@ -197,9 +197,7 @@ def test_a_long_splat_far_outside_the_image_still_crosses_it(backend: str) -> No
 @pytest.mark.parametrize("backend", KERNELS)
 def test_too_many_pairs_are_refused_and_not_allocated(backend: str) -> None:
     g = random_gaussians(100_000, sh_degree=0)._replace(scales=torch.full((100_000, 3), 1e6))
-    message = (
-        "drawing needs [1-9][0-9]{8} pairs of a tile of .* and a splat, the limit is 67108864; are the scales too large"
-    )
+    message = "drawing needs [0-9]+ pairs of a tile of .* and a splat, the limit is 67108864; are the scales too large"
     with pytest.raises(ValueError, match=message):
         render(Scene(g, camera(1100, 1100)), backend)
 
