@@ -3,8 +3,8 @@
     python scripts/compare_gsplat.py [--out docs/bench] [--avatar RUN] [--counts N ...] [--sizes N ...] [--repeats N]
 
 Needs a GPU and gsplat (`pip install gsplat`). Scenes are random shells of a head's shape and, with --avatar, a trained
-avatar in its first held-out frame. Calls take turns in one process; times are medians, waited for, through the public functions
-with autograd. "Replayed" is our forward and backward pass as one CUDA graph; gsplat's waits for the number of its tiles'
+avatar in its first held-out frame. Calls take turns in one process; times are medians through the public
+functions with autograd, waited for. "Replayed" is our forward and backward pass as one CUDA graph; gsplat's waits for the number of its tiles'
 splats, so it cannot be captured. Writes OUT/gpu_gsplat.md.
 """
 
