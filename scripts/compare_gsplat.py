@@ -2,10 +2,10 @@
 
     python scripts/compare_gsplat.py [--out docs/bench] [--avatar RUN] [--counts N ...] [--sizes N ...] [--repeats N]
 
-Needs a GPU and gsplat (`pip install gsplat`). Scenes are random shells of a head's shape and, with --avatar, a trained
-avatar in its first held-out frame. Calls take turns in one process; times are medians through the public
-functions with autograd, waited for. "Replayed" is our forward and backward pass as one CUDA graph; gsplat's waits for the number of its tiles'
-splats, so it cannot be captured. Writes OUT/gpu_gsplat.md.
+Needs a GPU and gsplat (`pip install gsplat`). Scenes are random shells of a head's shape and, with --avatar, a
+trained avatar in its first held-out frame. Calls take turns in one process; times are medians through the public
+functions with autograd, waited for. "Replayed" is our forward and backward pass as one CUDA graph; gsplat's waits for
+the number of its pairs of tile and splat, so it cannot be captured. Writes OUT/gpu_gsplat.md.
 """
 
 from __future__ import annotations
