@@ -51,6 +51,7 @@ def splat_backward(
     grad_opacities: Tensor,
     grad_sh: Tensor,
     grad_background: Tensor,
+    grad_pose: Tensor | None = None,
 ) -> None: ...
 def dssim(image: Tensor, target: Tensor, mask: Tensor, simd: str, threads: int, gradient: Tensor | None) -> float: ...
 def hyper_forward(

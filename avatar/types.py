@@ -28,7 +28,10 @@ IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion."""
+    """A pinhole camera without distortion.
+
+    R_cam_world and t_cam_world may require gradients. They are on the CPU or where the points and Gaussians are.
+    """
 
     R_cam_world: Float[Tensor, "3 3"]
     t_cam_world: Float[Tensor, 3]  # metres

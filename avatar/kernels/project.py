@@ -19,6 +19,7 @@ from avatar.kernels.geometry import (
     in_camera,
     load_scales,
     not_finite,
+    pose_is_not_finite,
     rotation_of,
     unit_quaternion,
     view_direction,
@@ -53,7 +54,8 @@ def project(
     scales,
     opacities,
     sh,
-    view,
+    pose,
+    intrinsics,
     alpha_min,
     degree,
     count,
@@ -88,7 +90,8 @@ def project(
     here = i < count
     mean_x, mean_y, mean_z = load3(means, i, here)
     opacity = tl.load(opacities + i, mask=here, other=0.0)
-    poisoned = not_finite(mean_x) | not_finite(mean_y) | not_finite(mean_z) | not_finite(opacity)
+    poisoned = pose_is_not_finite(pose)
+    poisoned |= not_finite(mean_x) | not_finite(mean_y) | not_finite(mean_z) | not_finite(opacity)
     for k in tl.static_range(4):
         poisoned |= not_finite(tl.load(quats + 4 * i + k, mask=here, other=0.0))
     for k in tl.static_range(3):
@@ -97,13 +100,13 @@ def project(
         poisoned |= not_finite(tl.load(sh + 3 * STORED * i + k, mask=here, other=0.0))
 
     transparent = opacity < alpha_min
-    p_x, p_y, p_z = in_camera(view, mean_x, mean_y, mean_z)
-    in_front = p_z >= tl.load(view + NEAR)
+    p_x, p_y, p_z = in_camera(pose, mean_x, mean_y, mean_z)
+    in_front = p_z >= tl.load(intrinsics + NEAR)
     p_z = tl.where(in_front, p_z, 1.0)
     inv_z = 1.0 / p_z
-    slope_x, _ = clamped_slope(view, SLOPE_X, p_x * inv_z)
-    slope_y, _ = clamped_slope(view, SLOPE_Y, p_y * inv_z)
-    t00, t01, t02, t10, t11, t12 = image_rows(view, slope_x, slope_y, inv_z)
+    slope_x, _ = clamped_slope(intrinsics, SLOPE_X, p_x * inv_z)
+    slope_y, _ = clamped_slope(intrinsics, SLOPE_Y, p_y * inv_z)
+    t00, t01, t02, t10, t11, t12 = image_rows(pose, intrinsics, slope_x, slope_y, inv_z)
     qw, qx, qy, qz, _ = unit_quaternion(quats, i, here)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(qw, qx, qy, qz)
     s0, s1, s2 = load_scales(scales, i, here)
@@ -117,7 +120,7 @@ def project(
         dot3(t10, t11, t12, r01, r11, r21) * s1,
         dot3(t10, t11, t12, r02, r12, r22) * s2,
     )
-    _, _, _, area, xx, xy, yy, det = covariance(view, f00, f01, f02, f10, f11, f12)
+    _, _, _, area, xx, xy, yy, det = covariance(intrinsics, f00, f01, f02, f10, f11, f12)
     solid = (det > 0.0) & (det < float("inf"))  # neither for a NaN
     det, yy = tl.where(solid, det, 1.0), tl.where(solid, yy, 1.0)
     root_det = tl.sqrt(det)
@@ -126,8 +129,8 @@ def project(
         transparent |= solid & in_front & (opacity < alpha_min)
     drawn = here & ~transparent & in_front & solid
 
-    x = tl.load(view + FX) * p_x / p_z + tl.load(view + CX)
-    y = tl.load(view + FY) * p_y / p_z + tl.load(view + CY)
+    x = tl.load(intrinsics + FX) * p_x / p_z + tl.load(intrinsics + CX)
+    y = tl.load(intrinsics + FY) * p_y / p_z + tl.load(intrinsics + CY)
     root = tl.sqrt(yy)
     a = root * WHITENING / root_det
     b = -xy * WHITENING / (root * root_det)
@@ -144,7 +147,7 @@ def project(
     tile_y, tiles_y = _tiles_between(y - half_y, y + half_y, height, first_y, down, TILE)
     tiles = tl.where(drawn, tiles_x * tiles_y, 0)
 
-    d_x, d_y, d_z, _ = view_direction(view, mean_x, mean_y, mean_z)
+    d_x, d_y, d_z, _ = view_direction(pose, mean_x, mean_y, mean_z)
     red, green, blue = colour(sh + 3 * STORED * i, d_x, d_y, d_z, degree, STORED, here)
     poisoned |= (tiles > 0) & (not_finite(red) | not_finite(green) | not_finite(blue))
 

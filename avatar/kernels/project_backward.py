@@ -8,8 +8,10 @@ from avatar.kernels.geometry import (
     BLUR,
     FX,
     FY,
+    POSE_VALUES,
     SLOPE_X,
     SLOPE_Y,
+    TRANSLATION,
     WHITENING,
     clamped_slope,
     covariance,
@@ -100,7 +102,7 @@ def _sum(sums, k: tl.constexpr, count, i, here):
 def colour_of_backward(
     means,
     sh,
-    view,
+    pose,
     sums,
     degree,
     count,
@@ -115,7 +117,7 @@ def colour_of_backward(
     # Where all moments are zero, so must be all that follows: values that cannot overflow stand in there.
     shown = here & ((m_red != 0.0) | (m_green != 0.0) | (m_blue != 0.0))
     mean_x, mean_y, mean_z = load3(means, i, shown)
-    d_x, d_y, d_z, inv_distance = view_direction(view, mean_x, mean_y, mean_z)
+    d_x, d_y, d_z, inv_distance = view_direction(pose, mean_x, mean_y, mean_z)
     at = 3 * STORED * i
     by_dx, by_dy, by_dz = colour_backward(
         sh + at, grad_sh + at, d_x, d_y, d_z, m_red, m_green, m_blue, degree, STORED, shown, here
@@ -127,24 +129,40 @@ def colour_of_backward(
     store3(grad_means, i, m_x.to(tl.float32), m_y.to(tl.float32), m_z.to(tl.float32), here)
 
 
+@triton.jit
+def _row_of_pose(grad_pose, pose, row: tl.constexpr, by_p, mean_x, mean_y, mean_z, by_x, by_y, by_z, e0, e1, e2):
+    """Sum what one row of R and one element of t take: by p = R m + t, by T (as e), and by the direction along m + R^T t
+    that the colour depends on, of which (by_x, by_y, by_z) is the gradient in m."""
+    t = tl.load(pose + TRANSLATION + row)
+    tl.store(grad_pose + 3 * row, tl.sum(by_p * mean_x + t * by_x + e0, 0))
+    tl.store(grad_pose + 3 * row + 1, tl.sum(by_p * mean_y + t * by_y + e1, 0))
+    tl.store(grad_pose + 3 * row + 2, tl.sum(by_p * mean_z + t * by_z + e2, 0))
+    v0, v1, v2 = tl.load(pose + 3 * row), tl.load(pose + 3 * row + 1), tl.load(pose + 3 * row + 2)
+    tl.store(grad_pose + TRANSLATION + row, tl.sum(by_p + dot3(v0, v1, v2, by_x, by_y, by_z), 0))
+
+
 @triton.jit(do_not_specialize=["count"])
 def project_backward(
     means,
     quats,
     scales,
     opacities,
-    view,
+    pose,
+    intrinsics,
     sums,
     count,
     grad_means,
     grad_quats,
     grad_scales,
     grad_opacities,
+    grad_pose,
     ANTIALIASED: tl.constexpr,
+    POSE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Write the other gradients of all Gaussians; one lane for each. `grad_means` is added to what `colour_of_backward`
-    wrote there; see `project` for the other buffers."""
+    wrote there; see `project` for the other buffers. With POSE, grad_pose [programs, 12], float64, takes what the Gaussians
+    of each program add to the gradient of the pose."""
     i, here = _own(count, BLOCK)
     weight, m_u, m_uu = _sum(sums, 0, count, i, here), _sum(sums, 1, count, i, here), _sum(sums, 2, count, i, here)
     m_v, m_uv, m_vv = _sum(sums, 3, count, i, here), _sum(sums, 4, count, i, here), _sum(sums, 5, count, i, here)
@@ -152,12 +170,12 @@ def project_backward(
     shown = here & shown
 
     mean_x, mean_y, mean_z = load3(means, i, shown)
-    p_x, p_y, p_z = in_camera(view, mean_x, mean_y, mean_z)
+    p_x, p_y, p_z = in_camera(pose, mean_x, mean_y, mean_z)
     p_z = tl.where(shown, p_z, 1.0)
     inv_z = 1.0 / p_z
-    slope_x, free_x = clamped_slope(view, SLOPE_X, p_x * inv_z)
-    slope_y, free_y = clamped_slope(view, SLOPE_Y, p_y * inv_z)
-    t00, t01, t02, t10, t11, t12 = image_rows(view, slope_x, slope_y, inv_z)
+    slope_x, free_x = clamped_slope(intrinsics, SLOPE_X, p_x * inv_z)
+    slope_y, free_y = clamped_slope(intrinsics, SLOPE_Y, p_y * inv_z)
+    t00, t01, t02, t10, t11, t12 = image_rows(pose, intrinsics, slope_x, slope_y, inv_z)
     qw, qx, qy, qz, inv_length = unit_quaternion(quats, i, shown)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(qw, qx, qy, qz)
     s0, s1, s2 = load_scales(scales, i, shown)
@@ -171,7 +189,7 @@ def project_backward(
         dot3(t10, t11, t12, r01, r11, r21) * s1,
         dot3(t10, t11, t12, r02, r12, r22) * s2,
     )
-    n0, n1, n2, area, _, xy, yy, det = covariance(view, f00, f01, f02, f10, f11, f12)
+    n0, n1, n2, area, _, xy, yy, det = covariance(intrinsics, f00, f01, f02, f10, f11, f12)
     det, yy = tl.where(shown, det, 1.0), tl.where(shown, yy, 1.0)
     root_det, root = tl.sqrt(det), tl.sqrt(yy)
     a, b, c = root * WHITENING / root_det, -xy * WHITENING / (root * root_det), WHITENING / root
@@ -206,7 +224,7 @@ def project_backward(
         # shrink = area / sqrt(det), area = |f0 x f1|, det = area^2 + blur (|f0|^2 + |f1|^2) + blur^2
         by_shrink = weight * opacity
         by_area = by_shrink / root_det * (1.0 - area * area / det)
-        per_row = -by_shrink * shrink / det * tl.load(view + BLUR)
+        per_row = -by_shrink * shrink / det * tl.load(intrinsics + BLUR)
         scale = by_area * tl.where(area > 0.0, 1.0 / tl.where(area > 0.0, area, 1.0), 0.0)
         g00 += scale * (f11 * n2 - f12 * n1) + per_row * f00
         g01 += scale * (f12 * n0 - f10 * n2) + per_row * f01
@@ -247,12 +265,12 @@ def project_backward(
     store4(grad_quats, i, by_w, by_x, by_y, by_z, here)
 
     # A row of T is f / z (R_row - slope R_z), and the slope p / z where it is not clamped.
-    fx, fy = tl.load(view + FX), tl.load(view + FY)
+    fx, fy = tl.load(intrinsics + FX), tl.load(intrinsics + FY)
     by_px, by_py = grad_x * fx * inv_z, grad_y * fy * inv_z
     by_pz = -(grad_x * fx * p_x + grad_y * fy * p_y) * inv_z * inv_z
-    v0, v1, v2 = tl.load(view), tl.load(view + 1), tl.load(view + 2)
-    v3, v4, v5 = tl.load(view + 3), tl.load(view + 4), tl.load(view + 5)
-    v6, v7, v8 = tl.load(view + 6), tl.load(view + 7), tl.load(view + 8)
+    v0, v1, v2 = tl.load(pose), tl.load(pose + 1), tl.load(pose + 2)
+    v3, v4, v5 = tl.load(pose + 3), tl.load(pose + 4), tl.load(pose + 5)
+    v6, v7, v8 = tl.load(pose + 6), tl.load(pose + 7), tl.load(pose + 8)
     along_z = dot3(e00, e01, e02, v6, v7, v8)
     by_pz -= fx * inv_z * inv_z * (dot3(e00, e01, e02, v0, v1, v2) - slope_x * along_z)
     by_slope = tl.where(free_x, -fx * inv_z * along_z, 0.0)
@@ -269,3 +287,11 @@ def project_backward(
     m_y = dot3(v1, v4, v7, by_px, by_py, by_pz) + by_y
     m_z = dot3(v2, v5, v8, by_px, by_py, by_pz) + by_z
     store3(grad_means, i, m_x.to(tl.float32), m_y.to(tl.float32), m_z.to(tl.float32), here)
+    if POSE:
+        own = grad_pose + POSE_VALUES * tl.program_id(0)
+        e00, e01, e02 = e00 * (fx * inv_z), e01 * (fx * inv_z), e02 * (fx * inv_z)
+        e10, e11, e12 = e10 * (fy * inv_z), e11 * (fy * inv_z), e12 * (fy * inv_z)
+        e20, e21, e22 = -slope_x * e00 - slope_y * e10, -slope_x * e01 - slope_y * e11, -slope_x * e02 - slope_y * e12
+        _row_of_pose(own, pose, 0, by_px, mean_x, mean_y, mean_z, by_x, by_y, by_z, e00, e01, e02)
+        _row_of_pose(own, pose, 1, by_py, mean_x, mean_y, mean_z, by_x, by_y, by_z, e10, e11, e12)
+        _row_of_pose(own, pose, 2, by_pz, mean_x, mean_y, mean_z, by_x, by_y, by_z, e20, e21, e22)

@@ -41,7 +41,8 @@ def splat(
     antialiased: bool = False,
     region: tuple[slice, slice] | None = None,
 ) -> Rendering:
-    """Draw 3D Gaussians over a background; differentiable in all five fields of `gaussians` and in `background`.
+    """Draw 3D Gaussians over a background; differentiable in all five fields of `gaussians`, in `background`, and in the
+    camera's pose, `camera.R_cam_world` and `camera.t_cam_world`.
 
     backend      "cpu": C++, float32, multithreaded (torch.get_num_threads(), or the variable AVATAR_THREADS);
                  "gpu": Triton, float32, tensors on a GPU (or on the CPU, with TRITON_INTERPRET=1, slowly, for tests);
@@ -65,8 +66,12 @@ def splat(
     The Jacobian of the projection is taken at a slope clamped to 0.3 tan(fov / 2) outside the image, as in gsplat. A
     zero quaternion is the identity, with zero gradient. The sign of a scale has no effect.
 
-    The image and alpha of the "cpu" backend are the same to the last bit for any number of threads. The camera stays on the
-    CPU for all backends.
+    The gradient in the pose is that of any 3 x 3 matrix R and vector t: with p = R m + t for each mean m,
+    dL/dR = sum of (dL/dp) m^T and dL/dt = sum of dL/dp, plus what R changes in the covariance J R Sigma R^T J^T, and both in
+    the direction m + R^T t of the colour. It is computed where R or t requires it. R and t are on the CPU or where the
+    Gaussians are. Nothing waits for a pose on a GPU; the backward pass waits for the gradient of a pose on the CPU.
+
+    Image, alpha and gradients of the "cpu" backend are the same to the last bit for any number of threads.
     Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
     for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. The
     "gpu" backend learns of those when nobody waits for it any more: image and alpha are then NaN wherever it draws.
@@ -145,7 +150,7 @@ def _checked_options(
         t_cam_world=(camera.t_cam_world, "3"),
     )
     _check_dtype_and_device(gaussians, background, backend)
-    _check_camera(camera)
+    _check_camera(camera, gaussians.means.device, backend)
     stored_degree = sh_degree_of(sizes["K"])
     if sh_degree is None:
         sh_degree = stored_degree
@@ -192,12 +197,14 @@ def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: s
             raise ValueError(f'{name} must be on {device} for backend "{backend}", got {tensor.device}')
 
 
-def _check_camera(camera: Camera) -> None:
+def _check_camera(camera: Camera, device: torch.device, backend: str) -> None:
     for name in ("R_cam_world", "t_cam_world"):
-        if not (pose := getattr(camera, name)).is_cpu:
-            raise ValueError(f"camera.{name} must be on the cpu, whatever the backend, got {pose.device}")
-    if not all(map(math.isfinite, (*camera.R_cam_world.flatten().tolist(), *camera.t_cam_world.tolist()))):
-        check_finite(R_cam_world=camera.R_cam_world, t_cam_world=camera.t_cam_world)  # names and counts them
+        pose = getattr(camera, name)
+        if not pose.is_cpu and pose.device != device:
+            raise ValueError(f"camera.{name} must be on the cpu or where means are, {device}, got {pose.device}")
+        # The "gpu" backend does not wait for a pose that is on a GPU.
+        if backend == "reference" or (pose.is_cpu and not all(map(math.isfinite, pose.flatten().tolist()))):
+            check_finite(**{name: pose})
     for name in ("fx", "fy"):
         value = getattr(camera, name)
         if not (value > 0 and math.isfinite(value)):

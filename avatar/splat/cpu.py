@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from avatar import _core
 from avatar.compute.native import instruction_set, thread_count
 from avatar.splat.counters import Counters
+from avatar.splat.pose import pose_of
 from avatar.splat.region import Region
 from avatar.tensors import describe_non_finite
 from avatar.types import Camera, Gaussians, Rendering
@@ -23,8 +24,8 @@ class CannotDraw(ValueError):
 
 def splat_cpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
     """`avatar.splat.splat` without its checks of shape and type; float32 tensors on the CPU."""
-    size = camera.height, camera.width
-    image, alpha = _Splat.apply(*gaussians, background, size, _settings(camera, **options))  # pyright: ignore
+    size, pose = (camera.height, camera.width), pose_of(camera, gaussians.means.device)
+    image, alpha = _Splat.apply(*gaussians, background, pose, size, _settings(camera, **options))  # pyright: ignore
     return Rendering(image, alpha)
 
 
@@ -90,7 +91,7 @@ def _draw(
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *inputs, background, size, settings = arguments
+        *inputs, background, _, size, settings = arguments
         gaussians = Gaussians(*(t.detach().contiguous() for t in inputs))
         image, alpha, drawing = _draw(gaussians, background.detach(), size, settings)
         ctx.drawing = drawing
@@ -104,6 +105,7 @@ class _Splat(torch.autograd.Function):
         gaussians = Gaussians(*ctx.saved_tensors)
         gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
         grad_background = torch.empty(3, dtype=torch.float32)
+        grad_pose = torch.empty(12, dtype=torch.float64) if ctx.needs_input_grad[6] else None
         _core.splat_backward(
             ctx.drawing,
             **gaussians._asdict(),
@@ -111,5 +113,6 @@ class _Splat(torch.autograd.Function):
             grad_alpha=None if grad_alpha is None else grad_alpha.contiguous(),
             **{f"grad_{name}": gradient for name, gradient in gradients._asdict().items()},
             grad_background=grad_background,
+            grad_pose=grad_pose,
         )
-        return *gradients, grad_background, None, None
+        return *gradients, grad_background, grad_pose, None, None

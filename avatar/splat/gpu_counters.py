@@ -12,7 +12,7 @@ from avatar.kernels.composite import NEVER_STOPS
 from avatar.kernels.project import VISIBLE
 from avatar.splat import gpu_draw
 from avatar.splat.counters import Counters
-from avatar.splat.gpu import settings_of
+from avatar.splat.gpu import pose_on, settings_of
 from avatar.splat.gpu_draw import Counted, Drawing, Settings, draw, tile_grid
 from avatar.types import Camera, Gaussians, Rendering
 
@@ -27,7 +27,8 @@ def count_gpu(
 
     A block is a tile here: its pixels are drawn in step.
     """
-    settings = settings_of(camera, gaussians.means.device, **options, everywhere=everywhere)
+    device = gaussians.means.device
+    settings = settings_of(camera, device, **options, everywhere=everywhere)
     background = background.detach().contiguous()
     if len(gaussians.means) == 0:
         tiles = tile_grid(settings.region, gpu_draw.TUNING.tile).tiles
@@ -35,7 +36,7 @@ def count_gpu(
         counts = dict.fromkeys(Counters._fields, 0) | {"tiles": tiles, "blocks": tiles}
         return Rendering(image, torch.zeros_like(image[..., 0])), Counters(**counts)
     tensors = Gaussians(*(t.detach().contiguous() for t in gaussians))
-    rendering, drawing, found = draw(tensors, background, settings, count=True)
+    rendering, drawing, found = draw(tensors, pose_on(camera, device), background, settings, count=True)
     return rendering, counters_of(settings, drawing, found)
 
 
@@ -68,7 +69,7 @@ def counters_of(settings: Settings, drawing: Drawing, found: Counted) -> Counter
 def tile_of_pixels(settings: Settings, drawing: Drawing) -> Int[Tensor, "H W"]:
     """The tile of each pixel; of those outside the region, which are never open, any."""
     rows, columns = (
-        torch.arange(size, device=settings.view.device) // drawing.tuning.tile - first
+        torch.arange(size, device=drawing.chunks.device) // drawing.tuning.tile - first
         for size, first in ((settings.height, drawing.grid.first_y), (settings.width, drawing.grid.first_x))
     )
     return rows[:, None] * drawing.grid.across + columns

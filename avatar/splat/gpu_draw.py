@@ -1,4 +1,4 @@
-"""The launches of a drawing on a GPU and of its gradients; no autograd, and nothing that waits but `needed_pairs`."""
+"""The launches of a drawing on a GPU; no autograd, and nothing that waits but `needed_pairs`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from torch import Tensor
 
 from avatar.kernels.bin import FIELDS, expand, gather
 from avatar.kernels.composite import composite
-from avatar.kernels.composite_backward import MOMENTS, composite_backward
 from avatar.kernels.project import POISON, project
-from avatar.kernels.project_backward import colour_of_backward, project_backward, sum_moments
 from avatar.kernels.start import start
 from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Kind
 from avatar.splat.cpu import CannotDraw
@@ -49,9 +47,9 @@ TUNING = Tuning()
 
 
 class Settings(NamedTuple):
-    """The options of `avatar.splat.splat`, checked, and what they need of the camera."""
+    """The options of `avatar.splat.splat`, checked, and what they need of the camera but for its pose."""
 
-    view: Float[Tensor, " 25"]  # float64, see avatar.kernels.geometry
+    intrinsics: Float[Tensor, " 10"]  # float64, see avatar.kernels.geometry
     width: int
     height: int
     region: Region
@@ -111,9 +109,14 @@ class Counted(NamedTuple):
 
 
 def draw(
-    gaussians: Gaussians, background: Float[Tensor, " 3"], settings: Settings, *, count: bool = False
+    gaussians: Gaussians,
+    pose: Float[Tensor, " 12"],
+    background: Float[Tensor, " 3"],
+    settings: Settings,
+    *,
+    count: bool = False,
 ) -> tuple[Rendering, Drawing, Counted]:
-    """Draw contiguous tensors of at least one Gaussian."""
+    """Draw contiguous tensors of at least one Gaussian, seen from `pose` (float64, see avatar.splat.pose)."""
     device, tuning, s = gaussians.means.device, TUNING, settings
     N, stored = len(gaussians.means), gaussians.sh.shape[1]
     grid, warps = tile_grid(s.region, tuning.tile), tuning.lanes // 32
@@ -127,7 +130,7 @@ def draw(
     start(
         project,
         programs(N, tuning.lanes),
-        *(*gaussians, s.view, s.alpha_min, s.sh_degree, N, s.width, s.height, *grid),
+        *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree, N, s.width, s.height, *grid),
         *(depths, ellipses, looks, boxes, visibility),
         warps=warps,
         STORED=stored,
@@ -142,7 +145,7 @@ def draw(
     kind = Kind(device, N, grid.tiles)
     capacity = CAPACITIES.known(kind)
     if capacity is None:
-        capacity = CAPACITIES.learn(kind, needed_pairs(gaussians, background, boxes, ends))
+        capacity = CAPACITIES.learn(kind, needed_pairs(gaussians, pose, background, boxes, ends))
     if not 1 <= capacity <= MAX_PAIRS:
         raise ValueError(f"the capacity must be 1 to {MAX_PAIRS} pairs of a tile and a splat, got {capacity}")
 
@@ -196,63 +199,6 @@ def draw(
     return Rendering(image, alphas), drawing, Counted(visibility, ellipses, looks, composited)
 
 
-def backward(
-    gaussians: Gaussians,
-    background: Float[Tensor, " 3"],
-    settings: Settings,
-    drawing: Drawing,
-    grad_image: Float[Tensor, "H W 3"] | None,
-    grad_alpha: Float[Tensor, "H W"] | None,
-) -> Gaussians:
-    """The gradients of all fields; four launches."""
-    s, d, N, tuning = settings, drawing, len(gaussians.means), drawing.tuning
-    stride = d.records.shape[1]
-    moments = torch.empty((stride, MOMENTS.value), dtype=torch.float32, device=background.device)
-    # The moments stand for a cotangent that the kernel does not read.
-    by_image, by_alpha = (moments if g is None else g.contiguous() for g in (grad_image, grad_alpha))
-    start(
-        composite_backward,
-        d.grid.tiles,
-        *(d.records, d.begins, d.chunks, background, d.transmittances, d.stops, by_image, by_alpha),
-        *(s.alpha_min, s.alpha_max, stride, s.width, *d.grid.place, *s.region, moments),
-        warps=tuning.backward_warps,
-        HAS_IMAGE=grad_image is not None,
-        HAS_ALPHA=grad_alpha is not None,
-        TILE=tuning.tile,
-        CHUNK=tuning.chunk,
-        STEP=tuning.backward_step,
-        FORWARD_STEP=tuning.step,
-    )
-    sums = torch.empty((MOMENTS.value, N), dtype=torch.float64, device=background.device)
-    start(
-        sum_moments,
-        programs(N, tuning.summed),
-        *(d.order, d.ends, d.boxes, d.places, moments, N, d.capacity, sums),
-        warps=1,
-        LANES=tuning.summed_lanes,
-        BLOCK=tuning.summed,
-    )
-    gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
-    warps = max(tuning.backward_lanes // 32, 1)
-    start(
-        colour_of_backward,
-        programs(N, tuning.backward_lanes),
-        *(gaussians.means, gaussians.sh, s.view, sums, s.sh_degree, N, gradients.means, gradients.sh),
-        warps=warps,
-        STORED=gaussians.sh.shape[1],
-        BLOCK=tuning.backward_lanes,
-    )
-    start(
-        project_backward,
-        programs(N, tuning.backward_lanes),
-        *(*gaussians[:4], s.view, sums, N, *gradients[:4]),
-        warps=warps,
-        ANTIALIASED=s.antialiased,
-        BLOCK=tuning.backward_lanes,
-    )
-    return gradients
-
-
 def programs(items: int, each: int) -> int:
     """How many programs of `each` items it takes; also what to multiply `each` by to hold all."""
     return -(-items // each)
@@ -273,14 +219,18 @@ def _numbers(bits: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor,
 
 
 def needed_pairs(
-    gaussians: Gaussians, background: Float[Tensor, " 3"], boxes: Int[Tensor, "4 N"], ends: Int[Tensor, " N"]
+    gaussians: Gaussians,
+    pose: Float[Tensor, " 12"],
+    background: Float[Tensor, " 3"],
+    boxes: Int[Tensor, "4 N"],
+    ends: Int[Tensor, " N"],
 ) -> int:
     """The number of pairs, waited for. Raises CannotDraw, as the "cpu" backend does, where nothing can be drawn."""
     needed = int(ends[-1])
     try:
         check_finite(background=background)
         if needed >= POISON.value:
-            check_finite(**gaussians._asdict())
+            check_finite(**gaussians._asdict(), R_cam_world=pose[:9].view(3, 3), t_cam_world=pose[9:])
     except ValueError as error:
         raise CannotDraw(str(error)) from None
     if needed >= POISON.value and bool((spoilt := boxes[3] == POISON.value).any()):

@@ -107,7 +107,7 @@ def project(
     R = camera.R_cam_world.to(gaussians.means)
     t = camera.t_cam_world.to(gaussians.means)
     # Written out, so that every backend that computes in float64 rounds a depth, and so breaks near-ties, in the same way.
-    depth = _row_times(R[2], gaussians.means.detach()) + t[2]
+    depth = _row_times(R[2].detach(), gaussians.means.detach()) + t[2].detach()
     visible = (depth >= near).nonzero()[:, 0]
     visible = visible[torch.sort(depth[visible], stable=True).indices]
     means, quats, scales, opacities, sh = (field[visible] for field in gaussians)

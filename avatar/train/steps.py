@@ -20,7 +20,6 @@ from torch import Tensor
 from avatar.compute.device import brought, on_gpu
 from avatar.compute.replay import Replay
 from avatar.model import Avatar
-from avatar.splat import NEAR
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.capacity import Kind as DrawingKind
 from avatar.train.align import Alignment, Row, Seen
@@ -169,14 +168,14 @@ class Steps:
 
     def _inputs(self, step: int, frame: Frame, seen: Seen | None, row: Row | None) -> list[Tensor]:
         """What differs between steps of a kind, where the avatar is; in the order in which `_play` takes it."""
-        from avatar.splat.gpu import view_block  # imports Triton, which is not there on every machine
+        from avatar.splat.gpu import pose_on  # imports Triton, which is not there on every machine
 
         avatar, device = self._avatar, self._avatar.code.device
         shown = frame if seen is None else seen.frame
         few = [torch.zeros(1) if row is None else torch.tensor([row.rate])]
         few += [] if avatar.turning is None else [avatar.told(shown.camera.R_cam_world)]
         few += [] if self._noise is None else [self._noise.of(step)]
-        inputs = [view_block(shown.camera, avatar.config.blur, NEAR, device), brought(torch.cat(few), device)]
+        inputs = [pose_on(shown.camera, device), brought(torch.cat(few), device)]
         inputs += [getattr(shown, name) for name in _PLANES]
         if row is not None:
             return inputs + list(row[:-1])
@@ -193,10 +192,9 @@ class Steps:
         inputs: Sequence[Tensor],
     ) -> tuple[Outcome, Tensor | None]:
         """Launch a step like number `step` on what `inputs` hold."""
-        from avatar.splat.gpu import fixed_view
-
-        view, few, *rest = inputs
-        frame = replace(frame, **dict(zip(_PLANES, rest, strict=False)))
+        pose, few, *rest = inputs
+        camera = replace(frame.camera, R_cam_world=pose[:9].view(3, 3), t_cam_world=pose[9:])
+        frame = replace(frame, camera=camera, **dict(zip(_PLANES, rest, strict=False)))
         rest, rate, few = rest[len(_PLANES) :], few[0], few[1:]
         told, few = (None, few) if self._avatar.turning is None else (few[:3], few[3:])
         if row is None:
@@ -207,9 +205,8 @@ class Steps:
             given, lowest, highest, moves, R, t = rest
             seen = self._alignment.placed(step, frame, Row(given, lowest, highest, moves, R, t, rate))
         shown = seen.frame if self._noise is None else noisy(seen.frame, few)
-        with fixed_view(view):
-            given = step, shown, seen.vertices, judge, seen.watched, told
-            outcome = descend(self._avatar, self._optimizer, self._objective, *given)
+        given = step, shown, seen.vertices, judge, seen.watched, told
+        outcome = descend(self._avatar, self._optimizer, self._objective, *given)
         if seen.placed is None or self._alignment is None:
             return outcome, None
         return outcome, self._alignment.moved(seen, is_spoilt)

@@ -21,6 +21,7 @@ SIMD = ("baseline", "avx2", "avx512")
 # The gpu backend takes part where there is a GPU, and where Triton interprets its kernels: make gpu-check.
 GPU = ["gpu"] if interpreted() or torch.cuda.is_available() else []
 BACKENDS = ["cpu", "reference", *GPU]
+POSE = ("R_cam_world", "t_cam_world")
 
 
 @dataclass(frozen=True)
@@ -147,22 +148,28 @@ def render(scene: Scene, backend: Any = "cpu") -> Rendering:
 
 def gradients(scene: Scene, backend: Any, grad_image: Tensor | None, grad_alpha: Tensor | None) -> dict[str, Tensor]:
     """dL/d(every input) for L = grad_image . image + grad_alpha . alpha."""
-    inputs = {**scene.gaussians._asdict(), "background": scene.background}
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
-    leaf_scene = replace(
-        scene, gaussians=Gaussians(*(leaves[n] for n in Gaussians._fields)), background=leaves["background"]
-    )
-    rendering = render(leaf_scene, backend)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs_of(scene).items()}
+    rendering = render(with_inputs(scene, leaves), backend)
     pairs = [(o, g) for o, g in zip(rendering, (grad_image, grad_alpha), strict=True) if g is not None]
     outputs, cotangents = zip(*pairs, strict=True)
     found = torch.autograd.grad(outputs, list(leaves.values()), cotangents, allow_unused=True)
     return {n: torch.zeros_like(leaves[n]) if g is None else g for n, g in zip(leaves, found, strict=True)}
 
 
+def inputs_of(scene: Scene) -> dict[str, Tensor]:
+    """All that a drawing has a gradient in."""
+    pose = {name: getattr(scene.camera, name) for name in POSE}
+    return {**scene.gaussians._asdict(), "background": scene.background, **pose}
+
+
+def with_inputs(scene: Scene, inputs: dict[str, Tensor]) -> Scene:
+    """The scene with other tensors in the place of `inputs_of` it."""
+    gaussians, pose = Gaussians(*(inputs[n] for n in Gaussians._fields)), {name: inputs[name] for name in POSE}
+    return replace(scene, gaussians=gaussians, background=inputs["background"], camera=replace(scene.camera, **pose))
+
+
 def in_float64(scene: Scene) -> Scene:
-    return replace(
-        scene, gaussians=Gaussians(*(t.double() for t in scene.gaussians)), background=scene.background.double()
-    )
+    return with_inputs(scene, {name: tensor.double() for name, tensor in inputs_of(scene).items()})
 
 
 def ambiguous_pixels(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -211,18 +218,25 @@ def expected_of_named(name: str) -> Expected:
 
 
 def assert_agrees(
-    scene: Scene, backend: Any = "cpu", *, expected: Expected | None = None, image_tolerance: float = 1e-5
+    scene: Scene,
+    backend: Any = "cpu",
+    *,
+    expected: Expected | None = None,
+    image_tolerance: float = 1e-5,
+    pose_tolerance: float = 1e-4,
 ) -> None:
     """Image, alpha and, for one random cotangent, every gradient agree with the float64 reference."""
     if expected is None:
         expected = expected_of(scene)
     assert expected.ambiguous.float().mean() <= 0.01 or expected.ambiguous.sum() <= 2
     with torch.no_grad():
-        found = render(scene, backend)
+        drawn = render(scene, backend)
     allowed = image_tolerance + torch.where(expected.ambiguous, expected.jump, 0.0)
-    assert ((found.image - expected.rendering.image).abs().amax(-1) <= allowed).all()
-    assert ((found.alpha - expected.rendering.alpha).abs() <= allowed).all()
-    assert_gradients_close(gradients(scene, backend, expected.grad_image, expected.grad_alpha), expected.gradients)
+    assert ((drawn.image - expected.rendering.image).abs().amax(-1) <= allowed).all()
+    assert ((drawn.alpha - expected.rendering.alpha).abs() <= allowed).all()
+    found, wanted = gradients(scene, backend, expected.grad_image, expected.grad_alpha), dict(expected.gradients)
+    assert_gradients_close(found, {name: wanted.pop(name) for name in POSE}, pose_tolerance)
+    assert_gradients_close(found, wanted)
 
 
 def assert_gradients_close(found: dict[str, Tensor], wanted: dict[str, Tensor], tolerance: float = 1e-4) -> None:

@@ -139,7 +139,8 @@ def test_gradients_hold_behind_thousands_of_faint_splats(simd: str, monkeypatch:
     g = random_gaussians(4000, seed=9, sh_degree=0, spread=0.02, size=0.5, anisotropy=0.1)
     scene = Scene(g._replace(opacities=torch.full((4000,), 0.005)), camera(20, 20))
     scene = scene.with_options(alpha_min=0.0)  # or cut-offs would fall on many pixels
-    assert_agrees(scene)
+    # The splats' gradients cancel to a three-hundredth in those of the pose, which are their sums.
+    assert_agrees(scene, pose_tolerance=1e-3)
     found = counters(scene.gaussians, scene.camera, scene.background, **scene.options)
     assert found.pixels_composited > 1000 * 400
 

@@ -91,7 +91,7 @@ void bind_splat(nb::module_& m) {
         [](const Drawing& drawing, ConstFloats means, ConstFloats quats, ConstFloats scales, ConstFloats opacities,
            ConstFloats sh, std::optional<ConstFloats> grad_image, std::optional<ConstFloats> grad_alpha,
            Floats grad_means, Floats grad_quats, Floats grad_scales, Floats grad_opacities, Floats grad_sh,
-           Floats grad_background) {
+           Floats grad_background, std::optional<Array<double>> grad_pose) {
             Size N("N"), K("K");
             const int sh_degree = drawing.view.settings.sh_degree;
             const Camera& camera = drawing.view.camera;
@@ -100,6 +100,7 @@ void bind_splat(nb::module_& m) {
             avatar::check_within("the number of Gaussians", N.value, drawn, drawn);
             check_gaussians("grad_", grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, sh_degree, N, K);
             check_shape("grad_background", grad_background, {3});
+            if (grad_pose) check_shape("grad_pose", *grad_pose, {kPoseValues});
             if (grad_image) check_shape("grad_image", *grad_image, {camera.height, camera.width, 3});
             if (grad_alpha) check_shape("grad_alpha", *grad_alpha, {camera.height, camera.width});
             const GaussianGradients gradients{grad_means.data(), grad_quats.data(), grad_scales.data(),
@@ -107,11 +108,12 @@ void bind_splat(nb::module_& m) {
             const nb::gil_scoped_release unlocked;
             backward(drawing, gaussians_of(means, quats, scales, opacities, sh),
                      grad_image ? grad_image->data() : nullptr, grad_alpha ? grad_alpha->data() : nullptr, gradients,
-                     grad_background.data());
+                     grad_background.data(), grad_pose ? grad_pose->data() : nullptr);
         },
         nb::arg("drawing"), nb::arg("means").noconvert(), nb::arg("quats").noconvert(), nb::arg("scales").noconvert(),
         nb::arg("opacities").noconvert(), nb::arg("sh").noconvert(),
         nb::arg("grad_image").noconvert().none(), nb::arg("grad_alpha").noconvert().none(),
         nb::arg("grad_means").noconvert(), nb::arg("grad_quats").noconvert(), nb::arg("grad_scales").noconvert(),
-        nb::arg("grad_opacities").noconvert(), nb::arg("grad_sh").noconvert(), nb::arg("grad_background").noconvert());
+        nb::arg("grad_opacities").noconvert(), nb::arg("grad_sh").noconvert(), nb::arg("grad_background").noconvert(),
+        nb::arg("grad_pose").noconvert() = nb::none());
 }

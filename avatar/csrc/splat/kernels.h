@@ -10,9 +10,11 @@ struct Kernels {
     int words;  // in a set of a tile's blocks, which have as many pixels as a vector has lanes
     bool (*all_finite)(const float* values, std::int64_t count);
     void (*project)(const View&, const Gaussians&, std::int64_t begin, std::int64_t end, const Projection&);
-    // Writes (does not add) the gradients of Gaussians begin .. end - 1 from moments [pairs * kMoments], by slot.
+    // Writes (does not add) the gradients of Gaussians begin .. end - 1 from moments [pairs * kMoments], by slot, and to
+    // grad_pose [kPoseValues], unless that is null, what they add to the gradient of the camera's pose.
     void (*project_backward)(const View&, const Gaussians&, std::int64_t begin, std::int64_t end,
-                             const std::uint32_t* slot_begin, const float* moments, const GaussianGradients&);
+                             const std::uint32_t* slot_begin, const float* moments, const GaussianGradients&,
+                             double* grad_pose);
     void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
     void (*count_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);  // draws as forward_tile and counts
     void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);

@@ -15,9 +15,18 @@ struct alignas(64) BatchGradients {
     float sh[3 * kMaxCoefficients][kBatch];
 };
 
-// dL/dF (2x3) -> scales, quaternion and, through T, the camera-space centre.
+// The gradient of the camera's pose, R (9 values) and t (3), a sum over Gaussians in each lane. By p = R m + t, by
+// T row = f / z (R_row - slope R_z), and by the direction d along m + R^T t, which the colour depends on:
+//     dL/dR = sum of (dL/dp) m^T + t (dL/dm by d)^T + dL/dR by T,    dL/dt = sum of dL/dp + R (dL/dm by d)
+struct alignas(64) PoseSums {
+    double values[kPoseValues][kBatch];
+
+    void add(int value, int at, Doubles term) { store(values[value] + at, load(values[value] + at) + term); }
+};
+
+// dL/dF (2x3) -> scales, quaternion and, through T, the camera-space centre and the pose.
 inline void covariance_backward(const View& view, const Geometry& g, const Doubles grad_F[2][3], Doubles grad_p[3],
-                                int at, BatchGradients& to) {
+                                int at, BatchGradients& to, PoseSums* pose) {
     const Doubles* R = g.rotation;
     // F = T M, M = rotation * diag(scales)
     Doubles G[9], grad_T[2][3] = {};
@@ -51,11 +60,17 @@ inline void covariance_backward(const View& view, const Geometry& g, const Doubl
         const Doubles grad_slope = -scale * along_z;
         grad_p[row] = g.clamped[row] ? grad_p[row] : grad_p[row] + grad_slope * g.inv_z;
         grad_p[2] = g.clamped[row] ? grad_p[2] : grad_p[2] - grad_slope * g.slope[row] * g.inv_z;
+        if (pose == nullptr) continue;
+        for (int k = 0; k < 3; ++k) {
+            pose->add(3 * row + k, at, scale * grad_T[row][k]);
+            pose->add(6 + k, at, -scale * g.slope[row] * grad_T[row][k]);
+        }
     }
 }
 
 // Through the ellipse and the opacity, for the Gaussians in lanes `at` and following.
-inline void outline_backward(const View& view, const Batch& batch, const Sums& sums, int at, BatchGradients& to) {
+inline void outline_backward(const View& view, const Batch& batch, const Sums& sums, int at, BatchGradients& to,
+                             PoseSums* pose) {
     const Geometry g = geometry_of(view, batch, at);
     const auto moment = [&](Moment m) { return load(sums.moments[m] + at); };
     const Doubles root_det = square_root(g.det), root = square_root(g.yy);
@@ -101,7 +116,7 @@ inline void outline_backward(const View& view, const Batch& batch, const Sums& s
     const Camera& camera = view.camera;
     Doubles grad_p[3] = {grad_x * camera.fx * g.inv_z, grad_y * camera.fy * g.inv_z,
                          -(grad_x * camera.fx * g.p[0] + grad_y * camera.fy * g.p[1]) * g.inv_z * g.inv_z};
-    covariance_backward(view, g, grad_F, grad_p, at, to);
+    covariance_backward(view, g, grad_F, grad_p, at, to, pose);
     for (int k = 0; k < 3; ++k) store(to.p[k] + at, grad_p[k]);
 }
 
@@ -130,9 +145,9 @@ inline void colour_backward(int degree, const Directions& directions, const Batc
     for (int k = 0; k < 3; ++k) store(grad_d[k] + at, by_direction[k]);
 }
 
-inline void means_backward(const View& view, const Directions& directions, const float grad_d[3][kBatch], int at,
-                           BatchGradients& to) {
-    Doubles d[3], by_d[3], by_p[3];
+inline void means_backward(const View& view, const Batch& batch, const Directions& directions,
+                           const float grad_d[3][kBatch], int at, BatchGradients& to, PoseSums* pose) {
+    Doubles d[3], by_d[3], by_p[3], through_colour[3];
     for (int k = 0; k < 3; ++k) {
         d[k] = load_as_doubles(directions.d[k] + at);
         by_d[k] = load_as_doubles(grad_d[k] + at);
@@ -142,23 +157,32 @@ inline void means_backward(const View& view, const Directions& directions, const
     const double* R = view.camera.rotation;
     for (int k = 0; k < 3; ++k) {
         const Doubles through_view = R[k] * by_p[0] + R[3 + k] * by_p[1] + R[6 + k] * by_p[2];
-        const Doubles through_colour = (by_d[k] - along * d[k]) * inv_distance;
-        store_as_floats(to.means[k] + at, through_view + through_colour);
+        through_colour[k] = (by_d[k] - along * d[k]) * inv_distance;
+        store_as_floats(to.means[k] + at, through_view + through_colour[k]);
+    }
+    if (pose == nullptr) return;
+    const double* t = view.camera.translation;
+    for (int row = 0; row < 3; ++row) {
+        for (int k = 0; k < 3; ++k)
+            pose->add(3 * row + k, at, by_p[row] * load_as_doubles(batch.means[k] + at) + t[row] * through_colour[k]);
+        pose->add(9 + row, at, by_p[row] + dot(through_colour, R + 3 * row));
     }
 }
 
-// Writes (does not add) the gradients of the Gaussians with these indices, from the moments of their splats.
+// Writes (does not add) the gradients of the Gaussians with these indices, from the moments of their splats. Adds to
+// `pose`, which is null where nobody asks for it; all moments in lanes from `count` on are 0.
 inline void batch_backward(const View& view, const Gaussians& gaussians, const std::int64_t* indices, int count,
-                           const Sums& sums, const GaussianGradients& gradients) {
+                           const Sums& sums, const GaussianGradients& gradients, PoseSums* pose) {
     const int degree = view.settings.sh_degree, values = 3 * (degree + 1) * (degree + 1);
     Batch batch;
     batch.read(gaussians, indices, count, values);
     const Directions directions(view, batch);
     BatchGradients found;
     alignas(64) float grad_d[3][kBatch];
-    for (int at = 0; at < kBatch; at += kDoubles) outline_backward(view, batch, sums, at, found);
+    for (int at = 0; at < kBatch; at += kDoubles) outline_backward(view, batch, sums, at, found, pose);
     for (int at = 0; at < kBatch; at += kLanes) colour_backward(degree, directions, batch, sums, at, found, grad_d);
-    for (int at = 0; at < kBatch; at += kDoubles) means_backward(view, directions, grad_d, at, found);
+    for (int at = 0; at < kBatch; at += kDoubles)
+        means_backward(view, batch, directions, grad_d, at, found, pose);
 
     float unused[3 * kMaxCoefficients];
     float *mean_rows[kBatch], *quat_rows[kBatch], *scale_rows[kBatch], *sh_rows[kBatch];
@@ -188,10 +212,13 @@ inline void clear(const GaussianGradients& gradients, std::int64_t i, std::int64
 }
 
 // Writes the gradients of the Gaussians begin .. end - 1. Those whose moments are all 0, hidden or behind all others,
-// have none.
+// have none. What they add to the camera's goes to `grad_pose` [kPoseValues], unless that is null.
 void project_backward(const View& view, const Gaussians& gaussians, std::int64_t begin, std::int64_t end,
-                      const std::uint32_t* slot_begin, const float* moments, const GaussianGradients& gradients) {
+                      const std::uint32_t* slot_begin, const float* moments, const GaussianGradients& gradients,
+                      double* grad_pose) {
     Sums sums{};
+    PoseSums pose_sums{};
+    PoseSums* const pose = grad_pose != nullptr ? &pose_sums : nullptr;
     std::int64_t indices[kBatch];
     int count = 0;
     for (std::int64_t i = begin; i < end; ++i) {
@@ -207,10 +234,19 @@ void project_backward(const View& view, const Gaussians& gaussians, std::int64_t
         for (int k = 0; k < kMoments; ++k) sums.moments[k][count] = own[k];
         indices[count++] = i;
         if (count < kBatch) continue;
-        batch_backward(view, gaussians, indices, count, sums, gradients);
+        batch_backward(view, gaussians, indices, count, sums, gradients, pose);
         count = 0;
     }
-    if (count > 0) batch_backward(view, gaussians, indices, count, sums, gradients);
+    if (count > 0) {
+        for (int k = 0; k < kMoments; ++k)
+            for (int lane = count; lane < kBatch; ++lane) sums.moments[k][lane] = 0.0;
+        batch_backward(view, gaussians, indices, count, sums, gradients, pose);
+    }
+    if (pose == nullptr) return;
+    for (int k = 0; k < kPoseValues; ++k) {
+        grad_pose[k] = 0.0;
+        for (int lane = 0; lane < kBatch; ++lane) grad_pose[k] += pose->values[k][lane];
+    }
 }
 
 }  // namespace

@@ -29,6 +29,7 @@ struct Camera {
     double fx, fy, cx, cy;  // pixels
     int width, height;
 };
+constexpr int kPoseValues = 12;  // of a gradient of the pose: rotation, then translation
 
 // The part of the image that is drawn, in pixels: columns left to right - 1, rows top to bottom - 1. Not empty.
 struct Region {

@@ -205,7 +205,7 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
 }
 
 void backward(const Drawing& drawing, const Gaussians& gaussians, const float* grad_image, const float* grad_alpha,
-              const GaussianGradients& gradients, float grad_background[3]) {
+              const GaussianGradients& gradients, float grad_background[3], double* grad_pose) {
     const TileLists& lists = drawing.lists;
     const std::int64_t tiles = TileGrid(drawing.view.region).count();
     const std::unique_ptr<float[]> moments(new float[lists.pair_count * kMoments]);  // every slot is written
@@ -224,10 +224,17 @@ void backward(const Drawing& drawing, const Gaussians& gaussians, const float* g
     if (grad_image != nullptr && !is_whole_image(drawing.view)) add_outside(drawing, grad_image, total);
     for (int c = 0; c < 3; ++c) grad_background[c] = static_cast<float>(total[c]);
 
+    const bool has_pose = grad_pose != nullptr;
+    const std::int64_t ranges = (gaussians.count + kRange - 1) / kRange;
+    std::vector<double> range_poses(has_pose ? kPoseValues * ranges : 0);  // summed in a fixed order below
     parallel_for(drawing.threads, gaussians.count, kRange, [&](std::int64_t begin, std::int64_t end) {
+        double* const pose = has_pose ? &range_poses[kPoseValues * (begin / kRange)] : nullptr;
         drawing.kernels->project_backward(drawing.view, gaussians, begin, end, lists.slot_begin.data(), moments.get(),
-                                          gradients);
+                                          gradients, pose);
     });
+    if (!has_pose) return;
+    std::fill(grad_pose, grad_pose + kPoseValues, 0.0);
+    for (std::size_t i = 0; i < range_poses.size(); ++i) grad_pose[i % kPoseValues] += range_poses[i];
 }
 
 }  // namespace avatar::splat

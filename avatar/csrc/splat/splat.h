@@ -42,8 +42,8 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                  const Region& region, const float background[3], const Kernels& kernels, int threads,
                                  float* image, float* alpha, Counts* counts = nullptr);
 
-// Writes all gradients. grad_image or grad_alpha may be null.
+// Writes all gradients. grad_image or grad_alpha may be null, and grad_pose [kPoseValues] where it is not wanted.
 void backward(const Drawing& drawing, const Gaussians& gaussians, const float* grad_image, const float* grad_alpha,
-              const GaussianGradients& gradients, float grad_background[3]);
+              const GaussianGradients& gradients, float grad_background[3], double* grad_pose);
 
 }  // namespace avatar::splat
