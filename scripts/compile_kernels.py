@@ -17,6 +17,8 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,7 +59,8 @@ TYPES = {
     torch.uint8: "*u8",
 }
 DIVISIBLE = [["tt.divisibility", 16]]
-SHOWN = ("ANTIALIASED", "HAS_IMAGE", "HAS_ALPHA", "HAS_GRID", "HAS_HYPER", "SAVE", "GRADIENT", "COLUMNS", "WIDTH")
+SHOWN = ("ANTIALIASED", "POSE", "HAS_IMAGE", "HAS_ALPHA", "HAS_GRID", "HAS_HYPER", "SAVE", "GRADIENT", "COLUMNS")
+SHOWN += ("WIDTH",)
 
 
 class Variant(NamedTuple):
@@ -119,9 +122,11 @@ def rehearse(assets: HeadAssets) -> list[Variant]:
             rehearsal = Rehearsal(assets, 128, 512, overrides)
             rehearsal.step(term, late=True)
             rehearsal.rendered()
-        for antialiased in (False, True):
+        still = head_camera(512)
+        R, t = (part.to(META).requires_grad_() for part in (still.R_cam_world, still.t_cam_world))
+        for antialiased, camera in product((False, True), (still, replace(still, R_cam_world=R, t_cam_world=t))):
             shell = Gaussians(*(field.to(META).requires_grad_() for field in head_shell()))
-            drawn = splat(shell, head_camera(512), torch.zeros(3, device=META), antialiased=antialiased)
+            drawn = splat(shell, camera, torch.zeros(3, device=META), antialiased=antialiased)
             (drawn.image.sum() + drawn.alpha.sum()).backward()
     return sorted(found)
 

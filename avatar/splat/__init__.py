@@ -67,8 +67,8 @@ def splat(
     zero quaternion is the identity, with zero gradient. The sign of a scale has no effect.
 
     The gradient in the pose is that of any 3 x 3 matrix R and vector t: with p = R m + t for each mean m,
-    dL/dR = sum of (dL/dp) m^T and dL/dt = sum of dL/dp, plus what R changes in the covariance J R Sigma R^T J^T, and both in
-    the direction m + R^T t of the colour. It is computed where R or t requires it. R and t are on the CPU or where the
+    dL/dR = sum of (dL/dp) m^T and dL/dt = sum of dL/dp, plus what R changes in the covariance J R Sigma R^T J^T, and both
+    in the direction m + R^T t of the colour. It is computed where R or t requires it. R and t are on the CPU or where the
     Gaussians are. Nothing waits for a pose on a GPU; the backward pass waits for the gradient of a pose on the CPU.
 
     Image, alpha and gradients of the "cpu" backend are the same to the last bit for any number of threads.

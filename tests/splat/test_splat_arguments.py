@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat.scenes import BACKENDS, Scene, camera, random_gaussians, render
+from splat.scenes import BACKENDS, POSE, Scene, camera, random_gaussians, render
 
 from avatar.types import Gaussians
 
@@ -74,6 +74,13 @@ def test_wrong_device() -> None:
         render(_with_field("scales", SCENE.gaussians.scales.to("meta")))
 
 
+@pytest.mark.parametrize("name", POSE)
+def test_a_pose_that_is_elsewhere(name: str) -> None:
+    pose = getattr(SCENE.camera, name).to("meta")
+    with pytest.raises(ValueError, match=rf"camera\.{name} must be on the cpu .* got meta"):
+        render(replace(SCENE, camera=replace(SCENE.camera, **{name: pose})))
+
+
 def test_unknown_backend() -> None:
     with pytest.raises(ValueError, match='backend must be "cpu", "gpu" or "reference", got \'metal\''):
         render(SCENE, "metal")
@@ -121,9 +128,10 @@ def test_impossible_cameras(field: str, value: float) -> None:
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize(("name", "at"), [("R_cam_world", (2, 1)), ("t_cam_world", (1,))])
-def test_camera_with_a_non_finite_pose(name: str, at: tuple[int, ...], value: float) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_camera_with_a_non_finite_pose(backend: str, name: str, at: tuple[int, ...], value: float) -> None:
     pose = getattr(SCENE.camera, name).clone()
     pose[at] = value
     message = rf"{name} has 1 non-finite of {pose.numel()} values, the first at \[{', '.join(map(str, at))}\]"
     with pytest.raises(ValueError, match=message):
-        render(replace(SCENE, camera=replace(SCENE.camera, **{name: pose})))
+        render(replace(SCENE, camera=replace(SCENE.camera, **{name: pose})), backend)

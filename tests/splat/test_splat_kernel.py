@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 import torch
 from splat.scenes import (
+    POSE,
     SCENES,
     SIMD,
     Scene,
@@ -19,10 +20,12 @@ from splat.scenes import (
     camera,
     gradients,
     in_float64,
+    inputs_of,
     random_gaussians,
     render,
     single_splat,
     use_simd,
+    with_inputs,
 )
 
 from avatar import _core
@@ -93,7 +96,7 @@ def test_impossible_number_of_threads_is_refused(text: str, monkeypatch: pytest.
         render(SCENES["1x1"])
 
 
-@pytest.mark.parametrize("field", [*Gaussians._fields, "background"])
+@pytest.mark.parametrize("field", [*Gaussians._fields, "background", *POSE])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradient_is_the_finite_difference_of_the_kernel(field: str, antialiased: bool) -> None:
     g = random_gaussians(40, seed=3, spread=0.15, size=0.04, anisotropy=0.4)
@@ -103,16 +106,13 @@ def test_gradient_is_the_finite_difference_of_the_kernel(field: str, antialiased
     weights_image, weights_alpha = torch.randn(40, 48, 3), torch.randn(40, 48)
     grad = gradients(scene, "cpu", weights_image, weights_alpha)[field]
 
-    value = scene.background if field == "background" else getattr(g, field)
+    inputs = inputs_of(scene)
+    value = inputs[field]
     direction = grad / grad.norm() * value.abs().mean()
     step = 2e-3
 
     def loss(amount: float) -> float:
-        moved = value + amount * direction
-        if field == "background":
-            image, alpha = render(replace(scene, background=moved))
-        else:
-            image, alpha = render(replace(scene, gaussians=g._replace(**{field: moved})))
+        image, alpha = render(with_inputs(scene, {**inputs, field: value + amount * direction}))
         return float((image.double() * weights_image).sum() + (alpha.double() * weights_alpha).sum())
 
     # Richardson's extrapolation of two central differences: the error is of the fourth order in the step.
@@ -232,6 +232,7 @@ def test_no_output_memory_is_left_uninitialised() -> None:
     assert torch.isfinite(image).all() and torch.isfinite(alpha).all()
     outputs = {f"grad_{name}": torch.full_like(field, torch.nan) for name, field in g._asdict().items()}
     outputs["grad_background"] = torch.full((3,), torch.nan)
+    outputs["grad_pose"] = torch.full((12,), torch.nan, dtype=torch.float64)
     cotangents = {"grad_image": torch.randn(57, 83, 3), "grad_alpha": torch.randn(57, 83)}
     _core.splat_backward(drawing=drawing, **g._asdict(), **cotangents, **outputs)
     assert all(torch.isfinite(output).all() for output in outputs.values())
