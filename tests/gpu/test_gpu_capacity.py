@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from interpreter import DEVICE
-from splat.scenes import SCENES, Scene, camera, gradients, random_gaussians, render
+from splat.scenes import (
+    POSE,
+    SCENES,
+    Scene,
+    camera,
+    gradients,
+    inputs_of,
+    random_gaussians,
+    render,
+    with_inputs,
+)
 
+from avatar.splat import CannotDraw, _checked_options, splat
 from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Capacities, Kind, fixed_capacity, roomy
 
 SCENE = SCENES["17x33"]
@@ -53,6 +65,25 @@ def test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits(field: s
         found = render(scene, "gpu")
     image = found.image[..., -1] if field == "background" else found.image
     assert not torch.isfinite(image).any()
+
+
+@pytest.mark.parametrize("name", POSE)
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf])
+def test_so_does_one_of_a_pose_that_is_on_the_gpu(name: str, value: float) -> None:
+    from avatar.splat.gpu import splat_gpu  # `splat` looks at a pose on the CPU, where Triton interprets
+
+    options: dict[str, Any] = {**(splat.__kwdefaults__ or {}), "backend": "cpu"}
+    pose = getattr(SCENE.camera, name).clone()
+    pose.view(-1)[1] = value
+    inputs = {name: tensor.to(DEVICE) for name, tensor in {**inputs_of(SCENE), name: pose}.items()}
+    scene = with_inputs(SCENE, inputs)
+    checked = _checked_options(SCENE.gaussians, SCENE.camera, SCENE.background, **options)
+    with fixed_capacity(10_000):
+        found = splat_gpu(scene.gaussians, scene.camera, scene.background, **checked)
+    assert found.image.isnan().all() and found.alpha.isnan().all()
+    CAPACITIES.forget()
+    with pytest.raises(CannotDraw, match=f"{name} has 1 non-finite of"):
+        splat_gpu(scene.gaussians, scene.camera, scene.background, **checked)
 
 
 def test_a_value_that_is_not_finite_spoils_the_image_although_its_splat_is_hidden() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -11,8 +12,12 @@ import pytest
 import torch
 from heads import grid_head
 
+from avatar.bench.scenes import head_camera, head_shell
 from avatar.losses.photometric import dssim
+from avatar.splat import splat
+from avatar.splat.capacity import fixed_capacity
 from avatar.train.step import PerceptualTerm, Weighted
+from avatar.types import Gaussians
 
 pytest.importorskip("triton", reason="Triton is not installed")
 pytestmark = pytest.mark.without_kernels  # the meta device has none
@@ -52,6 +57,29 @@ def test_every_kernel_of_a_step_is_ours_once_or_twice(counts: dict[str, Counter[
     own = {name: count for name, count in counts["step with D-SSIM"].items() if name.startswith("our ")}
     assert own.keys() >= {"our project", "our composite", "our composite_backward", "our project_backward", "our place"}
     assert max(own.values()) <= 2
+
+
+def test_a_drawing_launches_little_more_for_a_pose_that_is_on_the_gpu(counting: ModuleType) -> None:
+    """And no more than ever for one that is not: forward, backward."""
+
+    def launches(pose: tuple[torch.Tensor, torch.Tensor], *, differentiated: bool) -> tuple[int, int]:
+        R, t = (part.requires_grad_(differentiated) for part in pose)
+        shell = Gaussians(*(field.to(counting.META).requires_grad_() for field in head_shell(100)))
+        with fixed_capacity(1000):
+            with counting.counting() as forward:
+                camera = replace(head_camera(64), R_cam_world=R, t_cam_world=t)
+                image = splat(shell, camera, torch.zeros(3, device=counting.META)).image.sum()
+            with counting.counting() as backward:
+                torch.autograd.grad(image, [*shell, R, t] if differentiated else list(shell))
+        assert backward["our project_backward"] == 1
+        return forward.total(), backward.total()
+
+    here = head_camera(64).R_cam_world, head_camera(64).t_cam_world
+    there = tuple(part.to(counting.META) for part in here)
+    launches(here, differentiated=False)  # brings what is brought once
+    before = launches(here, differentiated=False)
+    assert launches(there, differentiated=False) == (before[0] + 2, before[1])
+    assert launches(there, differentiated=True) == (before[0] + 2, before[1] + 2)
 
 
 @pytest.mark.parametrize("preset", ["preset=paper", "model=flashavatar", "preset=balanced"])

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from interpreter import DEVICE
 from small_runs import new_avatar, open_small, small_config
+from splat.scenes import SCENES
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.compute.replay import Replay, own_stream
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
-from avatar.splat.capacity import CAPACITIES, Capacities, Kind
+from avatar.splat import splat
+from avatar.splat.capacity import CAPACITIES, Capacities, Kind, fixed_capacity
 from avatar.train import align as align_module
 from avatar.train import steps as steps_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import choose_perceptual
 from avatar.train.steps import Steps
 from avatar.train.trainer import train
+from avatar.types import Gaussians
 
 # Degrees of the colours change at steps 7 and 14, the third term at step 10; previews and checkpoints come in between.
 TINY = (
@@ -161,3 +165,23 @@ def test_a_replay_reads_what_it_is_given_each_time() -> None:
         assert replay((inputs[0] + 1.0, inputs[1].flip(0))).tolist() == [2.0, 6.0]
         weight.fill_(3.0)
         assert replay(inputs).tolist() == [6.0, 0.0]
+
+
+def test_a_replayed_drawing_follows_its_camera() -> None:
+    scene = SCENES["17x33"]
+    gaussians, background = Gaussians(*(t.to(DEVICE) for t in scene.gaussians)), scene.background.to(DEVICE)
+
+    def function(pose: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        R, t = (part.detach().requires_grad_() for part in pose)
+        camera = replace(scene.camera, R_cam_world=R, t_cam_world=t)
+        image = splat(gaussians, camera, background, backend="gpu").image
+        return image.detach(), *torch.autograd.grad(image.square().sum(), (R, t))
+
+    R, t = scene.camera.R_cam_world.to(DEVICE), scene.camera.t_cam_world.to(DEVICE)
+    poses = [(R, t), (R.roll(1, 0).contiguous(), t + 0.1), (R, t + 0.02)]
+    with fixed_capacity(4096), own_stream(DEVICE):
+        expected = [function(pose) for pose in poses]
+        replay = Replay(function, poses[0])
+        for pose, wanted in zip(poses, expected, strict=True):
+            assert all(torch.equal(a, b) for a, b in zip(replay(pose), wanted, strict=True))
+    assert (expected[0][0] != expected[2][0]).any() and all(part.any() for part in expected[2])
