@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import pytest
 import torch
+from splat.scenes import POSE
 from stress.batched_oracle import Batch, Drawn, draw
 from stress.random_scenes import random_batch
 from torch import Tensor
@@ -31,6 +32,12 @@ NOTHING = 1e-30  # float32 ends at 1e-38, and products of what is near it
 LONG = 1e3
 
 
+def inputs_of(batch: Batch) -> dict[str, Tensor]:
+    """All that a drawing has a gradient in."""
+    pose = {name: getattr(batch, name) for name in POSE}
+    return {**batch.gaussians._asdict(), "background": batch.background, **pose}
+
+
 @dataclass(frozen=True)
 class Truth:
     """What the oracle says of a batch, and cotangents that are zero at ambiguous pixels."""
@@ -46,10 +53,10 @@ def truth_of(batch: Batch, seed: int) -> Truth:
     g = torch.Generator().manual_seed(seed)
     shape = (len(batch), batch.height, batch.width)
     grad_image, grad_alpha = torch.randn(*shape, 3, generator=g), torch.randn(shape, generator=g)
-    leaves = {**batch.gaussians._asdict(), "background": batch.background}
-    leaves = {name: leaf.double().requires_grad_() for name, leaf in leaves.items()}
+    leaves = {name: leaf.double().requires_grad_() for name, leaf in inputs_of(batch).items()}
     gaussians = Gaussians(*(leaves[name] for name in Gaussians._fields))
-    drawn = draw(batch, gaussians, leaves["background"], grad_image.double(), grad_alpha.double())
+    posed = replace(batch, **{name: leaves[name] for name in POSE})
+    drawn = draw(posed, gaussians, leaves["background"], grad_image.double(), grad_alpha.double())
     grad_image = grad_image.masked_fill(drawn.ambiguous[..., None], 0.0)
     grad_alpha = grad_alpha.masked_fill(drawn.ambiguous, 0.0)
     loss = (drawn.image * grad_image).sum() + (drawn.alpha * grad_alpha).sum()
@@ -68,36 +75,39 @@ def draw_with_kernel(
     batch: Batch, truth: Truth, function: Callable[..., Rendering] = splat, dtype: torch.dtype = torch.float32
 ) -> tuple[Rendering, dict[str, Tensor]]:
     """Images and gradients of all scenes, one after the other, in float64 for the comparison."""
-    renderings, gradients = [], []
+    renderings, gradients, inputs = [], [], inputs_of(batch)
     for b in range(len(batch)):
-        leaves = [field[b].to(dtype, copy=True).requires_grad_() for field in (*batch.gaussians, batch.background)]
-        found = function(Gaussians(*leaves[:5]), batch.camera(b), leaves[5], **asdict(batch.options))
+        leaves = [tensor[b].to(dtype, copy=True).requires_grad_() for tensor in inputs.values()]
+        camera = replace(batch.camera(b), **dict(zip(POSE, leaves[6:], strict=True)))
+        found = function(Gaussians(*leaves[:5]), camera, leaves[5], **asdict(batch.options))
         cotangents = truth.grad_image[b].to(dtype), truth.grad_alpha[b].to(dtype)
         gradients.append(torch.autograd.grad(found, leaves, cotangents, materialize_grads=True))
         renderings.append(Rendering(*(t.detach() for t in found)))
-    names = (*Gaussians._fields, "background")
     image, alpha = (torch.stack(fields).double() for fields in zip(*renderings, strict=True))
     columns = (torch.stack(column).double() for column in zip(*gradients, strict=True))
-    return Rendering(image, alpha), dict(zip(names, columns, strict=True))
+    return Rendering(image, alpha), dict(zip(inputs, columns, strict=True))
 
 
 def norms(name: str, field: Tensor) -> Tensor:
-    """The lengths of what belongs to one splat, [B, N], or of the background's three channels, [B, 1]."""
-    batch, count = len(field), 1 if name == "background" else field.shape[1]
+    """The lengths of what belongs to one splat, [B, N], or of the background or a part of the pose, [B, 1]."""
+    batch, count = len(field), field.shape[1] if name in Gaussians._fields else 1
     return torch.linalg.vector_norm(field.reshape(batch, count, field[0].numel() // max(count, 1)), dim=-1)
 
 
 def allowed_and_error(truth: Truth, found: dict[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    """For every splat and the background: the error of its gradient and what is allowed, infinite if it is not compared."""
+    """For every splat, the background, R and t: the error of its gradient and what is allowed, infinite if not compared."""
     result = {}
     for name, expected in truth.gradients.items():
         error = norms(name, found[name] - expected)
         size = norms(name, expected) + norms(name, truth.noise[name])
         allowed = GRADIENT_TOLERANCE * size + NOTHING
+        long, ambiguous = truth.drawn.lengths > LONG, truth.drawn.ambiguous_colour
+        if name in POSE:  # sums over splats
+            allowed = allowed.masked_fill((long | ambiguous).any(1, keepdim=True), torch.inf)
         if name in ("means", "quats", "scales"):
-            allowed = allowed.masked_fill(truth.drawn.lengths > LONG, torch.inf)
+            allowed = allowed.masked_fill(long, torch.inf)
         if name in ("means", "sh"):
-            allowed = allowed.masked_fill(truth.drawn.ambiguous_colour, torch.inf)
+            allowed = allowed.masked_fill(ambiguous, torch.inf)
         result[name] = (error, allowed)
     return result
 
