@@ -1,4 +1,4 @@
-"""Deliberate mistakes in the GPU's kernels, each of which the tests have to catch; see `mutate_kernels.py`."""
+"""Deliberate mistakes in the splatter's kernels, each of which the tests have to catch; see `mutate_kernels.py`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Mutation(NamedTuple):
     first: str = ""  # part of the name of the test that sees it soonest
 
 
-MUTATIONS = [
+SPLATTER_MUTATIONS = [
     # Which splats a tile is given.
     Mutation(
         "project",
@@ -25,8 +25,8 @@ MUTATIONS = [
     Mutation(
         "project",
         "a splat just behind the near plane is drawn",
-        "p_z >= tl.load(view + NEAR)",
-        "p_z >= 0.5 * tl.load(view + NEAR)",
+        "p_z >= tl.load(intrinsics + NEAR)",
+        "p_z >= 0.5 * tl.load(intrinsics + NEAR)",
         first="other cut-offs",
     ),
     Mutation(
@@ -62,8 +62,22 @@ MUTATIONS = [
     Mutation(
         "geometry",
         "the camera looks from its translation",
-        "tl.load(view + CENTRE + 1)",
-        "tl.load(view + TRANSLATION + 1)",
+        "+ dot3(tl.load(pose + 1), tl.load(pose + 4), tl.load(pose + 7), t0, t1, t2)",
+        "- t1",
+    ),
+    Mutation(
+        "geometry",
+        "all but the last value of a pose may be infinite",
+        "found |= (bits",
+        "found = (bits",
+        first="of_a_pose",
+    ),
+    Mutation(
+        "project",
+        "a pose that is not finite shows the background",
+        "poisoned = pose_is_not_finite(pose)",
+        "poisoned = False",
+        first="of_a_pose",
     ),
     Mutation(
         "harmonics",
@@ -209,73 +223,45 @@ MUTATIONS = [
         first="reference[17x33",
     ),
     Mutation(
+        "project_backward",
+        "the camera's rotation does not turn covariances",
+        "by_p * mean_x + t * by_x + e0",
+        "by_p * mean_x + t * by_x",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "project_backward",
+        "the optical axis turns covariances along rows only",
+        "-slope_x * e01 - slope_y * e11",
+        "-slope_x * e01",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "project_backward",
+        "the camera's rotation does not move its eye",
+        "by_p * mean_y + t * by_y + e1",
+        "by_p * mean_y + e1",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "project_backward",
+        "the camera's translation does not move its eye",
+        "by_p + dot3(v0, v1, v2, by_x, by_y, by_z)",
+        "by_p",
+        first="reference[17x33",
+    ),
+    Mutation(
+        "project_backward",
+        "all programs write the same share of the pose's gradient",
+        "grad_pose + POSE_VALUES * tl.program_id(0)",
+        "grad_pose",
+        first="production",
+    ),
+    Mutation(
         "harmonics",
         "a basis function's derivative is halved",
         "dz += 2 * z * g",
         "dz += z * g",
         first="reference[17x33",
-    ),
-    # From the network's values to Gaussians.
-    Mutation("hyper", "a latent is mixed from three nodes of four", "tl.static_range(4)", "tl.static_range(3)"),
-    Mutation(
-        "hyper",
-        "a triangular factor is solved without an element",
-        "row(values, FACTOR + 7, mask) * x3\n",
-        "0.0 * x3\n",
-    ),
-    Mutation(
-        "place",
-        "the offset turns before the base",
-        "product(bw, bx, by, bz, tl.exp(r0), r1, r2, r3)",
-        "product(tl.exp(r0), r1, r2, r3, bw, bx, by, bz)",
-    ),
-    Mutation(
-        "place_backward",
-        "a factor's diagonal is taken as it is stored",
-        "-s1 * q1 * tl.exp(row(values, FACTOR + 2, mask))",
-        "-s1 * q1",
-    ),
-    Mutation(
-        "place_backward",
-        "lanes without a Gaussian are not written",
-        "_put(grads, at + 12, q9 * from_mean, all_lanes)",
-        "_put(grads, at + 12, q9 * from_mean, mask)",
-        first="lanes_that_stand",
-    ),
-    Mutation("place_backward", "a node's list ends an entry early", "begins + node + 1)", "begins + node + 1) - 1"),
-    Mutation("activations", "tanh is wrong where it saturates", "tl.where(x < 0.0, -far, far)", "far"),
-    # Posing and losses.
-    Mutation(
-        "pose",
-        "the right eyelid moves with the left",
-        "right * tl.load(eyelid_directions",
-        "left * tl.load(eyelid_directions",
-    ),
-    Mutation("pose", "the neck does not carry the jaw", "a + t0 - u", "a - u"),
-    Mutation(
-        "pose",
-        "coefficients that are not given hold what was there",
-        "mask=e < given, other=0.0",
-        "mask=e < stride, other=0.0",
-        first="bands[posed]",
-    ),
-    Mutation(
-        "ssim",
-        "the gradient is smoothed along columns the other way",
-        "at = tl.load(window + k), i - k * line",
-        "at = tl.load(window + k), i + k * line",
-    ),
-    Mutation("ssim", "the contrast's gradient has the wrong sign", "-light / contrast", "light / contrast"),
-    Mutation(
-        "huber", "the difference is not clamped", "tl.minimum(tl.maximum(difference, -delta), delta)", "difference"
-    ),
-    Mutation(
-        "huber",
-        "the mask weighs the loss and not the difference",
-        "tl.sum(_huber(weight * difference, delta), 0)",
-        "tl.sum(weight * _huber(difference, delta), 0)",
-    ),
-    Mutation(
-        "reduce", "the last programs' shares are left out", "range(0, programs, BLOCK)", "range(0, programs - 1, BLOCK)"
     ),
 ]

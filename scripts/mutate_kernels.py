@@ -2,10 +2,10 @@
 
     TRITON_INTERPRET=1 python scripts/mutate_kernels.py [--jobs 2] [--only WORD] [--changed-only]
 
-Every mistake of `kernel_mutations.py` gets a process, in which its module is loaded from a changed copy; the checkout is
-not touched. It counts as caught where an assertion of a test fails, not where the program merely falls over. The same
-tests pass without a mistake, which is the first thing tried unless --changed-only says that it has been. Ends with status
-1 when a mistake goes unseen.
+Every mistake of `kernel_mutations.py` and `kernel_mutations_avatar.py` gets a process, in which its module is loaded from
+a changed copy; the checkout is not touched. It counts as caught where an assertion of a test fails, not where the program
+merely falls over. The same tests pass without a mistake, which is the first thing tried unless --changed-only says that it
+has been. Ends with status 1 when a mistake goes unseen.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from kernel_mutations import MUTATIONS, Mutation
+from kernel_mutations import SPLATTER_MUTATIONS, Mutation
+from kernel_mutations_avatar import AVATAR_MUTATIONS
 
 # Without what takes longer than most of these tests do: other plugins, rewritten assertions, a collection of all garbage.
 QUIET = ["-x", "-q", "--no-header", "--assert=plain", "-p", "pytest_timeout", "-p", "no:cacheprovider"]
@@ -49,6 +50,8 @@ SPLATTER = [
     "tests/splat/test_splat_public_bugs.py::test_gradient_is_zero_where_alpha_is_clamped[gpu]",
     CAPACITY + "test_room_for_exactly_the_pairs_is_enough_and_one_less_makes_the_image_nan",
     CAPACITY + "test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits",
+    CAPACITY + "test_so_does_one_of_a_pose_that_is_on_the_gpu",
+    "tests/gpu/test_gpu_production.py::test_a_scene_agrees_with_the_reference[small]",
     HOSTILE + "test_the_same_bits_and_whole_bands[17x33]",
     HOSTILE + "test_the_same_bits_and_whole_bands[walls]",
     f"{REFERENCE}[thresholds-gpu]",
@@ -157,7 +160,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if os.environ.get("TRITON_INTERPRET") != "1":
         raise SystemExit("the kernels are interpreted: set TRITON_INTERPRET=1")
-    chosen = [m for m in MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
+    chosen = [m for m in SPLATTER_MUTATIONS + AVATAR_MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
     for mutation in chosen:
         mutated(mutation), soonest_first(mutation)
     areas = {id(tests_of(m.module)): m.module for m in reversed(chosen)}.values()  # the first module of each
