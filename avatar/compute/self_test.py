@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -100,10 +101,10 @@ def placed(device: torch.device) -> Fields:
 
 
 def faint_scene(device: torch.device) -> Fields:
-    """Transparent splats, and no cut-offs."""
+    """Transparent splats, no cut-offs, and a camera whose pose has a gradient."""
     shell = head_shell(COUNT)
     gaussians = shell._replace(opacities=0.1 + 0.5 * shell.opacities, scales=2 * shell.scales)
-    return drawn(gaussians, device, alpha_min=0.0, t_min=0.0)
+    return drawn(gaussians, device, ("R_cam_world", "t_cam_world"), alpha_min=0.0, t_min=0.0)
 
 
 def opaque_scene(device: torch.device) -> Fields:
@@ -113,12 +114,15 @@ def opaque_scene(device: torch.device) -> Fields:
     return drawn(gaussians, device, alpha_min=0.0)
 
 
-def drawn(gaussians: Gaussians, device: torch.device, **cutoffs: Any) -> Fields:
-    """Image, alpha and the gradients of a loss, by the same program on any device."""
+def drawn(gaussians: Gaussians, device: torch.device, pose: tuple[str, ...] = (), **cutoffs: Any) -> Fields:
+    """Image, alpha and the gradients of a loss, also in the fields `pose` of the camera, by the same program anywhere."""
+    camera = head_camera(SIZE)
     inputs = {**gaussians._asdict(), "background": torch.tensor([0.2, 0.5, 0.9])}
+    inputs |= {name: getattr(camera, name) for name in pose}
     leaves = {name: value.to(device).requires_grad_() for name, value in inputs.items()}
     scene = Gaussians(*(leaves[name] for name in Gaussians._fields))
-    image, alpha = splat(scene, head_camera(SIZE), leaves["background"], **cutoffs)
+    camera = replace(camera, **{name: leaves[name] for name in pose})
+    image, alpha = splat(scene, camera, leaves["background"], **cutoffs)
     rows = torch.linspace(0, 1, SIZE, device=device)
     mask = (rows[:, None] * rows).clamp(max=0.5)
     target = torch.stack((mask, 1 - mask, rows.expand(SIZE, SIZE)), dim=-1)

@@ -51,6 +51,8 @@ def test_right_kernels_pass_and_every_field_was_compared() -> None:
     for scene in ("faint", "opaque"):
         for field in ("image", "alpha", "loss", "gradient of sh", "gradient of quats", "gradient of background"):
             assert f"{field} of the {scene} scene" in errors
+    for field in ("gradient of R_cam_world", "gradient of t_cam_world"):
+        assert f"{field} of the faint scene" in errors and f"{field} of the opaque scene" not in errors
     assert len(errors) > 20
 
 
@@ -67,9 +69,9 @@ def faint_scene_only(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_wrong_gradient_is_named(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     right = gpu.backward
 
-    def wrong(*arguments: Any) -> Gaussians:
-        found = right(*arguments)
-        return found._replace(opacities=found.opacities * factor)
+    def wrong(*arguments: Any, **named: Any) -> tuple[Gaussians, Tensor | None]:
+        found, by_pose = right(*arguments, **named)
+        return found._replace(opacities=found.opacities * factor), by_pose
 
     monkeypatch.setattr(gpu, "backward", wrong)
     with pytest.raises(WrongGpu) as caught:
