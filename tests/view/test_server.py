@@ -134,6 +134,7 @@ def test_a_person_plays_and_moves_a_slider(viewer: Viewer) -> None:
         page.get_by_role("slider").nth(1).focus()
         page.keyboard.press("ArrowRight")
         until(lambda: viewer.setting.expressions)
+    assert not viewer.complaints._counts, "viser's own page sends nothing that is refused"
 
 
 CANVAS = (
