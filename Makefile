@@ -9,9 +9,10 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
+STRESS_MINUTES ?= 60
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup demo test stress fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
+.PHONY: help setup demo test stress stress-view fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
@@ -27,10 +28,13 @@ test: setup ## run all tests
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress
 
-# The page's avatar files and a socket's packets get half as many each.
+stress-view: setup ## let 50 hostile clients at a viewer for an hour (STRESS_MINUTES=60)
+	AVATAR_STRESS_MINUTES=$(STRESS_MINUTES) $(BIN)/python -m pytest -q -rP --timeout=0 tests/stress/test_viewer_stress.py
+
+# The page's avatar files, a stream's packets and a viewer's messages get half as many each.
 fuzz: setup ## give every reader damaged and hostile files (FUZZ_CASES=20000 in all)
 	AVATAR_FUZZ_CASES=$(FUZZ_CASES) AVATAR_FUZZ_TABLE=docs/bench/fuzz.md $(BIN)/python -m pytest --timeout=0 -rP tests/fuzz
-	AVATAR_FUZZ_CASES=$(FUZZ_CASES) $(BIN)/python -m pytest --timeout=0 -k damaged tests/view/test_stream.py tests/export/test_web_core.py
+	AVATAR_FUZZ_CASES=$(FUZZ_CASES) $(BIN)/python -m pytest --timeout=0 -k damaged tests/view tests/export/test_web_core.py
 
 sanitize: setup ## run the compiled core's tests with AddressSanitizer and UndefinedBehaviorSanitizer
 	scripts/sanitize.sh

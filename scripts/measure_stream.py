@@ -90,7 +90,7 @@ def shapes(frame: int) -> dict[str, float]:
 def measure(trained: TrainedAvatar, name: str, packets: list[bytes], rate: float) -> None:
     receiver = Arrivals(trained)
     player = Player(trained, {}, time.monotonic, receiver.newest)
-    viewer = Viewer(Stage(trained), player, trained.rest_camera().width, "127.0.0.1", 0, None)
+    viewer = Viewer(Stage(trained), player, trained.rest_camera().width, "127.0.0.1", 0, "measured")
     viewer.pace = record = Record()
     try:
         words = [sys.executable, "-c", SENDER, "tcp" if name == "JSON" else "udp", str(receiver.port), str(rate)]

@@ -40,6 +40,7 @@ from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Span, whole
 
 COMPARED = 200  # frames
+TOKEN = "measured"
 
 
 class Record(Pace):
@@ -68,7 +69,7 @@ def page(port: int, wanted: bool) -> Iterator[None]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=flags)
         shown = browser.new_page(viewport={"width": 800, "height": 600})
-        shown.goto(f"http://127.0.0.1:{port}/")
+        shown.goto(f"http://127.0.0.1:{port}/{TOKEN}/")
         yield
         browser.close()
 
@@ -84,7 +85,7 @@ def measure_live(trained: TrainedAvatar, head: Path, video: Path, with_page: boo
         return webcam.newest()
 
     player = Player(trained, {}, time.monotonic, newest, WEBCAM)
-    viewer = Viewer(Stage(trained), player, trained.rest_camera().width, "127.0.0.1", 0, None)
+    viewer = Viewer(Stage(trained), player, trained.rest_camera().width, "127.0.0.1", 0, TOKEN)
     viewer.pace = record = Record()
     drawing: list[float] = []
     with page(viewer.port, with_page):

@@ -16,6 +16,7 @@ from avatar.commands.options import (
     add_reading,
     add_run,
     add_source,
+    add_token,
     add_tracking,
 )
 
@@ -176,6 +177,7 @@ def build_parser() -> argparse.ArgumentParser:
     send.add_argument("drive", type=Path, metavar="FILE", help="drive file (.npz, .csv)")
     send.add_argument("port", type=int, metavar="PORT", help="of avatar view --stream on this machine")
     send.add_argument("--head", type=Path, metavar="PATH", required=True, help="the avatar's head model")
+    add_token(send, "that of avatar view (default: $AVATAR_TOKEN)")
     send.add_argument("--loop", action="store_true", help="again and again, until Ctrl-C")
 
     drive_file = commands.add_parser("drive-file", help="write a tracked folder's motion as a drive file")
@@ -271,13 +273,16 @@ def add_view(view: argparse.ArgumentParser) -> None:
     view.add_argument("--drive", type=Path, action="append", default=[], metavar="FILE", help="a motion to play, too")
     view.add_argument("--size", type=int, metavar="N", help="width of the picture in pixels (default: as in training)")
     view.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on; others than this machine's need a token"
+        "--host", default="127.0.0.1", help="address to listen on; 0.0.0.0: other machines can open the page, too"
     )
     view.add_argument("--port", type=int, default=8080, help="default: 8080; 0 takes a free one")
-    view.add_argument("--token", metavar="TEXT", help="what a browser must know (default: made up where it is needed)")
+    add_token(view, "what a browser and a stream must know (default: $AVATAR_TOKEN, else made up)")
+    view.add_argument(
+        "--url", metavar="ADDRESS", help="where a proxy shows the page, such as https://hub.example.org/proxy/8080/"
+    )
     live = view.add_mutually_exclusive_group()
     live.add_argument(
-        "--stream", type=int, metavar="PORT", help="take frames there: JSON lines, OSC, Live Link Face; 0: a free port"
+        "--stream", type=int, metavar="PORT", help="take frames there: lines of JSON after the token; 0: a free port"
     )
     live.add_argument(
         "--webcam",
@@ -285,5 +290,10 @@ def add_view(view: argparse.ArgumentParser) -> None:
         const="0",
         metavar="N|VIDEO",
         help="follow your face: a camera's number (default: 0), or a video",
+    )
+    view.add_argument(
+        "--open-stream",
+        action="store_true",
+        help="--stream: without the token, from everybody on this machine; OSC and Live Link Face, too",
     )
     view.add_argument("--fov", type=float, metavar="DEG", help="--webcam: field of view across its width, if known")

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import functools
+import os
 import re
 import secrets
+import socket
+import threading
 import time
+import urllib.parse
 from argparse import Namespace
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.commands import OK
+from avatar.commands import INTERRUPTED, OK
 from avatar.commands.driving import head_of
 from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_run, open_trained
 from avatar.compute.choose import choose_device
@@ -27,14 +33,18 @@ from avatar.view.gate import LOCAL
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.sender import send
-from avatar.view.server import Viewer
 from avatar.view.stage import Stage
 from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.pictures import open_source
 
+if TYPE_CHECKING:
+    from avatar.view.server import Viewer
+
 WIDTHS = (64, 2048)
 CACHED_PICTURES = 64
+EVERY_ADDRESS = ("0.0.0.0", "::", "")
+END_SECONDS = 5.0  # after Ctrl-C
 
 
 def run_view(arguments: Namespace) -> int:
@@ -43,32 +53,36 @@ def run_view(arguments: Namespace) -> int:
     if arguments.size is not None and not WIDTHS[0] <= arguments.size <= WIDTHS[1]:
         raise UserError(f"--size must be from {WIDTHS[0]} to {WIDTHS[1]}, not {arguments.size}")
     width = arguments.size or min(trained.recording.image_size(trained.config.data.size)[0], WIDTHS[1])
+    if arguments.open_stream and arguments.stream is None:
+        raise UserError("--open-stream belongs to --stream")
     if arguments.fov is not None and arguments.webcam is None:
         raise UserError("--fov belongs to --webcam: it is the field of view of that camera")
-    token = arguments.token
-    if token is not None and not re.fullmatch(r"[A-Za-z0-9_-]{8,200}", token):
-        raise UserError("--token must be at least 8 letters, digits, - or _")
-    if arguments.host not in LOCAL:
-        token = token or secrets.token_urlsafe(16)
+    url = None if arguments.url is None else checked_url(arguments.url)
+    token = checked_token(arguments.token) or secrets.token_hex(16)
+    viewer_type = viewer_class()
     motions = clips(trained, arguments.drive)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
     stage = Stage(trained, None if run is None else truth_of(run))
-    live = open_live(arguments, trained)
+    live = open_live(arguments, trained, token)
     try:
         newest, name = (None, "") if live is None else (live.newest, live.name)
         player = Player(trained, motions, time.monotonic, newest, name)
         about = (None, None) if live is None else (live.status, live.calibrate)
-        viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, *about)
+        viewer = viewer_type(stage, player, width, arguments.host, arguments.port, token, url, *about)
         try:
-            shown = "localhost" if arguments.host in LOCAL else arguments.host
-            print(f"Open     http://{shown}:{viewer.port}/" + (f"?token={token}" if token else ""), flush=True)
+            print(f"Open     {address(arguments.host, viewer.port, url)}?token={token}", flush=True)
             if isinstance(live, Receiver):
-                print(f"Stream   127.0.0.1:{live.port}: lines of JSON (TCP), OSC and Live Link Face (UDP)", flush=True)
+                print(f"Stream   {about_stream(live.port, None if arguments.open_stream else token)}", flush=True)
             elif live is not None:
                 live.start(viewer.wake.set)
             print("Ctrl-C ends it.", flush=True)
             while True:
                 time.sleep(3600)
+        except KeyboardInterrupt:
+            end = threading.Timer(END_SECONDS, os._exit, (INTERRUPTED,))  # whatever a library's thread still waits for
+            end.daemon = True
+            end.start()
+            raise
         finally:
             viewer.close()
     finally:
@@ -77,10 +91,64 @@ def run_view(arguments: Namespace) -> int:
     return OK
 
 
-def open_live(arguments: Namespace, trained: TrainedAvatar) -> Receiver | Webcam | None:
+def viewer_class() -> type[Viewer]:
+    """Raises UserError where what the viewer needs is not installed."""
+    try:
+        from avatar.view.server import Viewer
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"avatar view needs {error.name}, which is not installed: pip install 'hyperavatar[view]' (from a checkout: "
+            "pip install -e '.[view]')"
+        ) from None
+    return Viewer
+
+
+def checked_token(given: str | None) -> str | None:
+    """That of the command line or of $AVATAR_TOKEN. Raises UserError when it is not one."""
+    token = given or os.environ.get("AVATAR_TOKEN")
+    if token is not None and not re.fullmatch(r"[A-Za-z0-9_-]{8,200}", token):
+        raise UserError("--token (or $AVATAR_TOKEN) must be at least 8 letters, digits, - or _")
+    return token
+
+
+def checked_url(given: str) -> str:
+    """Raises UserError when it is no address of a page."""
+    try:
+        parts = urllib.parse.urlsplit(given)
+        is_page = parts.scheme in ("http", "https") and parts.hostname and not (parts.query or parts.fragment)
+    except ValueError:
+        is_page = False
+    if not is_page:
+        raise UserError("--url takes the address that a proxy shows, such as https://hub.example.org/proxy/8080/")
+    return given.rstrip("/") + "/"
+
+
+def address(host: str, port: int, url: str | None = None) -> str:
+    """What to open in a browser; for a viewer that listens everywhere, the address by which others find this machine."""
+    if url is not None:
+        return url
+    if host in EVERY_ADDRESS:
+        host = socket.gethostname()
+        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; the system chooses the address to send from
+            host = probe.getsockname()[0]
+    elif host in LOCAL:
+        host = (
+            "[::1]" if ":" in host else "127.0.0.1"
+        )  # a name could lead to another address, and other people's program
+    return f"http://[{host}]:{port}/" if ":" in host and "[" not in host else f"http://{host}:{port}/"
+
+
+def about_stream(port: int, token: str | None) -> str:
+    if token is None:
+        return f"127.0.0.1:{port}: lines of JSON (TCP), OSC and Live Link Face (UDP), from everybody on this machine"
+    return f'127.0.0.1:{port}: {{"token": "{token}"}}, then lines of JSON (TCP)'
+
+
+def open_live(arguments: Namespace, trained: TrainedAvatar, token: str) -> Receiver | Webcam | None:
     """What drives the avatar live: nothing, a stream or a face in front of a camera."""
     if arguments.stream is not None:
-        return Receiver(trained, arguments.stream)
+        return Receiver(trained, arguments.stream, None if arguments.open_stream else token)
     if arguments.webcam is None:
         return None
 
@@ -130,6 +198,6 @@ def truth_of(run: Run) -> Callable[[int, int], Float[Tensor, "H W 3"]]:
 
 def run_send(arguments: Namespace) -> int:
     drive = read_drive(arguments.drive, load_head_assets(arguments.head), width=512)
-    count = send(drive, "127.0.0.1", arguments.port, arguments.loop)
+    count = send(drive, "127.0.0.1", arguments.port, arguments.loop, token=checked_token(arguments.token))
     print(f"{count} frames of {arguments.drive} sent to port {arguments.port}")
     return OK

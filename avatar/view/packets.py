@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,13 @@ BLENDSHAPES = LIVE_LINK[: LIVE_LINK.index("TongueOut") + 1]  # without the head'
 _SHAPES = frozenset(plain(name) for name in LIVE_LINK)
 
 
+BUNDLE, BUNDLE_HEAD, MAX_NESTING = b"#bundle\0", 16, 4
+# What the reader of OSC gets: it prints what it does not know, and cannot end with some damaged bundles.
+_OSC = re.compile(rb"(/[^\0]{1,200})\0+,[ifsdhTF]{0,2}\0.*", re.DOTALL)
+
+
 class PacketError(ValueError):
-    """What is wrong with a packet."""
+    """What is wrong with a packet. What the sender has written is in it only as Python's ascii() gives it."""
 
 
 class FrameReader:
@@ -81,10 +87,12 @@ class FrameReader:
         return self._osc(data)
 
     def _osc(self, data: bytes) -> HeadParams | None:
-        from pythonosc.osc_packet import OscPacket
+        from pythonosc.osc_message import OscMessage
 
         try:
-            messages = [timed.message for timed in OscPacket(data).messages]
+            messages = [OscMessage(part) for part in osc_messages(data) if _OSC.fullmatch(part)]
+        except PacketError:
+            raise
         except Exception as error:  # the library raises what its parts raise; it reads bytes, and does nothing else
             raise PacketError("a packet is neither OSC nor of Live Link Face") from error
         is_complete, has_apply = False, False
@@ -116,7 +124,7 @@ class FrameReader:
                 if index is None and name.isascii() and name.isdigit() and len(name) < 7:
                     index = int(name)
                 if index is None or index >= E:
-                    raise PacketError(f"there is no expression {name[:40]!r}")
+                    raise PacketError(f"there is no expression {name[:40]!a}")
                 expression[index] = _number(value, name)
         elif isinstance(values, list) and len(values) <= E:
             expression[: len(values)] = _numbers(values, len(values), "expression")
@@ -132,6 +140,23 @@ class FrameReader:
             self._assets.names,
         )
         return _params({name: array[0] for name, array in arrays.items()})
+
+
+def osc_messages(data: bytes, nesting: int = 0) -> Iterator[bytes]:
+    """The messages of an OSC packet: its own, or those of its bundle. Raises PacketError."""
+    if not data.startswith(BUNDLE):
+        if not data.startswith(b"/"):
+            raise PacketError("a packet is neither OSC nor of Live Link Face")
+        yield data
+        return
+    at = BUNDLE_HEAD  # with the time
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        part = data[at + 4 : at + 4 + size]
+        if size == 0 or len(part) != size or nesting == MAX_NESTING:
+            raise PacketError("a bundle of OSC is damaged")
+        yield from osc_messages(part, nesting + 1)
+        at += 4 + size
 
 
 def live_link_values(data: bytes) -> dict[str, float]:
@@ -175,9 +200,14 @@ def _numbers(values: Any, count: int, name: str) -> np.ndarray:
 
 def _number(value: Any, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise PacketError(f"{name[:40]} is not a number")
+        raise PacketError(f"{_shown(name)} is not a number")
     if isinstance(value, int):
         value = max(min(value, 10**6), -(10**6))  # refused below, without overflow
     if not math.isfinite(value) or abs(value) > LARGEST:
-        raise PacketError(f"{name[:40]} is not within +-{LARGEST:g}")
+        raise PacketError(f"{_shown(name)} is not within +-{LARGEST:g}")
     return float(value)
+
+
+def _shown(name: str) -> str:
+    """A name that a sender may have written."""
+    return name if re.fullmatch(r"[A-Za-z0-9_]{1,40}", name) else f"{name[:40]!a}"

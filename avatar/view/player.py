@@ -35,14 +35,14 @@ class Player:
     ) -> None:
         self._clips, self._clock, self._live = dict(clips), clock, live
         self._rest = Shown(trained.rest_params(), trained.rest_camera(), None, NEUTRAL)
-        self._live_name = live_name
+        self.live_name = live_name
         self.name = NEUTRAL if live is None else live_name
         self.is_playing = False
         self._since, self._first = 0.0, 0
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (NEUTRAL, *self._clips, *([self._live_name] if self._live else []))
+        return (NEUTRAL, *self._clips, *([self.live_name] if self._live else []))
 
     @property
     def clip(self) -> Clip | None:
@@ -86,7 +86,7 @@ class Player:
             index = self.index
             params, camera = clip.frames[index]
             return Shown(params, camera, clip.recorded[index] if clip.recorded else None, (self.name, index))
-        if self.name == self._live_name and self._live is not None and (newest := self._live()) is not None:
+        if self.name == self.live_name and self._live is not None and (newest := self._live()) is not None:
             camera = newest.camera or self._rest.camera
             return Shown(newest.params, camera, None, (self.name, newest.number), newest.taken)
         return self._rest

@@ -1,14 +1,17 @@
-"""`--stream PORT`: frames over TCP (lines of JSON) and UDP (OSC, Live Link Face) on this machine. The newest frame counts.
+"""`--stream PORT`: frames from other programs of this machine. The newest frame counts.
 
-A frame that has not been shown when the next one comes is dropped, so that what is seen is never late; a packet that cannot
-be read is counted and forgotten.
+Lines of JSON come over TCP; the first says the token. OSC and Live Link Face come over UDP, whose packets cannot carry a
+token, so UDP is listened to only where none is asked for. A frame that has not been shown when the next one comes is
+dropped, so that what is seen is never late; a packet that cannot be read is counted and forgotten.
 """
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -18,11 +21,14 @@ from avatar.motion.rest import RestPose
 from avatar.motion.transfer import departed
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
+from avatar.view.gate import same
 from avatar.view.live import Live
 from avatar.view.packets import MAX_LINE, FrameReader, PacketError
 from avatar.view.player import STREAM
 
 MAX_SENDERS = 8
+IDLE_SECONDS = 30.0  # after which a sender that says nothing is closed
+SHARE = 0.3  # of a processor that a sender's packets may take
 MAX_DATAGRAM = 1 << 16
 
 
@@ -38,8 +44,9 @@ class Receiver:
 
     name = STREAM
 
-    def __init__(self, trained: TrainedAvatar, port: int, host: str = "127.0.0.1") -> None:
+    def __init__(self, trained: TrainedAvatar, port: int, token: str | None = None) -> None:
         """Port 0 takes a free one, then in `port`. Raises UserError when it is taken."""
+        host = "127.0.0.1"
         self._assets = trained.assets
         self._goal = RestPose(trained.neutral.expression, trained.neutral.jaw, None)
         self._source: RestPose | None = None
@@ -48,17 +55,20 @@ class Receiver:
         self._received = self._dropped = self._malformed = 0
         self._complaint = ""
         self._lock = threading.Lock()
-        self._is_open, self._senders = True, 0
-        self._udp_reader = FrameReader(self._assets)
+        self._token, self._is_open = token, True
+        self._senders: dict[socket.socket, float] = {}  # when the last frame of each came; 0: never
+        self._udp: socket.socket | None = None
         try:
             self._tcp = socket.create_server((host, port))
             self.port: int = self._tcp.getsockname()[1]
-            self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._udp.bind((host, self.port))
+            if token is None:
+                self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                self._udp.bind((host, self.port))
         except (OSError, OverflowError) as error:
             raise UserError(f"the stream cannot listen on {host}:{port} ({error}); give another --stream") from None
-        for target in (self._accept, self._take_datagrams):
-            threading.Thread(target=target, daemon=True, name="stream").start()
+        threading.Thread(target=self._accept, daemon=True, name="stream").start()
+        if self._udp is not None:
+            threading.Thread(target=self._take_datagrams, args=(self._udp,), daemon=True, name="stream").start()
 
     @property
     def counts(self) -> Counts:
@@ -66,9 +76,9 @@ class Receiver:
             return Counts(self._received, self._dropped, self._malformed)
 
     def status(self) -> str:
-        """A sentence for the page."""
+        """A sentence for the page: plain text, in which stands what strangers have sent."""
         counts, complaint = self.counts, self._complaint
-        said = f"Stream on port {self.port}: {counts.received} frames, {counts.dropped} dropped"
+        said = f"Port {self.port}: {counts.received} frames, {counts.dropped} dropped"
         return said + (f", {counts.malformed} malformed (last: {complaint})" if counts.malformed else "")
 
     def newest(self) -> Live | None:
@@ -94,10 +104,13 @@ class Receiver:
 
     def close(self) -> None:
         self._is_open = False
-        for listening in (self._tcp, self._udp):
-            with suppress(OSError):
-                listening.shutdown(socket.SHUT_RDWR)  # wakes who waits on it
-            listening.close()
+        with self._lock:
+            sockets = [self._tcp, *self._senders, *([] if self._udp is None else [self._udp])]
+        for used in sockets:
+            _wake(used)
+        self._tcp.close()
+        if self._udp is not None:
+            self._udp.close()
 
     def _take(self, params: HeadParams, is_departure: bool) -> None:
         with self._lock:
@@ -107,55 +120,119 @@ class Receiver:
             self._number += 1
             self._taken = time.monotonic()
 
-    def _refuse(self, error: PacketError) -> None:
+    def _refuse(self, complaint: str) -> None:
         with self._lock:
             self._malformed += 1
-            self._complaint = str(error)
+            self._complaint = complaint
 
     def _accept(self) -> None:
         while self._is_open:
             try:
                 sender, _ = self._tcp.accept()
-            except OSError:
-                return
+            except OSError:  # closed, or the process has no file left for it
+                time.sleep(0.05)
+                continue
+            sender.settimeout(IDLE_SECONDS)
             with self._lock:
-                is_welcome = self._senders < MAX_SENDERS
-                self._senders += is_welcome
-            if is_welcome:
-                threading.Thread(target=self._take_lines, args=(sender,), daemon=True, name="stream").start()
-            else:
-                sender.close()
+                if len(self._senders) == MAX_SENDERS:  # the one whose last frame is the oldest goes
+                    _wake(longest := min(self._senders, key=lambda other: self._senders[other]))
+                    del self._senders[longest]
+                self._senders[sender] = 0.0
+            threading.Thread(target=self._take_lines, args=(sender,), daemon=True, name="stream").start()
 
     def _take_lines(self, sender: socket.socket) -> None:
-        reader = FrameReader(self._assets)
+        reader, throttle, is_first = FrameReader(self._assets), Throttle(), True
         try:
             with sender, sender.makefile("rb") as lines:
                 while self._is_open and (line := lines.readline(MAX_LINE + 1)):
+                    if is_first:
+                        is_first = False
+                        if (complaint := self._unwelcome(line)) is not None:
+                            return self._refuse(complaint)
+                        if self._token is not None:
+                            continue
                     if len(line) > MAX_LINE:
-                        self._refuse(PacketError(f"a line is longer than {MAX_LINE} bytes"))
+                        self._refuse(f"a line is longer than {MAX_LINE} bytes")
                         while line and not line.endswith(b"\n"):
                             line = lines.readline(MAX_LINE)
                     elif line.strip():
-                        try:
-                            self._take(*reader.line(line))
-                        except PacketError as error:
-                            self._refuse(error)
+                        self._take_line(reader, line, sender)
+                    throttle.rest()
         except OSError:
-            pass  # the sender has gone
+            pass  # the sender has gone, or says nothing
         finally:
             with self._lock:
-                self._senders -= 1
+                self._senders.pop(sender, None)
 
-    def _take_datagrams(self) -> None:
+    def _unwelcome(self, line: bytes) -> str | None:
+        """Why a sender with this first line is closed."""
+        if not line.startswith(b"{"):  # a web page can send anything, but not before the head of its request
+            return "a sender's first line is not JSON: web pages may not send frames"
+        if self._token is not None and not knows(line, self._token):
+            return "a sender's first line does not say the token"
+        return None
+
+    def _take_line(self, reader: FrameReader, line: bytes, sender: socket.socket) -> None:
+        try:
+            self._take(*reader.line(line))
+        except Exception as error:
+            self._refuse(_told(error))
+            return
+        with self._lock:
+            if sender in self._senders:
+                self._senders[sender] = time.monotonic()
+
+    def _take_datagrams(self, udp: socket.socket) -> None:
+        reader, throttle = FrameReader(self._assets), Throttle()
         while self._is_open:
             try:
-                data = self._udp.recv(MAX_DATAGRAM)
+                data = udp.recv(MAX_DATAGRAM)
             except OSError:
                 return
             try:
-                params = self._udp_reader.datagram(data)
-            except PacketError as error:
-                self._refuse(error)
-                continue
-            if params is not None:
-                self._take(params, True)
+                if (params := reader.datagram(data)) is not None:
+                    self._take(params, True)
+            except Exception as error:
+                self._refuse(_told(error))
+            throttle.rest()
+
+
+class Throttle:
+    """Keeps its thread from more than SHARE of a processor: what comes faster waits, or is lost, in the socket."""
+
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        used: Callable[[], float] = time.thread_time,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._clock, self._used, self._sleep = clock, used, sleep
+        self._since, self._before = clock(), used()
+
+    def rest(self) -> None:
+        """Called after each packet; sleeps where the last second's took too long."""
+        used = self._used() - self._before
+        if used > SHARE:
+            self._sleep(max(self._since + used / SHARE - self._clock(), 0.0))
+        if self._clock() - self._since > 1:
+            self._since, self._before = self._clock(), self._used()
+
+
+def knows(line: bytes, token: str) -> bool:
+    """Whether a sender's first line is {"token": TOKEN}."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    given = found.get("token") if isinstance(found, dict) else None
+    return isinstance(given, str) and same(given, token)
+
+
+def _told(error: Exception) -> str:
+    return str(error) if isinstance(error, PacketError) else f"a packet cannot be read ({type(error).__name__})"
+
+
+def _wake(used: socket.socket) -> None:
+    """End what a thread waits for."""
+    with suppress(OSError):
+        used.shutdown(socket.SHUT_RDWR)

@@ -26,7 +26,14 @@ def encode_line(params: HeadParams) -> bytes:
     return json.dumps(values, separators=(",", ":")).encode() + b"\n"
 
 
-def send(drive: Drive, host: str, port: int, loop: bool = False, wait: Callable[[float], None] = time.sleep) -> int:
+def send(
+    drive: Drive,
+    host: str,
+    port: int,
+    loop: bool = False,
+    wait: Callable[[float], None] = time.sleep,
+    token: str | None = None,
+) -> int:
     """The number of frames sent. Raises UserError when nobody listens, or stops to."""
     sent, begin = 0, time.monotonic()
 
@@ -37,12 +44,15 @@ def send(drive: Drive, host: str, port: int, loop: bool = False, wait: Callable[
 
     try:
         with socket.create_connection((host, port), timeout=10) as connection:
+            if token is not None:
+                connection.sendall(json.dumps({"token": token}).encode() + b"\n")
             for params in frames():
                 wait(max(begin + sent / drive.fps - time.monotonic(), 0.0))
                 connection.sendall(encode_line(params))
                 sent += 1
     except (OSError, OverflowError) as error:
         raise UserError(
-            f"{sent} frames sent; {host}:{port} does not take any more ({error}): is avatar view --stream {port} running?"
+            f"{sent} frames sent; {host}:{port} does not take any more ({error}): does avatar view --stream {port} run, "
+            "and did it print this --token?"
         ) from None
     return sent

@@ -1,15 +1,14 @@
-"""The page of `avatar view`: viser's controls and camera around pictures that our splatter draws here."""
+"""The viewer: pictures that our splatter draws, in the page of viser."""
 
 from __future__ import annotations
 
-import io
 import math
 import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,17 +19,23 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
-from avatar.view.gate import Gate
+from avatar.view.complaints import Complaints
+from avatar.view.gate import LOCAL, Gate
 from avatar.view.live import Pace
+from avatar.view.messages import Door
+from avatar.view.panel import Panel, notes
 from avatar.view.player import Player
 from avatar.view.stage import Look, Setting, Stage
+from avatar.view.web_server import WebServer
 
 TARGET_MS = (20.0, 33.0)  # of a picture while things move: between them its size stays
 LEAST_WIDTH = 96  # pixels
+LARGEST = 4096  # pixels of a side of what is sent
 STILL_AFTER = 0.3  # seconds without a change after which the picture is drawn in full size
 STATUS_EVERY = 0.25  # seconds
+AFTER_AN_ERROR = 0.25  # seconds
+SAVE_EVERY = 0.5  # seconds
 JPEG_QUALITY = 92
-LABELS = {"jaw": "jaw open", "look_left": "look to its left", "turn": "turn to its left"}
 
 
 class Viewer:
@@ -43,60 +48,57 @@ class Viewer:
         width: int,
         host: str,
         port: int,
-        token: str | None,
-        stream_status: Callable[[], str] | None = None,
+        token: str,
+        url: str | None = None,
+        live_status: Callable[[], str] | None = None,
         calibrate: Callable[[], None] | None = None,
     ) -> None:
-        viser = _viser()
+        """Raises UserError when the address cannot be listened on. Port 0 takes a free one, then in `port`."""
         self.stage, self.player, self._width = stage, player, width
-        self._setting, self._changed = Setting(), 0.0
+        self.setting, self._changed = Setting(), 0.0
         self._moving_width = width
-        self._lock, self.wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
-        self._aspects: dict[int, float] = {}
+        self.lock, self.wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
         self._last: tuple[object, ...] = ()
-        self._stream_status = stream_status
+        self._told = 0.0
+        self._live_status = live_status
+        self._save_lock = threading.Lock()
         self.picture: np.ndarray | None = None
         self.milliseconds, self.pace = 0.0, Pace()
-        inner = _free_port()
-        with redirect_stdout(io.StringIO()):  # it prints its own address, which is not the one to open
-            self._server = viser.ViserServer(host="127.0.0.1", port=inner, label=stage.trained.name, verbose=False)
-        try:
-            self._gate = Gate(host, port, self._server.get_port(), token)
-        except UserError:
-            self._server.stop()
-            raise
-        self.port = self._gate.port
+        self.complaints, self.door = Complaints(), Door()
         camera = stage.trained.rest_camera()
         self._own: Angles = seen_from(camera, stage.trained.rest_params())
-        position = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
-        self._distance = math.hypot(*position)
-        # Sharing would open a tunnel past the gate.
-        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self._server.scene.world_axes.visible = False
-        self._server.scene.set_up_direction("+y")
-        self._server.initial_camera.position = position
-        self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
-        self._server.initial_camera.up = (0.0, 1.0, 0.0)
-        self._server.on_client_connect(self._welcome)
-        self._make_controls(calibrate)
+        x, y, z = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
+        self._distance = math.hypot(x, y, z)
+        listening = _listen(host, port)
+        self.port: int = listening.getsockname()[1]
+        gate = Gate(token, host in LOCAL, url)
+        self._web = WebServer(listening, gate, self.door, self.complaints, stage.trained.name)
+        self.server = server = self._web.viser
+        server.scene.world_axes.visible = False
+        server.scene.set_up_direction("+y")
+        server.initial_camera.position = (x, y, z)
+        server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        server.initial_camera.up = (0.0, 1.0, 0.0)
+        self._panel = Panel(self, server.gui, None if live_status is None else player.live_name, calibrate)
+        server.on_client_connect(self._welcome)
         self._thread = threading.Thread(target=self._loop, daemon=True, name="viewer")
         self._thread.start()
 
     def close(self) -> None:
         self._stop.set()
         self.wake.set()
-        self._thread.join(10)
-        self._gate.close()
-        with redirect_stdout(io.StringIO()):
-            self._server.stop()
+        self._web.close()
+        self._thread.join(5)
+        self.complaints.close()
 
     def change(self, **values: Any) -> None:
         """Set fields of the Setting."""
-        with self._lock:
-            self._setting = replace(self._setting, **values)
-            self._touch()
+        with self.lock:
+            before, self.setting = self.setting, replace(self.setting, **values)
+        if self.setting != before:
+            self.touch()
 
-    def _touch(self) -> None:
+    def touch(self) -> None:
         self._changed = time.monotonic()
         self.wake.set()
 
@@ -108,170 +110,128 @@ class Viewer:
         return Look(self._own.yaw - yaw, elevation - self._own.elevation, self._distance / distance)
 
     def _welcome(self, client: Any) -> None:
-        with self._lock:
-            self._last = ()  # drawn again, for the newcomer
-            self._touch()
-
         @client.camera.on_update
         def _(camera: Any) -> None:
-            self._aspects[client.client_id] = float(camera.aspect)
             look, _ = self.stage.within(self.look_from(np.asarray(camera.position) - np.asarray(camera.look_at)))
-            with self._lock:
-                self._last = ()
-                self.change(look=look)
-
-    def _make_controls(self, calibrate: Callable[[], None] | None) -> None:
-        gui, stage, player = self._server.gui, self.stage, self.player
-        self._status = gui.add_markdown("")
-        with gui.add_folder("Motion"):
-            motion = gui.add_dropdown("Motion", player.names, initial_value=player.name)
-            self._play = gui.add_button("Play")
-            self._scrub = gui.add_slider("Place", min=0.0, max=1.0, step=0.001, initial_value=0.0)
-            if calibrate is not None:
-                gui.add_button("Take this face as neutral").on_click(lambda _: calibrate())
-        with gui.add_folder("Picture"):
-            if stage.truth is not None:
-                beside = gui.add_checkbox("Truth beside", initial_value=False)
-                beside.on_update(lambda _: self.change(with_truth=beside.value))
-            overlay = gui.add_dropdown("Overlay", stage.overlays, initial_value="none")
-            overlay.on_update(lambda _: self.change(overlay=overlay.value))
-            gui.add_button("Save picture").on_click(self._save_picture)
-            gui.add_button("Save video").on_click(self._save_video)
-        sliders: list[Any] = []
-        folders: dict[str, Any] = {}
-        for number, control in enumerate(stage.controls):
-            folders.setdefault(control.part, gui.add_folder(control.part, expand_by_default=not folders))
-            with folders[control.part]:
-                sliders.append(self._slider(control.name, (control.low, control.high), "expressions", number))
-        with gui.add_folder("Joints"):
-            for name, limits in stage.joints.items():
-                sliders.append(self._slider(LABELS.get(name, name.replace("_", " ")), limits, "joints", name))
-
-        def reset(_: Any) -> None:
-            for slider in sliders:
-                slider.value = 0.0
-            self.change(expressions={}, joints={})
-
-        gui.add_button("Reset face").on_click(reset)
-
-        def choose(_: Any) -> None:
-            with self._lock:
-                player.choose(motion.value)
-                self._touch()
-
-        def toggle(_: Any) -> None:
-            with self._lock:
-                (player.pause if player.is_playing else player.play)()
-                self._touch()
-
-        def seek(event: Any) -> None:
-            if event.client is not None:  # a person, not the player
-                with self._lock:
-                    player.seek(self._scrub.value)
-                    self._touch()
-
-        motion.on_update(choose)
-        self._play.on_click(toggle)
-        self._scrub.on_update(seek)
-
-    def _slider(self, label: str, limits: tuple[float, float], part: str, key: int | str) -> Any:
-        low, high = (round(limit, 2) for limit in limits)
-        if low == high:
-            low, high = limits
-        slider = self._server.gui.add_slider(label, min=low, max=high, step=(high - low) / 200, initial_value=0.0)
-
-        def moved(_: Any) -> None:
-            with self._lock:
-                self.change(**{part: {**getattr(self._setting, part), key: float(slider.value)}})
-
-        slider.on_update(moved)
-        return slider
+            self.change(look=look)
 
     def _loop(self) -> None:
-        told = 0.0
         while not self._stop.is_set():
-            with self._lock:
-                shown, setting, now = self.player.now(), self._setting, time.monotonic()
-                newest = max(self._changed, shown.taken or 0.0)
-                is_moving = self.player.is_playing or now - newest < STILL_AFTER
-            width = self._moving_width if is_moving else self._width
-            key = (shown.key, setting, width)
-            if key != self._last:
-                self._last = key
-                begin = time.perf_counter()
-                picture = self.stage.draw((shown.params, shown.camera), setting, width, shown.recorded)
-                self.milliseconds = 1000 * (time.perf_counter() - begin)
-                self.picture = picture
-                self._send(picture)
-                if shown.taken is not None:
-                    self.pace.add(shown.taken, time.monotonic())
-                if is_moving:
-                    self._fit(self.milliseconds)
-            else:
-                self.wake.wait(0.01)
-                self.wake.clear()
-            if now - told > STATUS_EVERY:
-                told = now
-                self._tell(self.stage.distance(self.stage.params(shown.params, setting)), setting)
+            try:
+                self._step()
+            except Exception as error:
+                self.complaints.add(f"a picture could not be drawn ({type(error).__name__})")
+                self._stop.wait(AFTER_AN_ERROR)
+
+    def _step(self) -> None:
+        """Draw and send what has changed, or wait for that."""
+        with self.lock:
+            shown, setting, now = self.player.now(), self.setting, time.monotonic()
+            newest = max(self._changed, shown.taken or 0.0)
+            is_moving = self.player.is_playing or now - newest < STILL_AFTER
+        clients = self.server.get_clients()
+        windows = tuple((number, client.camera.aspect) for number, client in clients.items())
+        width = self._moving_width if is_moving else self._width
+        key = (shown.key, setting, width, windows)
+        if key != self._last:
+            self._last = key
+            begin = time.perf_counter()
+            picture = self.stage.draw((shown.params, shown.camera), setting, width, shown.recorded)
+            self.milliseconds = 1000 * (time.perf_counter() - begin)
+            self.picture = picture
+            for number, aspect in windows:
+                self._send(clients[number], aspect, picture)
+            if shown.taken is not None:
+                self.pace.add(shown.taken, time.monotonic())
+            if is_moving:
+                self._fit(self.milliseconds)
+        else:
+            self.wake.wait(0.01)
+            self.wake.clear()
+        if now - self._told > STATUS_EVERY:
+            self._told = now
+            is_recorded = shown.recorded is not None
+            self._tell(self.stage.distance(self.stage.params(shown.params, setting)), setting, is_recorded)
 
     def _fit(self, milliseconds: float) -> None:
         low, high = TARGET_MS
         factor = 0.85 if milliseconds > high else 1.15 if milliseconds < low else 1.0
         self._moving_width = round(min(max(self._moving_width * factor, LEAST_WIDTH), self._width))
 
-    def _send(self, picture: np.ndarray) -> None:
-        for number, client in self._server.get_clients().items():
-            image = padded(picture, self._aspects.get(number, 1.0), self.stage.trained.config.data.background)
+    def _send(self, client: Any, aspect: float, picture: np.ndarray) -> None:
+        try:
+            image = padded(picture, aspect, self.stage.trained.config.data.background)
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
+        except Exception as error:  # the others get theirs
+            self.complaints.add(f"a picture could not be sent ({type(error).__name__})")
 
-    def _tell(self, distance: float, setting: Setting) -> None:
+    def _tell(self, distance: float, setting: Setting, is_recorded: bool) -> None:
         height, width = (0, 0) if self.picture is None else self.picture.shape[:2]
         _, is_supported = self.stage.within(setting.look)
         lines = [
             f"{width} x {height} pixels, {self.milliseconds:.0f} ms a picture",
             f"Distance from training: {distance:.2f}" + (" (**far**: the avatar guesses)" if distance > 1 else ""),
+            *notes(setting, self.stage.truth is not None, is_recorded),
         ]
         if not is_supported:
             lines.append("**The camera is where the training video never was: the avatar guesses.**")
-        if self._stream_status is not None:
-            lines.append(self._stream_status())
-            if (pace := self.pace.now(time.monotonic())) is not None:
-                lines.append(f"Latency {pace[0]:.0f} ms at {pace[1]:.0f} pictures a second")
-        self._status.content = "\n\n".join(lines)
-        self._play.label = "Pause" if self.player.is_playing else "Play"
-        if self.player.is_playing:
-            self._scrub.value = round(self.player.share, 3)
+        if (pace := self.pace.now(time.monotonic())) is not None:
+            lines.append(f"Latency {pace[0]:.0f} ms at {pace[1]:.0f} pictures a second")
+        self._panel.tell(lines, "" if self._live_status is None else self._live_status())
 
-    def _save_picture(self, event: Any) -> None:
-        with self._lock:
-            shown, setting = self.player.now(), self._setting
-        picture = self.stage.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
-        data = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
-        if event.client is not None:
-            event.client.send_file_download(f"{self.stage.trained.name}.png", data, save_immediately=True)
+    def save_picture(self, event: Any) -> None:
+        with self.lock:
+            shown, setting = self.player.now(), self.setting
+        with self._saving(event.client) as may_save:
+            if may_save:
+                picture = self.stage.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
+                data = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
+                event.client.send_file_download(f"{self.stage.trained.name}.png", data, save_immediately=True)
 
-    def _save_video(self, event: Any) -> None:
+    def save_video(self, event: Any) -> None:
         """The whole motion as it is seen now."""
-        with self._lock:
-            clip, setting = self.player.clip, self._setting
-        if event.client is None:
-            return
+        with self.lock:
+            clip, setting = self.player.clip, self.setting
         if clip is None:
             event.client.add_notification("No motion", "Choose a motion first: a face at rest makes no video.")
             return
-        recorded = clip.recorded or (None,) * len(clip)
-        frames = (self.stage.draw(f, setting, self._width, r) for f, r in zip(clip.frames, recorded, strict=True))
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "video.mp4"
-            write_video(path, frames, clip.fps)
-            name = f"{self.stage.trained.name}-{clip.name}.mp4"
-            event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
+
+        def frames() -> Iterator[np.ndarray]:
+            for frame, recorded in zip(clip.frames, clip.recorded or (None,) * len(clip), strict=True):
+                if self._stop.is_set():
+                    raise UserError("the viewer has ended")
+                yield self.stage.draw(frame, setting, self._width, recorded)
+
+        with self._saving(event.client) as may_save, tempfile.TemporaryDirectory() as folder:
+            if may_save:
+                path = Path(folder) / "video.mp4"
+                write_video(path, frames(), clip.fps)
+                name = f"{self.stage.trained.name}-{clip.name}.mp4"
+                event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
+
+    @contextmanager
+    def _saving(self, client: Any) -> Iterator[bool]:
+        """One at a time, and not many a second: what is saved stays in memory until a client has taken it."""
+        if not self._save_lock.acquire(blocking=False):
+            client.add_notification("Not saved", "Something else is being saved: try again.")
+            yield False
+            return
+        try:
+            yield True
+            self._stop.wait(SAVE_EVERY)
+        finally:
+            self._save_lock.release()
 
 
 def padded(picture: np.ndarray, aspect: float, background: tuple[float, ...]) -> np.ndarray:
-    """The picture in the middle of one of another width over height."""
+    """The picture in the middle of one of another width over height, smaller where that would be larger than LARGEST."""
     height, width = picture.shape[:2]
-    wide, tall = max(width, round(height * aspect)), max(height, round(width / max(aspect, 1e-3)))
+    factor = min(LARGEST / max(width, height * aspect), LARGEST / max(height, width / aspect), 1.0)
+    if factor < 1.0:
+        width, height = max(1, round(width * factor)), max(1, round(height * factor))
+        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    wide = min(max(width, round(height * aspect)), LARGEST)
+    tall = min(max(height, round(width / aspect)), LARGEST)
     sheet = np.empty((tall, wide, 3), np.uint8)
     sheet[:] = np.round(np.asarray(background) * 255)
     top, left = (tall - height) // 2, (wide - width) // 2
@@ -279,18 +239,9 @@ def padded(picture: np.ndarray, aspect: float, background: tuple[float, ...]) ->
     return sheet
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def _viser() -> Any:
+def _listen(host: str, port: int) -> socket.socket:
     try:
-        import viser
-    except ImportError:
-        raise UserError(
-            "avatar view needs viser, which is not installed: pip install 'hyperavatar[view]' (from a checkout: "
-            "pip install -e '.[view]')"
-        ) from None
-    return viser
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"the viewer cannot listen on {host}:{port} ({reason}); give another --port") from None

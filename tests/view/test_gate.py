@@ -1,89 +1,78 @@
-"""Who comes in to the viewer."""
+"""Which requests may use the viewer."""
 
 from __future__ import annotations
 
-import http.client
-import http.server
-import threading
-from collections.abc import Iterator
-
 import pytest
 
-from avatar.errors import UserError
-from avatar.view.gate import Gate, answer, last_of_its_connection
+pytest.importorskip("websockets")
+from websockets.datastructures import Headers
+
+from avatar.view.gate import Gate
 
 TOKEN = "a-token-that-is-long"
+HERE = Gate(TOKEN, True)
+EVERYWHERE = Gate(TOKEN, False)
 
 
-def head(path: str = "/", *lines: str, host: str = "127.0.0.1:8080") -> bytes:
-    return "\r\n".join([f"GET {path} HTTP/1.1", f"Host: {host}", *lines, "", ""]).encode()
+def asked(gate: Gate, path: str = f"/{TOKEN}/", *more: tuple[str, str], host: str = "127.0.0.1:8080") -> int:
+    """The status of the answer; 200 where the request is let in."""
+    headers = Headers([("Host", host), *more])
+    refusal = gate.refusal(path, headers)
+    return 200 if refusal is None else refusal.status
 
 
-def refused(*arguments: object) -> str:
-    response = answer(*arguments)  # type: ignore[arg-type]
-    assert response is not None
-    return response.decode().splitlines()[0]
+def origin(value: str) -> tuple[str, str]:
+    return "Origin", value
 
 
-def test_on_this_machine_other_sites_are_kept_out() -> None:
-    assert answer(head(), None, True) is None
-    assert answer(head("/", "Origin: http://127.0.0.1:8080"), None, True) is None
-    assert "403" in refused(head("/", "Origin: http://evil.example"), None, True)
-    assert "403" in refused(head("/", "Origin: null"), None, True)
-    assert "403" in refused(head(host="evil.example:8080"), None, True), "a name made to point here"
-    assert answer(head(host="localhost:8080"), None, True) is None
-    assert "400" in refused(b"\x16\x03\x01 hello\r\n\r\n", None, True)
+@pytest.mark.parametrize("gate", [HERE, EVERYWHERE])
+def test_everybody_needs_the_token(gate: Gate) -> None:
+    assert asked(gate) == asked(gate, f"/{TOKEN}") == 200
+    for path in ("/", "", "/another/", f"/{TOKEN}x/", f"/{TOKEN}/x", "/?token=another", "/?token=", f"/?Token={TOKEN}"):
+        assert asked(gate, path) == 401, path
+    assert asked(gate, "/", ("Cookie", f"avatar_token={TOKEN}")) == 401, "a browser sends cookies to every port"
+    assert asked(gate, "/\udcff\udcfe") == asked(gate, "/?token=%ff%00") == 401
 
 
-def test_from_elsewhere_the_token_is_needed_once() -> None:
-    far = "192.168.0.7:8080"
-    assert "401" in refused(head(host=far), TOKEN, False)
-    assert "401" in refused(head("/?token=another", host=far), TOKEN, False)
-    assert "401" in refused(head("/", "Cookie: avatar_token=another", host=far), TOKEN, False)
-    shown = answer(head(f"/?token={TOKEN}", host=far), TOKEN, False)
-    assert shown is not None and b"303" in shown and b"HttpOnly" in shown and b"SameSite=Strict" in shown
-    assert answer(head("/", f"Cookie: x=1; avatar_token={TOKEN}", host=far), TOKEN, False) is None
-    cookie = f"Cookie: avatar_token={TOKEN}"
-    assert "403" in refused(head("/", cookie, "Origin: http://evil.example", host=far), TOKEN, False)
+def test_the_printed_address_leads_to_the_page() -> None:
+    refusal = HERE.refusal(f"/?token={TOKEN}", Headers(Host="127.0.0.1:8080"))
+    assert refusal is not None and refusal.status == 303 and refusal.location == f"./{TOKEN}/"
 
 
-def test_only_websockets_keep_their_connection() -> None:
-    socket = head("/", "Connection: Upgrade", "Upgrade: websocket")
-    assert last_of_its_connection(socket) == socket
-    plain = last_of_its_connection(head("/", "Connection: keep-alive", "Accept: x"))
-    assert b"keep-alive" not in plain and b"Accept: x" in plain and plain.endswith(b"\r\nConnection: close\r\n\r\n")
+def test_pages_of_other_sites_are_kept_out() -> None:
+    for ours in ("http://127.0.0.1:8080", "https://127.0.0.1:8080", "HTTP://127.0.0.1:8080"):
+        assert asked(HERE, f"/{TOKEN}/", origin(ours)) == 200
+    others = (
+        "http://evil.example",
+        "null",
+        "",
+        "http://127.0.0.1:8081",
+        "http://[::1",
+        "file://",
+        "http://127.0.0.1:8080/x",
+    )
+    for other in others:
+        assert asked(HERE, f"/{TOKEN}/", origin(other)) == asked(EVERYWHERE, f"/{TOKEN}/", origin(other)) == 403, other
+    assert asked(HERE, f"/{TOKEN}/", origin("http://127.0.0.1:8080"), origin("http://evil.example")) == 400
 
 
-@pytest.fixture
-def inner() -> Iterator[int]:
-    class Hello(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(b"hello" * 100_000)
-
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hello)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield server.server_address[1]
-    server.shutdown()
-    server.server_close()
+def test_a_name_that_was_made_to_point_here_is_kept_out() -> None:
+    for ours in ("localhost", "localhost:9000", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:8080"):
+        assert asked(HERE, host=ours) == 200, ours
+    for other in ("evil.example:8080", "127.0.0.1.evil.example", "localhost.evil.example:8080", "192.168.0.7:8080"):
+        assert asked(HERE, host=other) == 403, other
+    for broken in ("", "[::1", "a b", "localhost:8080:1", "user@localhost", "localhost/", "localhost:123456"):
+        assert asked(HERE, host=broken) == asked(EVERYWHERE, host=broken) == 400, broken
+    assert HERE.refusal(f"/{TOKEN}/", Headers()) is not None
+    assert asked(EVERYWHERE, f"/{TOKEN}/", origin("http://192.168.0.7:8080"), host="192.168.0.7:8080") == 200
 
 
-def test_what_is_let_in_is_handed_through(inner: int) -> None:
-    gate = Gate("127.0.0.1", 0, inner, TOKEN)
-
-    def get(path: str, **headers: str) -> tuple[int, bytes]:
-        connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=10)
-        connection.request("GET", path, headers=headers)
-        response = connection.getresponse()
-        return response.status, response.read()
-
-    assert get("/")[0] == 401
-    assert get(f"/?token={TOKEN}")[0] == 303
-    assert get("/", Cookie=f"avatar_token={TOKEN}") == (200, b"hello" * 100_000)
-    with pytest.raises(UserError, match="cannot listen on 127.0.0.1"):
-        Gate("127.0.0.1", gate.port, inner, None)
-    gate.close()
+def test_a_proxy_that_was_named_is_let_in() -> None:
+    """Row 24 of the public reports: a proxy's own Host, or the one that it keeps; and a sub-path."""
+    gate, page = Gate(TOKEN, True, "https://hub.example.org/proxy/8080/"), origin("https://hub.example.org")
+    assert asked(gate, f"/{TOKEN}/", page) == 200, "nginx writes a Host of its own"
+    assert asked(gate, f"/{TOKEN}/", page, host="hub.example.org") == 200, "it is kept"
+    assert asked(gate, f"/proxy/8080/{TOKEN}/", page) == 200, "the sub-path is kept"
+    assert asked(gate, f"/{TOKEN}/", origin("https://evil.example")) == 403
+    assert asked(gate, f"/{TOKEN}/", origin("http://hub.example.org")) == 403
+    assert asked(gate, "/", page) == 401

@@ -1,51 +1,38 @@
-"""The viewer as it runs: started by the command, reached over HTTP, driven in Chromium."""
+"""The viewer as a person meets it: what is set is drawn, in a window of any shape; started and ended by the command."""
 
 from __future__ import annotations
 
 import http.client
-import re
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
+import json
+import socket
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from browsers import chromium
-from command_line import avatar
-from lively import lively_avatar, lively_run
-from waiting import until
-
-from avatar.motion.orbit import orbited
-from avatar.runs.clips import own_clip
-from avatar.runs.trained import TrainedAvatar
-from avatar.view.player import Player
-from avatar.view.server import Viewer, padded
-from avatar.view.stage import Look, Setting, Stage
 
 pytest.importorskip("viser")
-WIDTH = 96
+from browsers import chromium
+from command_line import avatar
+from lively import lively_run
+from view_client import TOKEN, WIDTH, Page, started
+from waiting import until
 
-
-@pytest.fixture(scope="module")
-def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
-    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run")
-
-
-@pytest.fixture
-def viewer(trained: TrainedAvatar) -> Iterator[Viewer]:
-    player = Player(trained, {"train": own_clip(trained, "train")}, time.monotonic)
-    viewer = Viewer(Stage(trained), player, WIDTH, "127.0.0.1", 0, None)
-    yield viewer
-    viewer.close()
+from avatar.commands.viewing import address, checked_url
+from avatar.motion.orbit import orbited
+from avatar.runs.trained import TrainedAvatar
+from avatar.view.server import LARGEST, Viewer, padded
+from avatar.view.stage import Look, Setting
 
 
 def shows(viewer: Viewer, setting: Setting) -> bool:
     shown = viewer.player.now()
     expected = viewer.stage.draw((shown.params, shown.camera), setting, WIDTH)
     return viewer.picture is not None and np.array_equal(viewer.picture, expected)
+
+
+def page_of(viewer: Viewer) -> str:
+    return f"http://127.0.0.1:{viewer.port}/?token={TOKEN}"
 
 
 def test_what_is_set_is_drawn(viewer: Viewer) -> None:
@@ -77,8 +64,8 @@ def test_while_things_move_the_picture_is_as_small_as_it_must_be(viewer: Viewer)
     assert viewer._moving_width == before
 
 
-def test_a_camera_of_the_page_is_a_turn_of_the_head(viewer: Viewer, trained: TrainedAvatar) -> None:
-    camera = trained.rest_camera()
+def test_a_camera_of_the_page_is_a_turn_of_the_head(viewer: Viewer, shown_avatar: TrainedAvatar) -> None:
+    camera = shown_avatar.rest_camera()
     position = (-camera.R_cam_world.T @ camera.t_cam_world).numpy()
     look = viewer.look_from(position)
     assert abs(look.yaw) < 1e-3 and abs(look.pitch) < 1e-3 and look.zoom == pytest.approx(1.0)
@@ -99,13 +86,45 @@ def test_pictures_keep_their_shape() -> None:
     assert tall.shape == (40, 20, 3) and (tall[15:25] == 0).all() and tall[0, 0].tolist() == [255, 128, 0]
 
 
+@pytest.mark.parametrize("aspect", [1 / 16384, 10 / 900, 0.46, 1.0, 3000.0, 16384.0])
+def test_what_is_sent_is_bounded_for_every_window(aspect: float) -> None:
+    """The picture of --size 2048 with truth and error beside it."""
+    picture = np.full((2048, 3 * 2048, 3), 255, np.uint8)
+    sheet = padded(picture, aspect, (0.0, 0.0, 0.0))
+    assert max(sheet.shape) <= LARGEST
+    if 0.01 < aspect < 100:
+        rows, columns = np.nonzero(sheet[..., 0] > 127)
+        assert (np.ptp(columns) + 1) / (np.ptp(rows) + 1) == pytest.approx(3.0, rel=0.1)
+
+
+def test_the_panel_has_no_empty_folder(viewer: Viewer) -> None:
+    parts = {control.part for control in viewer.stage.controls}
+    assert len(parts) > 1
+    with Page(f"http://127.0.0.1:{viewer.port}/{TOKEN}/") as page:
+        page.until(lambda: "Reset face" in page.controls)
+        assert sorted(page.folders) == sorted(["Motion", "Picture", "Joints", *parts])
+
+
+def test_the_panel_says_why_nothing_plays_and_there_is_no_truth(viewer: Viewer) -> None:
+    with Page(f"http://127.0.0.1:{viewer.port}/{TOKEN}/") as page:
+        page.set("Play", True)
+        page.until(lambda: any("Choose a motion" in text for text in page.notifications))
+        page.set("Truth beside", True)
+        page.until(lambda: "No truth to show" in str(page.values))
+        assert viewer.picture is not None and viewer.picture.shape == (WIDTH, WIDTH, 3)
+        page.set("Motion", "train")
+        page.until(lambda: viewer.picture is not None and viewer.picture.shape == (WIDTH, 2 * WIDTH, 3))
+        page.values.clear()
+        page.until(lambda: "pixels" in str(page.values))
+        assert "No truth to show" not in str(page.values)
+
+
 @pytest.mark.chromium
 def test_a_person_plays_and_moves_a_slider(viewer: Viewer) -> None:
     with chromium() as browser:
         page = browser.new_page(viewport={"width": 1000, "height": 700})
-        page.goto(f"http://127.0.0.1:{viewer.port}/")
+        page.goto(page_of(viewer))
         page.get_by_role("button", name="Save picture").wait_for(timeout=30000)
-        until(lambda: viewer._aspects)
         viewer.player.choose("train")
         page.get_by_role("button", name="Play", exact=True).click()
         until(lambda: viewer.player.is_playing)
@@ -114,41 +133,76 @@ def test_a_person_plays_and_moves_a_slider(viewer: Viewer) -> None:
         assert download.value.suggested_filename == "someone.png"
         page.get_by_role("slider").nth(1).focus()
         page.keyboard.press("ArrowRight")
-        until(lambda: viewer._setting.expressions)
+        until(lambda: viewer.setting.expressions)
+    assert not viewer.complaints._counts, "viser's own page sends nothing that is refused"
+
+
+CANVAS = (
+    "(() => { const c = window.__viserMutable?.canvas?.getBoundingClientRect();"
+    " return c ? [c.width, c.height, c.right] : null })()"
+)
+IMAGE = (
+    "(() => { const i = window.__viserMutable?.backgroundMaterial?.uniforms.colorMap.value?.image;"
+    " return i ? i.width / i.height : 0 })()"
+)
+
+
+@pytest.mark.chromium
+def test_the_panel_does_not_cover_the_picture_and_a_phone_does_not_stretch_it(viewer: Viewer) -> None:
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 1000, "height": 700})
+        page.goto(page_of(viewer))
+        panel = page.get_by_role("button", name="Save picture")
+        panel.wait_for(timeout=30000)
+        until_shaped(page)
+        assert page.evaluate(CANVAS)[2] <= panel.bounding_box()["x"], "the picture ends where the panel begins"
+        phone = browser.new_context(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True).new_page()
+        phone.goto(page_of(viewer))
+        until_shaped(phone)
+        phone.set_viewport_size({"width": 844, "height": 390})
+        until_shaped(phone)
+
+
+def until_shaped(page: Any) -> None:
+    """The picture that the page shows has the shape of its window."""
+
+    def is_shaped() -> bool:
+        window, shown = page.evaluate(CANVAS), page.evaluate(IMAGE)
+        page.wait_for_timeout(50)
+        return bool(window and shown) and shown == pytest.approx(window[0] / window[1], rel=0.02)
+
+    until(is_shaped)
 
 
 def test_the_command_serves_and_ends(tracked_folder: Path, tmp_path: Path) -> None:
     run = lively_run(tracked_folder, tmp_path / "run", "model.uv_size=8")
-    words = ["view", str(run), "--port", "0", "--stream", "0", "--host", "0.0.0.0", "--size", "64"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "avatar.cli", *words],
-        stdout=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what runs behind
+    with started(run, "--stream", 0, "--host", "0.0.0.0", "--size", 64) as viewer:
+        assert "0.0.0.0" not in viewer.said, "no other machine can open that"
+        assert len(viewer.token) >= 16 and json.dumps({"token": viewer.token}) in viewer.said
+        for path, status in (("/", 401), (f"/{viewer.token}/", 200)):
+            connection = http.client.HTTPConnection("127.0.0.1", viewer.port, timeout=10)
+            connection.request("GET", path)
+            assert connection.getresponse().status == status
+        assert viewer.listening() == {viewer.port, viewer.stream}, "and nothing else"
+        with Page(viewer.page) as page:
+            page.next_picture()
+            page.send(b"\xc1")
+            socket.create_connection(("127.0.0.1", viewer.port))
+            assert viewer.interrupt() < 10
+
+
+def test_addresses_can_be_opened() -> None:
+    assert address("127.0.0.1", 80) == address("localhost", 80) == "http://127.0.0.1:80/"
+    assert address("::1", 80) == "http://[::1]:80/" and address("fe80::1", 80) == "http://[fe80::1]:80/"
+    assert address("box.example.org", 8080) == "http://box.example.org:8080/"
+    assert (
+        address("127.0.0.1", 80, checked_url("https://hub.example.org/proxy/80")) == "https://hub.example.org/proxy/80/"
     )
-    try:
-        assert process.stdout is not None
-        said = ""
-        while "Ctrl-C" not in said:
-            line = process.stdout.readline()
-            assert line, said
-            said += line
-        found = re.search(r"http://0.0.0.0:(\d+)/\?token=(\S+)", said)
-        assert found is not None and "Stream   127.0.0.1:" in said
-        connection = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=10)
-        connection.request("GET", "/")
-        assert connection.getresponse().status == 401, "others need the token"
-        connection = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=10)
-        connection.request("GET", "/", headers={"Cookie": f"avatar_token={found[2]}"})
-        response = connection.getresponse()
-        assert response.status == 200 and b"<html" in response.read()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
-    finally:
-        process.kill()
+    for everywhere in ("0.0.0.0", "::"):
+        assert "0.0.0.0" not in address(everywhere, 80) and "[::]" not in address(everywhere, 80)
 
 
-def test_what_cannot_be_shown_is_said(tracked_folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_shown_is_said(tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = lively_run(tracked_folder, tmp_path / "run", "model.uv_size=8")
     assert "--size must be from" in avatar("view", run, "--size", 5, status=1)
     assert "--drive takes drive files" in avatar("view", run, "--drive", "x.mp4", "--port", 0, status=1)
@@ -156,4 +210,14 @@ def test_what_cannot_be_shown_is_said(tracked_folder: Path, tmp_path: Path) -> N
     assert "camera 97 gives no picture" in avatar("view", run, "--webcam", "97", "--port", 0, status=1)
     assert "not allowed with argument" in avatar("view", run, "--webcam", "--stream", 0, status=2)
     assert "--fov belongs to --webcam" in avatar("view", run, "--fov", 60, "--port", 0, status=1)
-    assert "--token must be at least 8" in avatar("view", run, "--token", "short", status=1)
+    assert "--open-stream belongs to --stream" in avatar("view", run, "--open-stream", "--port", 0, status=1)
+    assert "must be at least 8" in avatar("view", run, "--token", "short", status=1)
+    for wrong in ("hub.example.org", "ftp://x/", "https://", "https://[::1", "https://x/?a=b"):
+        assert "--url takes the address" in avatar("view", run, "--url", wrong, status=1)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert "the viewer cannot listen on 127.0.0.1" in avatar("view", run, "--port", port, status=1)
+    assert "cannot listen" in avatar("view", run, "--port", 70000, status=1)
+    assert "cannot listen" in avatar("view", run, "--host", "no such host", status=1)
+    monkeypatch.setenv("AVATAR_TOKEN", "not one!")
+    assert "must be at least 8" in avatar("view", run, status=1)

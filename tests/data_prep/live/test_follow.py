@@ -117,7 +117,7 @@ def test_the_command_follows_a_video_to_its_end(video: Path, head: Path, tmp_pat
             line = process.stdout.readline()
             assert line, said
             said += line
-        assert f"Webcam   {video}, {SIZE} x {SIZE} pixels" in said and "Open     http://localhost:" in said
+        assert f"Webcam   {video}, {SIZE} x {SIZE} pixels" in said and "Open     http://127.0.0.1:" in said
         assert "Webcam   Calibrated: the avatar follows." in said
         assert f"{video} has ended after {FRAMES} pictures" in said
         process.send_signal(signal.SIGINT)

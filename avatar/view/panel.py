@@ -1,0 +1,145 @@
+"""The viewer's panel: viser's controls, what they do, and which values a page may give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from avatar.view.messages import Value, one_of, pressed, switched, within
+from avatar.view.stage import Setting
+
+if TYPE_CHECKING:
+    from avatar.view.server import Viewer
+
+LABELS = {"jaw": "jaw open", "look_left": "look to its left", "turn": "turn to its left"}
+
+
+class Panel:
+    """A page can set what `_input` and `_button` have made, and to nothing but what their checks return."""
+
+    def __init__(self, viewer: Viewer, gui: Any, live_name: str | None, calibrate: Callable[[], None] | None) -> None:
+        self._viewer, self._gui = viewer, gui
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()  # beside the picture, which it would cover
+        self._status = gui.add_markdown("")
+        # A field shows plain text, whatever a stranger has sent; Markdown would be read for HTML and for files to show.
+        self._live = (
+            None if live_name is None else gui.add_text(live_name.capitalize(), "", multiline=True, disabled=True)
+        )
+        self._add_motion(calibrate)
+        self._add_picture()
+        self._add_face()
+
+    def tell(self, lines: list[str], live: str) -> None:
+        """What the panel says: `lines` are Markdown of this program's own, `live` is of anybody."""
+        self._status.content = "\n\n".join(lines)
+        if self._live is not None:
+            self._live.value = live
+        player = self._viewer.player
+        self._play.label = "Pause" if player.is_playing else "Play"
+        if player.is_playing:
+            self._scrub.value = round(player.share, 3)
+
+    def _safe(self, act: Callable[[Any], object]) -> Callable[[Any], None]:
+        """An error belongs to who pressed the control."""
+
+        def safely(event: Any) -> None:
+            try:
+                act(event)
+            except Exception as error:
+                self._viewer.complaints.add(f"a control failed ({type(error).__name__})")
+
+        return safely
+
+    def _input(self, handle: Any, check: Callable[[Value], Value], act: Callable[[Any], object]) -> Any:
+        self._viewer.door.admit(handle, check)
+        handle.on_update(self._safe(act))
+        return handle
+
+    def _button(self, label: str, act: Callable[[Any], object]) -> Any:
+        button = self._gui.add_button(label)
+        self._viewer.door.admit(button, pressed)
+        button.on_click(self._safe(act))
+        return button
+
+    def _add_motion(self, calibrate: Callable[[], None] | None) -> None:
+        gui, viewer, player = self._gui, self._viewer, self._viewer.player
+
+        def choose(_: Any) -> None:
+            with viewer.lock:
+                player.choose(motion.value)
+            viewer.touch()
+
+        def toggle(event: Any) -> None:
+            if player.clip is None:
+                event.client.add_notification("Nothing plays", "Choose a motion first.")
+                return
+            with viewer.lock:
+                (player.pause if player.is_playing else player.play)()
+            viewer.touch()
+
+        def seek(event: Any) -> None:
+            if event.client is not None:  # a person, not the player
+                with viewer.lock:
+                    player.seek(self._scrub.value)
+                viewer.touch()
+
+        with gui.add_folder("Motion"):
+            motion = gui.add_dropdown("Motion", player.names, initial_value=player.name)
+            self._input(motion, one_of(player.names), choose)
+            self._play = self._button("Play", toggle)
+            scrub = gui.add_slider("Place", min=0.0, max=1.0, step=0.001, initial_value=0.0)
+            self._scrub = self._input(scrub, within(0.0, 1.0), seek)
+            if calibrate is not None:
+                self._button("Take this face as neutral", lambda _: calibrate())
+
+    def _add_picture(self) -> None:
+        gui, viewer, stage = self._gui, self._viewer, self._viewer.stage
+        with gui.add_folder("Picture"):
+            if stage.truth is not None:
+                beside = gui.add_checkbox("Truth beside", initial_value=False)
+                self._input(beside, switched, lambda _: viewer.change(with_truth=beside.value))
+            overlay = gui.add_dropdown("Overlay", stage.overlays, initial_value="none")
+            self._input(overlay, one_of(stage.overlays), lambda _: viewer.change(overlay=overlay.value))
+            self._button("Save picture", viewer.save_picture)
+            self._button("Save video", viewer.save_video)
+
+    def _add_face(self) -> None:
+        stage, sliders = self._viewer.stage, []
+        parts = list(dict.fromkeys(control.part for control in stage.controls))
+        for part in parts:
+            with self._gui.add_folder(part, expand_by_default=part == parts[0]):
+                for number, control in enumerate(stage.controls):
+                    if control.part == part:
+                        sliders.append(self._slider(control.name, (control.low, control.high), "expressions", number))
+        if stage.joints:
+            with self._gui.add_folder("Joints"):
+                for name, limits in stage.joints.items():
+                    sliders.append(self._slider(LABELS.get(name, name.replace("_", " ")), limits, "joints", name))
+
+        def reset(_: Any) -> None:
+            for slider in sliders:
+                slider.value = 0.0
+            self._viewer.change(expressions={}, joints={})
+
+        self._button("Reset face", reset)
+
+    def _slider(self, label: str, limits: tuple[float, float], part: str, key: int | str) -> Any:
+        low, high = (round(limit, 2) for limit in limits)
+        if low == high:
+            low, high = limits
+        slider = self._gui.add_slider(label, min=low, max=high, step=(high - low) / 200, initial_value=0.0)
+
+        def moved(_: Any) -> None:
+            with self._viewer.lock:
+                values = getattr(self._viewer.setting, part)
+                self._viewer.change(**{part: {**values, key: float(slider.value)}})
+
+        return self._input(slider, within(low, high), moved)
+
+
+def notes(setting: Setting, has_truth: bool, is_recorded: bool) -> list[str]:
+    """Why the picture is without what was asked for."""
+    if not (setting.with_truth or setting.overlay == "error") or not has_truth or is_recorded:
+        return []
+    return ["**No truth to show: choose a motion of the training video.**"]
