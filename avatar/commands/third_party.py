@@ -12,12 +12,11 @@ from avatar.files.third_party import (
     PAGE_FILES,
     TRACKING_FILES,
     ThirdPartyFile,
-    check_sha256,
     download,
     find,
     models_folder,
+    require,
     search_folders,
-    sha256_of,
 )
 from avatar.losses.lpips import MissingWeights, download_lpips, load_lpips, lpips_folder
 from avatar.losses.lpips_network import NETS, Net
@@ -50,7 +49,7 @@ def describe(file: ThirdPartyFile, say: Callable[[str], object]) -> bool:
         say(f"  SHA-256 {file.sha256}")
         return file.is_optional
     try:
-        check_sha256(file, sha256_of(path), str(path))
+        require(file)
     except UserError as error:
         say(f"  {error}")
         return False
@@ -75,15 +74,23 @@ def describe_lpips(net: Net, say: Callable[[str], object]) -> bool:
 
 
 def fetch_missing(say: Callable[[str], object]) -> None:
-    """Download what is not there. Raises UserError, with where to put the file by other means, when that fails."""
+    """Download what is not there or is damaged. Raises UserError, with where to put the file by other means, when that
+    fails.
+    """
     for file in (*TRACKING_FILES, *PAGE_FILES):
-        if find(file) is None:
+        try:
+            require(file)
+        except UserError as error:
+            if find(file) is not None:
+                say(str(error))
             say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download(file)
     for net in FETCHED_BY_DEFAULT:
         try:
             load_lpips(net)
-        except MissingWeights:
+        except UserError as error:
+            if not isinstance(error, MissingWeights):
+                say(str(error))
             for file in LPIPS_FILES[net]:
                 say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download_lpips(net, lpips_folder())

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.opening import read_bytes
+
+MAX_BYTES = 2**26  # FLAME's template has 1.5 MB
 
 
 def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -18,25 +21,23 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
 
     Raises UserError when the OBJ has no UVs or another topology than the model.
     """
+    text = read_bytes(file, MAX_BYTES).decode(errors="replace")
     uvs: list[tuple[float, float]] = []
     corners: list[list[tuple[int, int]]] = []
     positions = 0
     number = 0
     try:
-        with file.open(encoding="utf-8", errors="replace") as lines:
-            for number, line in enumerate(lines, start=1):  # noqa: B007 (the message names the line)
-                kind, _, rest = line.partition(" ")
-                if kind == "v":
-                    positions += 1
-                elif kind == "vt":
-                    u, v = rest.split()[:2]
-                    uvs.append((float(u), float(v)))
-                elif kind == "f":
-                    pairs = [corner.split("/")[:2] for corner in rest.split()]
-                    polygon = [(int(v) - 1, int(vt) - 1) for v, vt in pairs]
-                    corners += [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
-    except OSError as error:
-        raise UserError(f"{file} cannot be read ({error.strerror})") from None
+        for number, line in enumerate(text.split("\n"), start=1):  # noqa: B007 (the message names the line)
+            kind, _, rest = line.partition(" ")
+            if kind == "v":
+                positions += 1
+            elif kind == "vt":
+                u, v = rest.split()[:2]
+                uvs.append((float(u), float(v)))
+            elif kind == "f":
+                pairs = [corner.split("/")[:2] for corner in rest.split()]
+                polygon = [(int(v) - 1, int(vt) - 1) for v, vt in pairs]
+                corners += [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
     except ValueError:
         raise UserError(
             f"{file}, line {number}: not a line of an OBJ file whose faces carry UVs (f v/vt ...)"

@@ -12,13 +12,15 @@ import tempfile
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
+from avatar.data.tensor_file import read_tensors
 from avatar.errors import UserError
 from avatar.files.third_party import LPIPS_FILES, ThirdPartyFile, check_sha256, fetch, search_folders, sha256_of
 from avatar.losses.lpips_network import NETS, Lpips, Net
+
+_MAX_BYTES = 2**30  # of a converted file; VGG16's has 59 MB
 
 
 class MissingWeights(UserError):
@@ -75,7 +77,7 @@ def from_published(net: Net, folder: Path, files: tuple[ThirdPartyFile, ThirdPar
     state: dict[str, Tensor] = {}
     for file in (backbone, heads):
         path = folder / file.name
-        check_sha256(file, sha256_of(path), str(path))
+        check_sha256(file, sha256_of(path, file.max_bytes), str(path))
         state |= _renamed(_read_torch(path))
     return from_state(net, state, folder / backbone.name)
 
@@ -146,6 +148,6 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} is not a readable safetensors file: {error}") from error
+        return read_tensors(path, _MAX_BYTES)
+    except UserError as error:
+        raise UserError(f"{error}; fetch or convert it again") from None

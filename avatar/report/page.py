@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,10 @@ from typing import Any
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from avatar.config import flatten
+from avatar.data.images import MAX_BYTES
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import is_there, read_bytes, read_json
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
 from avatar.report.pictures import frame_panels, uncertainty_map
@@ -64,12 +65,12 @@ def render_report(run: Run) -> str:
 
 def read_results(path: Path) -> dict[str, Any] | None:
     """What `avatar eval` wrote, or None where it has not run."""
-    if not path.is_file():
+    if not is_there(path):
         return None
     try:
-        results = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read ({error}); run avatar eval again") from None
+        results = read_json(path)
+    except UserError as error:
+        raise UserError(f"{error}; run avatar eval again") from None
     if not isinstance(results, dict) or not isinstance(results.get("protocols"), dict):
         raise UserError(f"{path} is not a results file of this program; run avatar eval again")
     return results
@@ -123,8 +124,8 @@ def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
     parts.append(fold("By head pose and by distance from the training expressions", *bins_tables(results["protocols"])))
     for name, caption in (("curves.png", "The figures along the video"), ("worst.png", "The worst frames")):
         file = run.path / "eval" / name
-        if file.is_file():
-            source = f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
+        if is_there(file):
+            source = f"data:image/png;base64,{base64.b64encode(read_bytes(file, MAX_BYTES)).decode()}"
             image = element("figure", element("img", src=source, alt=caption), element("figcaption", caption))
             parts.append(fold(caption, image))
     choices = {n: e.get("choices", {}).get("summary") for n, e in results["protocols"].items()}
