@@ -21,6 +21,7 @@ from avatar.errors import UserError
 from avatar.evaluation.bootstrap import BlockBootstrap, Interval
 from avatar.evaluation.earlier import MAX_TABLE_BYTES
 from avatar.evaluation.evaluate import RESULTS_FORMAT
+from avatar.evaluation.protocol import NAME
 from avatar.files.opening import MissingFile, read_bytes, read_json
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "protocols"}  # of results.json
@@ -120,6 +121,9 @@ def read_evaluation(label: str, run: Path) -> Evaluation:
         raise UserError(f"{path} was written by another version of this program; evaluate the run again")
     if missing := NEEDED - results.keys():
         raise UserError(f"{path} is damaged ({', '.join(sorted(missing))} missing); evaluate the run again")
+    names = results["protocols"]
+    if not isinstance(names, dict) or not all(NAME.fullmatch(name) for name in names):  # they name folders
+        raise UserError(f"{path} is damaged (the names of its protocols); evaluate the run again")
     return Evaluation(label, path.parent, results)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from avatar.errors import UserError
 from avatar.evaluation.pictures import clear_pictures
-from avatar.evaluation.protocol import Protocol
+from avatar.evaluation.protocol import NAME, Protocol
 from avatar.files.opening import read_bytes, read_json
 
 FRAMES_FILE = "frames.csv"
@@ -28,7 +28,9 @@ def earlier_results(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
         if _identity(earlier) != _identity(json.loads(json.dumps(results))):
             return {}
         asked = {*results["protocols"], *results["left_out"]}
-        others = {name: entry for name, entry in earlier["protocols"].items() if name not in asked}
+        others = {
+            name: entry for name, entry in earlier["protocols"].items() if name not in asked and NAME.fullmatch(name)
+        }
         return {name: entry for name, entry in others.items() if _is_whole(folder / name, entry)}
     except (UserError, ValueError, KeyError, TypeError, AttributeError):  # none, or not of this program
         return {}

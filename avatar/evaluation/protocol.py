@@ -28,6 +28,7 @@ Levels = Literal["round", "truncate", "float"]
 MEASURES = ("psnr", "ssim", "lpips")
 REGIONS: tuple[Region, ...] = ("head", "mouth", "eyes", "rest")
 HELD_OUT = "held-out"
+NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a protocol, and of its folder
 MAX_BYTES = 1 << 16  # of a protocol file: those that come with the program have 2 KB
 
 SHARED_CHOICES = {
@@ -138,7 +139,7 @@ def choose_protocols(given: Sequence[str] | None) -> list[Protocol]:
 def read_protocol(path: Path) -> Protocol:
     """The protocol of a file. Raises UserError naming the file and the key for anything that is not as it should be."""
     values = _read_yaml(path)
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", path.stem):
+    if not NAME.fullmatch(path.stem):
         raise UserError(f"{path}: the file's name names the protocol and a folder; use letters, digits, - and _ only")
     keys = [field.name for field in dataclasses.fields(Protocol) if field.name != "name"]
     for key in values:
