@@ -44,7 +44,7 @@ def writing_figures(run: Path) -> Iterator[None]:
 
 
 def run_report(arguments: Namespace) -> int:
-    from avatar.report.page import write_report  # imports matplotlib and tensorboard, which take a second
+    from avatar.report.page import write_report
 
     print(f"Report {write_report(open_run(arguments.run, arguments.head, arguments.folder))}")
     return OK

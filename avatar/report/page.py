@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
 from avatar.config import flatten
 from avatar.data.images import MAX_BYTES
-from avatar.errors import UserError
+from avatar.errors import UserError, check_installed
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there, read_bytes, read_json
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
@@ -35,7 +33,8 @@ if (slider) { slider.addEventListener("input", show); show(); }
 
 def write_report(run: Run) -> Path:
     """Write RUN/report.html and return it. Parts that a run does not have yet (its evaluation, its curves) are named as
-    missing. Raises UserError when the evaluation's results cannot be read, or a frame is gone."""
+    missing. Raises UserError when the evaluation's results cannot be read, a frame is gone, or a package is missing."""
+    check_installed("a report", "plots", "matplotlib", "tensorboard")
     path = run.path / "report.html"
     write_atomically(path, render_report(run).encode())
     return path
@@ -149,7 +148,10 @@ def _frames(run: Run) -> list[Markup]:
 
 
 def _curves(folder: Path) -> list[Markup]:
-    curves = read_curves(folder)
+    try:
+        curves = read_curves(folder)
+    except UnicodeEncodeError:
+        return [element("p", "Curves are not read from a folder whose name is not UTF-8.", class_="soft")]
     shown = [(tag, title) for tag, title in (("loss/total", "loss"), ("train/psnr", "PSNR, dB")) if curves.get(tag)]
     if not shown:
         return [element("p", "No curves were recorded.", class_="soft")]
@@ -167,6 +169,8 @@ def read_curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
     """(step, value) of every scalar that training recorded, at most `MAX_POINTS` of each; empty without a recording."""
     if not folder.is_dir():
         return {}
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # takes a second
+
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
     events.Reload()
     curves = {}
