@@ -8,21 +8,22 @@ from collections.abc import Callable
 from avatar.commands import OK
 from avatar.errors import UserError
 from avatar.files.third_party import (
+    FETCHED_LPIPS,
     LPIPS_FILES,
     PAGE_FILES,
     TRACKING_FILES,
     ThirdPartyFile,
     download,
     find,
+    lpips_folder,
     models_folder,
     require,
     search_folders,
 )
-from avatar.losses.lpips import MissingWeights, download_lpips, load_lpips, lpips_folder
+from avatar.losses.lpips import MissingWeights, download_lpips, load_lpips
 from avatar.losses.lpips_network import NETS, Net
 
 MISSING = 1
-FETCHED_BY_DEFAULT = ("squeeze",)  # what training and evaluation use; vgg is 528 MB and alex 233
 
 
 def run_models(arguments: Namespace, say: Callable[[str], object] = print) -> int:
@@ -67,7 +68,7 @@ def describe_lpips(net: Net, say: Callable[[str], object]) -> bool:
     except MissingWeights:
         for file in (backbone, heads):
             say(f"  missing: put {file.url} as {lpips_folder() / file.name}")
-        return net not in FETCHED_BY_DEFAULT
+        return net not in FETCHED_LPIPS
     except UserError as error:
         say(f"  {error}")
         return False
@@ -85,7 +86,7 @@ def fetch_missing(say: Callable[[str], object]) -> None:
                 say(str(error))
             say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download(file)
-    for net in FETCHED_BY_DEFAULT:
+    for net in FETCHED_LPIPS:
         try:
             load_lpips(net)
         except UserError as error:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-from avatar.config import config_dir
+from avatar.config_values import config_dir
 from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
 from avatar.data.split import Split
 from avatar.errors import UserError

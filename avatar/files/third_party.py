@@ -16,7 +16,8 @@ from avatar.errors import UserError
 from avatar.files.download import DownloadFailed, downloaded
 from avatar.files.opening import is_there, open_file
 
-FOLDER_VARIABLE = "AVATAR_MODELS"
+FOLDER_VARIABLE, HEAD_VARIABLE = "AVATAR_MODELS", "AVATAR_HEAD"
+FETCHED_LPIPS = ("squeeze",)  # what training and evaluation use; vgg is 528 MB and alex 233
 
 
 class ThirdPartyFile(NamedTuple):
@@ -107,6 +108,27 @@ def models_folder() -> Path:
     """Where downloads go: `models` in the cache."""
     cache = os.environ.get("AVATAR_CACHE")
     return (Path(cache).expanduser() if cache else Path.home() / ".cache" / "avatar") / "models"
+
+
+def lpips_folder() -> Path:
+    """Where weights of LPIPS are looked for when the caller names no place: $AVATAR_LPIPS, else `lpips` in the cache."""
+    named = os.environ.get("AVATAR_LPIPS")
+    return Path(named).expanduser() if named else models_folder().with_name("lpips")
+
+
+def lpips_place(net: str) -> Path:
+    """The first folder that holds weights of this network: $AVATAR_LPIPS or the cache's, then those of $AVATAR_MODELS."""
+    own = lpips_folder()
+    names = {converted_lpips(net)}, {file.name for file in LPIPS_FILES[net]}
+    for folder in (own, *search_folders()):
+        if any(all((folder / name).is_file() for name in wanted) for wanted in names):
+            return folder
+    return own
+
+
+def converted_lpips(net: str) -> str:
+    """The name of a file with all weights of a network."""
+    return f"lpips_{net}.safetensors"
 
 
 def search_folders() -> list[Path]:

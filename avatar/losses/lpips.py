@@ -7,7 +7,6 @@ Weights are looked for in a file or folder that the caller names, else in the fo
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 
@@ -17,7 +16,16 @@ from torch import Tensor
 
 from avatar.data.tensor_file import read_tensors
 from avatar.errors import UserError
-from avatar.files.third_party import LPIPS_FILES, ThirdPartyFile, check_sha256, fetch, search_folders, sha256_of
+from avatar.files.third_party import (
+    LPIPS_FILES,
+    ThirdPartyFile,
+    check_sha256,
+    converted_lpips,
+    fetch,
+    lpips_folder,
+    lpips_place,
+    sha256_of,
+)
 from avatar.losses.lpips_network import NETS, Lpips, Net
 
 _MAX_BYTES = 2**30  # of a converted file; VGG16's has 59 MB
@@ -25,25 +33,6 @@ _MAX_BYTES = 2**30  # of a converted file; VGG16's has 59 MB
 
 class MissingWeights(UserError):
     """No weights are where they are looked for, as opposed to weights that are there and wrong."""
-
-
-def lpips_folder() -> Path:
-    """Where weights are looked for when the caller names no place."""
-    named = os.environ.get("AVATAR_LPIPS")
-    if named:
-        return Path(named)
-    cache = os.environ.get("AVATAR_CACHE")
-    return (Path(cache) if cache else Path.home() / ".cache" / "avatar") / "lpips"
-
-
-def _folder_with(net: Net) -> Path:
-    """The first folder that holds weights of this network: $AVATAR_LPIPS or the cache's, then those of $AVATAR_MODELS."""
-    own = lpips_folder()
-    names = {f"lpips_{net}.safetensors"}, {file.name for file in LPIPS_FILES[net]}
-    for folder in (own, *search_folders()):
-        if any(all((folder / name).is_file() for name in wanted) for wanted in names):
-            return folder
-    return own
 
 
 def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False) -> Lpips:
@@ -54,10 +43,10 @@ def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False)
     """
     if net not in NETS:
         raise UserError(f"LPIPS network must be one of {', '.join(NETS)}, not {net!r}")
-    place = _folder_with(net) if weights is None else Path(weights)
+    place = lpips_place(net) if weights is None else Path(weights)
     if place.is_file():
         return from_state(net, _read_safetensors(place), place)
-    converted = place / f"lpips_{net}.safetensors"
+    converted = place / converted_lpips(net)
     if converted.is_file():
         return from_state(net, _read_safetensors(converted), converted)
     backbone, heads = LPIPS_FILES[net]
@@ -114,7 +103,7 @@ def download_lpips(net: Net, folder: Path, files: tuple[ThirdPartyFile, ThirdPar
             for file in files:
                 fetch(file, temporary / file.name, folder / file.name)
             lpips = from_published(net, temporary, files)
-            converted = temporary / f"lpips_{net}.safetensors"
+            converted = temporary / converted_lpips(net)
             save_lpips(lpips, converted)
             converted.replace(folder / converted.name)
     except OSError as error:

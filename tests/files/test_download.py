@@ -139,7 +139,7 @@ def test_a_damaged_file_is_replaced_by_the_download(
         monkeypatch.setattr(command, "TRACKING_FILES", (file,))
         monkeypatch.setattr(command, "PAGE_FILES", ())
         monkeypatch.setattr(command, "NETS", ())
-        monkeypatch.setattr(command, "FETCHED_BY_DEFAULT", ())
+        monkeypatch.setattr(command, "FETCHED_LPIPS", ())
         assert main(["models"]) == 1
         assert main(["models", "--download"]) == 0
         said = capsys.readouterr().out
