@@ -22,7 +22,7 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.data_unpickler import DataUnpickler
 from avatar.files.opening import open_file, read_bytes
-from avatar.files.pickled_data import Budget, Refused, plain
+from avatar.files.pickled_data import Budget, Refused, is_unicode, plain
 
 MAX_FILE_BYTES = 2**30  # FLAME's largest pickle has 53 MB
 MIN_BUDGET_BYTES = 2**26
@@ -100,6 +100,8 @@ def _parse_npy(data: bytes, path: Path) -> np.ndarray:
         if min(shape, default=0) < 0 or needed != given:
             raise UserError(f"{path} is damaged: an array of shape {list(shape)} needs {needed} bytes, it has {given}")
         flat = np.frombuffer(data, dtype, offset=stream.tell())
+        if not is_unicode(flat):
+            raise UserError(f"{path} is damaged: it holds text that is not Unicode")
         return flat.reshape(shape, order="F" if is_fortran else "C").copy()
     except (*_MALFORMED, SyntaxError, tokenize.TokenError) as error:
         raise UserError(f"{path} is damaged or holds no numpy arrays ({_short(error)})") from error

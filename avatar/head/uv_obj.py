@@ -6,6 +6,7 @@ faces; so the three kinds of line that matter are read here.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.opening import read_bytes
 
-MAX_BYTES = 2**26  # FLAME's template has 1.5 MB
+MAX_BYTES, MAX_LINE = 2**25, 10_000  # FLAME's template has 1.5 MB
 
 
 def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -21,14 +22,16 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
 
     Raises UserError when the OBJ has no UVs or another topology than the model.
     """
-    text = read_bytes(file, MAX_BYTES).decode(errors="replace")
+    lines = io.BytesIO(read_bytes(file, MAX_BYTES))
     uvs: list[tuple[float, float]] = []
     corners: list[list[tuple[int, int]]] = []
     positions = 0
     number = 0
     try:
-        for number, line in enumerate(text.split("\n"), start=1):  # noqa: B007 (the message names the line)
-            kind, _, rest = line.partition(" ")
+        for number, line in enumerate(lines, start=1):  # noqa: B007 (the message names the line)
+            if len(line) > MAX_LINE:
+                raise ValueError("no line is so long")
+            kind, _, rest = line.decode(errors="replace").partition(" ")
             if kind == "v":
                 positions += 1
             elif kind == "vt":

@@ -94,6 +94,8 @@ def _open_writer(folder: Path, start: int) -> SummaryWriter | None:
         return SummaryWriter(str(folder), purge_step=start)
     except MissingPackage as missing:
         print(f"Note: {missing}")
+    except ImportError as error:  # a package that it needs is of another version
+        print(f"Note: curves are not recorded: tensorboard cannot be imported ({error})")
     except UnicodeEncodeError:
         print(f"Note: curves are not recorded: tensorboard cannot write to {folder}, whose name is not UTF-8")
     return None
