@@ -13,7 +13,7 @@ import avatar
 from avatar.compute.present import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError
-from avatar.files.opening import is_there
+from avatar.files.opening import check_file, is_there
 from avatar.files.third_party import (
     FETCHED_LPIPS,
     HEAD_VARIABLE,
@@ -150,6 +150,7 @@ def lpips(net: str) -> Finding:
         from safetensors import SafetensorError, safe_open
 
         if converted.is_file():
+            check_file(converted, None)
             try:
                 with safe_open(converted, framework="np"):
                     return
