@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -59,6 +60,9 @@ def run() -> NoReturn:
     While libraries are imported, an exception would come out of the middle of them, and some print it themselves; nothing
     is lost by leaving at once. At the end Python's own clearing up is as little to be interrupted by an exception.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file's name may hold what a terminal cannot show
     try:
         interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is to be ignored
         if interruptible:

@@ -11,7 +11,6 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from pathlib import Path
 from typing import Any, get_type_hints
 
 from hydra import compose, initialize_config_dir
@@ -20,7 +19,16 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from avatar.config_values import cause, check_choice, check_device, check_range, checked_value, shown, typed_value
+from avatar.config_values import (
+    cause,
+    check_choice,
+    check_device,
+    check_range,
+    checked_value,
+    config_dir,
+    shown,
+    typed_value,
+)
 from avatar.data.background import Colour
 from avatar.errors import UserError
 
@@ -162,15 +170,6 @@ RANGES: dict[str, tuple[float, float]] = {
 _SHARES = "lr_final", "perceptual_start", "stray_share", "align_rate", "condition_noise"
 RANGES |= {f"trainer.{name}": (0, 1) for name in _SHARES}
 RANGES |= {f"trainer.learning_rates.{f.name}": (0.0, 10.0) for f in dataclasses.fields(LearningRates)}
-
-
-def config_dir() -> Path:
-    """The folder of YAML files: inside the package in a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    for candidate in (package / "configs", package.parent / "configs"):
-        if (candidate / "config.yaml").is_file():
-            return candidate
-    raise UserError(f"the configuration files are missing from the installation ({package / 'configs'})")
 
 
 def load_config(overrides: Sequence[str] = ()) -> Config:

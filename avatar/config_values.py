@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import types
+from pathlib import Path
 from typing import Any, Union, get_args, get_origin
 
 from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
@@ -12,6 +13,15 @@ from avatar.errors import UserError
 DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 _CONSTANTS = {"null": None, "~": None, "true": True, "false": False}
 _KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word", bool: "true or false"}
+
+
+def config_dir() -> Path:
+    """The folder of YAML files: inside the package in a wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    for candidate in (package / "configs", package.parent / "configs"):
+        if (candidate / "config.yaml").is_file():
+            return candidate
+    raise UserError(f"the configuration files are missing from the installation ({package / 'configs'})")
 
 
 def typed_value(text: str) -> int | float | bool | str | None:

@@ -1,97 +1,180 @@
-"""What this installation can do, what is missing, and how to get it."""
+"""What this installation can do, what is missing, and how to get it: a table, made without importing PyTorch."""
 
 from __future__ import annotations
 
 import os
 import platform
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-import torch
+from typing import NamedTuple
 
 import avatar
-from avatar.compute.choose import check_gpu, describe_gpu
-from avatar.config import config_dir
+from avatar.compute.present import has_gpu_driver
+from avatar.config_values import config_dir
 from avatar.errors import UserError
-from avatar.files.third_party import TRACKING_FILES, require
-from avatar.head.assets import load_head_assets
-from avatar.losses.lpips import load_lpips
-from avatar.runs.trained import HEAD_VARIABLE
-from avatar.splat import splat
-from avatar.types import Camera, Gaussians
+from avatar.files.opening import check_file, is_there
+from avatar.files.third_party import (
+    FETCHED_LPIPS,
+    HEAD_VARIABLE,
+    LPIPS_FILES,
+    TRACKING_FILES,
+    ThirdPartyFile,
+    check_sha256,
+    converted_lpips,
+    find,
+    lpips_folder,
+    lpips_place,
+    models_folder,
+    sha256_of,
+)
+
+DOWNLOAD = "avatar models --download"
+EXTRAS = {"mediapipe": ("track", "track videos"), "viser": ("view", "avatar view")} | dict.fromkeys(
+    ("matplotlib", "tensorboard"), ("plots", "curves, reports")
+)
+
+
+class Finding(NamedTuple):
+    name: str
+    state: str
+    advice: str = ""
+    addresses: tuple[str, ...] = ()  # of what is missing
+    is_broken: bool = False  # and every command needs it
 
 
 def diagnose(say: Callable[[str], None] = print) -> int:
-    """Print one line per finding. Returns 1 when something that every command needs does not work, else 0."""
-    say(f"avatar {avatar.__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
-    say(f"torch {torch.__version__}, {torch.get_num_threads()} threads, {os.cpu_count()} processors")
-    works = [
-        try_finding("compiled core", draw_one_splat, say),
-        try_finding("configuration", lambda: str(config_dir()), say),
-    ]
-    try_finding("video encoder", find_encoder, say)
-    try_finding("GPU", find_gpu, say)
-    try_finding("head model", find_default_head, say)
-    for file in TRACKING_FILES:
-        try_finding(Path(file.name).stem[:16], lambda file=file: f"found ({require(file)})", say)
-    try_finding("MediaPipe", find_mediapipe, say)
-    for net in ("vgg", "alex", "squeeze"):
-        try_finding(f"LPIPS {net}", lambda net=net: f"weights found ({type(load_lpips(net)).__name__})", say)
-    return 0 if all(works) else 1
+    """Print the table of findings and the addresses of what is missing.
+
+    Returns 1 when something that every command needs does not work, else 0.
+    """
+    found = [*essentials(), gpu(), head_model(), *map(model_file, TRACKING_FILES), *map(lpips, LPIPS_FILES)]
+    found += [package(name) for name in EXTRAS]
+    system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
+    say(f"avatar {avatar.__version__}, Python {platform.python_version()}, {system}\n")
+    for line in table(found):
+        say(line)
+    if missing := [finding for finding in found if finding.addresses]:
+        say(f"\nAddresses: files go into {models_folder()}, those of LPIPS into {lpips_folder()}")
+        for finding in missing:
+            say("\n".join([f"  {finding.name}", *(f"    {address}" for address in finding.addresses)]))
+    return 1 if any(finding.is_broken for finding in found) else 0
 
 
-def try_finding(name: str, finding: Callable[[], str], say: Callable[[str], None]) -> bool:
-    """Say what `finding` returns or why it failed; every failure is a line, never a stack trace."""
-    try:
-        say(f"  {name:16} {finding()}")
-        return True
-    except (UserError, OSError, ImportError, RuntimeError, ValueError) as error:
-        say(f"  {name:16} {error}")
-        return False
+def table(found: list[Finding]) -> Iterator[str]:
+    rows = [("name", "state", "what to do"), *((f.name, f.state, f.advice) for f in found)]
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    for name, state, advice in rows:
+        yield f"{name:{widths[0]}}  {state:{widths[1]}}  {advice}".rstrip()
 
 
-def draw_one_splat() -> str:
-    camera = Camera(torch.eye(3), torch.zeros(3), 8.0, 8.0, 4.0, 4.0, 8, 8)
-    one = Gaussians(
-        torch.tensor([[0.0, 0.0, 1.0]]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        torch.full((1, 3), 0.2),
-        torch.tensor([0.9]),
-        torch.zeros(1, 1, 3),
-    )
-    alpha = float(splat(one, camera, torch.zeros(3)).alpha[4, 4])
-    if not 0.8 < alpha < 0.9:
-        raise RuntimeError(
-            f"drew a splat of opacity 0.9 with alpha {alpha:.3f}; the compiled core is broken, reinstall it"
-        )
-    return f"draws ({Path(sys.modules['avatar._core'].__file__ or '').name})"
+def essentials() -> Iterator[Finding]:
+    for name, find_out, advice in (
+        ("PyTorch", lambda: version("torch"), "install the program again"),
+        ("compiled core", draw_one_triangle, "install the program again"),
+        ("configuration", lambda: "found" if config_dir() else "", "install the program again"),
+        ("video encoder", find_encoder, "pip install imageio-ffmpeg"),
+    ):
+        try:
+            yield Finding(name, find_out())
+        except (UserError, PackageNotFoundError, OSError, ImportError, RuntimeError, ValueError) as error:
+            yield Finding(name, "broken", f"{advice} ({error})", is_broken=name != "video encoder")
+
+
+def draw_one_triangle() -> str:
+    import numpy as np
+
+    from avatar.head.rasterize import rasterize_mesh
+
+    corners = np.array([[0, 0, 1], [8, 0, 1], [0, 8, 1]], np.float32)
+    raster = rasterize_mesh(corners, np.array([[0, 1, 2]]), 8, 8)
+    if raster.face_id[1, 1] != 0 or raster.face_id[7, 7] != -1:
+        raise RuntimeError("it draws a triangle wrongly")
+    return "works"
 
 
 def find_encoder() -> str:
     import imageio_ffmpeg
 
-    return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+    return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version().partition('-')[0]}"
 
 
-def find_mediapipe() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
+def gpu() -> Finding:
+    """Tested only where there is a driver: that takes PyTorch and some seconds."""
+    if not has_gpu_driver():
+        return Finding("GPU", "none", "nothing: training takes the processor")
     try:
-        return version("mediapipe")
-    except PackageNotFoundError:
-        return "not installed, so videos cannot be tracked: pip install 'hyperavatar[track]'"
+        return Finding("GPU", find_gpu())
+    except (UserError, OSError, ImportError, RuntimeError, ValueError) as error:
+        return Finding("GPU", "not used", str(error))
 
 
 def find_gpu() -> str:
+    import torch
+
+    from avatar.compute.choose import check_gpu, describe_gpu
+
     device = torch.device("cuda", 0)
     check_gpu(device)
     return f"{describe_gpu(device)}: computes what the CPU does"
 
 
-def find_default_head() -> str:
+def head_model() -> Finding:
     named = os.environ.get(HEAD_VARIABLE)
     if not named:
-        return f"{HEAD_VARIABLE} is not set; give --head, or put head_model/ into the subject"
-    assets = load_head_assets(Path(named))
-    return f"{named}: {assets.num_vertices} vertices, {assets.num_expressions} expressions"
+        return Finding(
+            "head model", "not set", f"give --head, set {HEAD_VARIABLE}, or put head_model/ into the subject"
+        )
+    path = Path(named)
+    if not is_there(path):
+        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {named}, which does not exist")
+    if path.is_dir() and not any(file.suffix in (".pkl", ".npz") for file in path.iterdir()):
+        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {named}, which holds no .pkl or .npz")
+    return Finding("head model", "found")
+
+
+def model_file(file: ThirdPartyFile) -> Finding:
+    optional = "optional: " if file.is_optional else ""
+    path = find(file)
+    if path is None:
+        return Finding(file.name, "missing", f"{optional}{DOWNLOAD}", (file.url,))
+    return state_of(file.name, lambda: check_sha256(file, sha256_of(path, file.max_bytes), str(path)), DOWNLOAD)
+
+
+def lpips(net: str) -> Finding:
+    name, place = f"LPIPS {net}", lpips_place(net)
+    advice = DOWNLOAD if net in FETCHED_LPIPS else "optional: put its two files into the folder below"
+    converted, published = place / converted_lpips(net), [(file, place / file.name) for file in LPIPS_FILES[net]]
+
+    def check() -> None:
+        from safetensors import SafetensorError, safe_open
+
+        if converted.is_file():
+            check_file(converted, None)
+            try:
+                with safe_open(converted, framework="np"):
+                    return
+            except SafetensorError as error:
+                raise UserError(f"{converted} is damaged ({error})") from None
+        for file, path in published:
+            check_sha256(file, sha256_of(path, file.max_bytes), str(path))
+
+    if converted.is_file() or all(path.is_file() for _, path in published):
+        return state_of(name, check, advice)
+    return Finding(name, "missing", advice, tuple(file.url for file in LPIPS_FILES[net]))
+
+
+def state_of(name: str, check: Callable[[], None], advice: str) -> Finding:
+    try:
+        check()
+    except (UserError, OSError) as error:
+        return Finding(name, "damaged", f"{advice} ({str(error).partition(';')[0]})")
+    return Finding(name, "found")
+
+
+def package(name: str) -> Finding:
+    extra, purpose = EXTRAS[name]
+    try:
+        return Finding(name, version(name))
+    except PackageNotFoundError:
+        return Finding(name, "missing", f"{purpose}: pip install 'hyperavatar[{extra}]'")

@@ -25,6 +25,7 @@ import numpy as np
 
 from avatar.errors import UserError, refuse
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from data_prep.frame_files import FrameFiles, KindNames, find_numbered
@@ -61,7 +62,7 @@ class TrackingInfo:
 
 
 def recognise(folder: Path) -> bool:
-    return (folder / INFO_FILE).is_file()
+    return is_there(folder / INFO_FILE)
 
 
 def open_folder(folder: Path) -> TrackedFolder:

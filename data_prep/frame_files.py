@@ -152,7 +152,7 @@ def _numbered(
     with os.scandir(folder) as entries:
         for entry in sorted(entries, key=lambda e: e.name):
             stem, suffix = Path(entry.name).stem, Path(entry.name).suffix
-            if entry.name.startswith(".") or suffix.lower() not in suffixes or not entry.is_file():
+            if entry.name.startswith(".") or suffix.lower() not in suffixes or entry.is_dir():
                 continue
             if not stem.lower().endswith(tag):
                 continue

@@ -10,11 +10,10 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets, load_head_assets
 from data_prep import avatar_track
 from data_prep.prepare import prepare
-
-HEAD_VARIABLE = "AVATAR_HEAD"
 
 
 def find_head(folder: Path, given: Path | None = None) -> Path:

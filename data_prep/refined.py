@@ -27,6 +27,8 @@ from avatar.data.recording import Recording
 from avatar.data.refinement import Refinement
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.names import shortened
+from avatar.files.opening import is_there
 from data_prep import avatar_track
 from data_prep.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
 from data_prep.tracked_folder import TrackedFolder
@@ -42,7 +44,7 @@ def open_folder(folder: Path) -> TrackedFolder:
     """A folder of avatar track, refined or not. Raises UserError for one that is not whole."""
     tracked = avatar_track.open_folder(folder)
     path = folder / REFINEMENT_FILE
-    if not path.is_file():
+    if not is_there(path):
         return tracked
     raw = read_json(path)
     if not isinstance(raw, dict) or raw.get("version") != VERSION:
@@ -93,7 +95,7 @@ def write_folder(
     check_target(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        building = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}-", dir=target.parent))
     except OSError as error:
         raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another --out") from None
     try:

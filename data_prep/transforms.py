@@ -7,7 +7,6 @@ has moved a part of a larger data set, writes one.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ import numpy as np
 from avatar.data.images import IMAGE_SUFFIXES
 from avatar.data.source import MAX_FPS
 from avatar.errors import UserError, refuse
+from avatar.files import opening
 from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
 
 SPLITS = ("train", "val", "test")
@@ -103,9 +103,9 @@ def read_listings(folder: Path) -> list[ListedFrame]:
         split: path
         for split in SPLITS
         for path in (folder / f"transforms_{split}.json", folder / split / "flame_params.json")
-        if path.is_file()
+        if opening.is_there(path)
     }
-    whole = [path for path in (folder / "transforms.json", folder / "flame_params.json") if path.is_file()]
+    whole = [path for path in (folder / "transforms.json", folder / "flame_params.json") if opening.is_there(path)]
     frames: dict[Path, ListedFrame] = {}
     for split in sorted(divided, key=("val", "train", "test").index):
         frames |= _read_listing(divided[split], split, folder)
@@ -154,12 +154,9 @@ def _read_listing(file: Path, split: str | None, root: Path) -> dict[Path, Liste
 def read_json(file: Path) -> Any:
     """Raises UserError when the file is unreadable, larger than a listing can be, or nested like no listing is."""
     try:
-        if file.stat().st_size > MAX_BYTES:
-            raise UserError(f"{file} has more than {MAX_BYTES} bytes; no listing of frames has")
-        return json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UserError(f"{file} cannot be read as JSON ({reason}); copy or export it again") from None
+        return opening.read_json(file, MAX_BYTES)
+    except UserError as error:
+        raise UserError(f"{error}; copy or export it again") from None
 
 
 def _natural(path: Path) -> tuple[Any, ...]:

@@ -14,10 +14,11 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.compute.choose import choose_device
 from avatar.compute.device import CPU
 from avatar.config_values import check_device
-from avatar.errors import UserError
+from avatar.errors import UserError, check_installed
 
 
 def run_bench(arguments: Namespace) -> int:
+    check_installed("a benchmark's plot", "plots", "matplotlib")
     out: Path = arguments.out
     device = bench_device(arguments.part, arguments.device)
     check_folder_output(out)

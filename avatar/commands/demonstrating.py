@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands import OK
+from avatar.commands.measuring import writing_figures
 from avatar.commands.opening import open_driver, open_run, open_trained
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.tracking import bar, can_track
@@ -69,7 +70,8 @@ def run_demo(arguments: Namespace) -> int:
         return status
     trained = open_trained(run)
     video = reenact(trained, open_driver(driver, trained), run / "reenact" / "driver-relative.mp4")
-    results = evaluate(open_run(run), None, write_frames=False)
+    with writing_figures(run):
+        results = evaluate(open_run(run), None, write_frames=False)
     page = write_page(trained, out / "avatar.html")
     print("\nThe demo is done. Look at")
     if (film := out / f"{ACTOR.name}.mp4").is_file():

@@ -10,6 +10,7 @@ from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.commands.tracking import is_video, tracked_once
 from avatar.compute.choose import choose_device
+from avatar.files.names import safe_name
 from avatar.files.video import VIDEO_SUFFIXES
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
@@ -56,7 +57,7 @@ def head_of(arguments: Namespace, trained: TrainedAvatar) -> Path:
 def default_video(avatar: Path, driver: Path, choices: Choices) -> Path:
     """RUN/reenact/DRIVER-TRANSFER.mp4; reenact/... in the current folder for an avatar that is a file alone."""
     folder = avatar if (avatar / RUN_FILE).is_file() else Path()
-    return folder / "reenact" / f"{driver.resolve().stem}-{choices.transfer}.mp4"
+    return folder / "reenact" / f"{safe_name(driver.resolve().stem)}-{choices.transfer}.mp4"
 
 
 def run_drive_file(arguments: Namespace) -> int:

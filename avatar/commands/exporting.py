@@ -21,6 +21,7 @@ from avatar.export.movie import write_movie
 from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
+from avatar.files.names import shortened
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.trained import TrainedAvatar
@@ -154,7 +155,7 @@ def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | N
 
 
 def numbered(out: Path, number: int) -> Path:
-    return out.with_name(f"{out.stem}-{number:05d}{out.suffix}")
+    return out.with_name(f"{shortened(out.stem)}-{number:05d}{out.suffix}")
 
 
 def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:

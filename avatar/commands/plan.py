@@ -18,6 +18,7 @@ from avatar.data.manifest import parse_number
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import read_json
 from avatar.refine.refine import estimated_seconds
 from avatar.train.align import WITH_REFINEMENT
 from avatar.train.cost import measure_cost
@@ -70,10 +71,7 @@ class Plan:
     def load(cls, run: Path) -> Plan:
         """Raises UserError for a file that `save` did not write."""
         path = plan_file(run)
-        try:
-            raw = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise UserError(f"{path} cannot be read ({error})") from None
+        raw = read_json(path)
         if not isinstance(raw, dict) or raw.get("format") != PLAN_FORMAT:
             raise UserError(f"{path} was written by another version of this program; start a new run")
         try:

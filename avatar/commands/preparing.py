@@ -14,7 +14,7 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.errors import UserError
+from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
 from avatar.train.cost import measure_cost
 from data_prep.check.folder import Check, as_text, check_tracked_folder
@@ -43,6 +43,7 @@ def run_check(arguments: Namespace) -> int:
     if arguments.out is not None:
         check_folder_output(arguments.out)
         check_outputs([arguments.out], [arguments.folder, arguments.head, arguments.tracking])
+        check_installed("the page of --out", "plots", "matplotlib")
     outcome = check_tracked_folder(
         arguments.folder,
         lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
@@ -56,7 +57,7 @@ def run_check(arguments: Namespace) -> int:
     )
     print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))
     if arguments.out is not None:
-        from data_prep.check.page import write_page  # imports matplotlib, which takes half a second
+        from data_prep.check.page import write_page
 
         page = write_page(outcome, training_facts(outcome), arguments.out)
         print(f"Page   {page}", file=sys.stderr if arguments.json else sys.stdout)

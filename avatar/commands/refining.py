@@ -15,6 +15,7 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.plan import FIRST_PASSES
 from avatar.compute.choose import choose_device
 from avatar.data.refinement import Refinement, Round
+from avatar.files.names import shortened
 from avatar.refine.record import frames_csv, sheet, summary
 from avatar.refine.refine import fingerprint, refine_subject
 from avatar.runs.run import Run
@@ -46,7 +47,7 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
         f"{len(subject.split.train)} of them"
     )
     begin = time.monotonic()
-    progress = target.with_name(f".{target.name}.progress.safetensors")
+    progress = target.with_name(f".{shortened(target.name)}.progress.safetensors")
     refined = refine_subject(run.avatar, subject, config.data.size, background, progress)
     if refined is None:
         print(f"\nInterrupted; what is done is saved in {progress}. The same command goes on from there.")

@@ -8,22 +8,22 @@ from collections.abc import Callable
 from avatar.commands import OK
 from avatar.errors import UserError
 from avatar.files.third_party import (
+    FETCHED_LPIPS,
     LPIPS_FILES,
     PAGE_FILES,
     TRACKING_FILES,
     ThirdPartyFile,
-    check_sha256,
     download,
     find,
+    lpips_folder,
     models_folder,
+    require,
     search_folders,
-    sha256_of,
 )
-from avatar.losses.lpips import MissingWeights, download_lpips, load_lpips, lpips_folder
+from avatar.losses.lpips import MissingWeights, download_lpips, load_lpips
 from avatar.losses.lpips_network import NETS, Net
 
 MISSING = 1
-FETCHED_BY_DEFAULT = ("squeeze",)  # what training and evaluation use; vgg is 528 MB and alex 233
 
 
 def run_models(arguments: Namespace, say: Callable[[str], object] = print) -> int:
@@ -50,7 +50,7 @@ def describe(file: ThirdPartyFile, say: Callable[[str], object]) -> bool:
         say(f"  SHA-256 {file.sha256}")
         return file.is_optional
     try:
-        check_sha256(file, sha256_of(path), str(path))
+        require(file)
     except UserError as error:
         say(f"  {error}")
         return False
@@ -68,22 +68,30 @@ def describe_lpips(net: Net, say: Callable[[str], object]) -> bool:
     except MissingWeights:
         for file in (backbone, heads):
             say(f"  missing: put {file.url} as {lpips_folder() / file.name}")
-        return net not in FETCHED_BY_DEFAULT
+        return net not in FETCHED_LPIPS
     except UserError as error:
         say(f"  {error}")
         return False
 
 
 def fetch_missing(say: Callable[[str], object]) -> None:
-    """Download what is not there. Raises UserError, with where to put the file by other means, when that fails."""
+    """Download what is not there or is damaged. Raises UserError, with where to put the file by other means, when that
+    fails.
+    """
     for file in (*TRACKING_FILES, *PAGE_FILES):
-        if find(file) is None:
+        try:
+            require(file)
+        except UserError as error:
+            if find(file) is not None:
+                say(str(error))
             say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download(file)
-    for net in FETCHED_BY_DEFAULT:
+    for net in FETCHED_LPIPS:
         try:
             load_lpips(net)
-        except MissingWeights:
+        except UserError as error:
+            if not isinstance(error, MissingWeights):
+                say(str(error))
             for file in LPIPS_FILES[net]:
                 say(f"fetching {file.name} ({file.megabytes:g} MB, {file.licence}) from {file.url}")
             download_lpips(net, lpips_folder())

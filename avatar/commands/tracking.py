@@ -12,6 +12,7 @@ from tqdm import tqdm
 from avatar.commands import OK
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
+from avatar.files.names import safe_name
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.avatar_track import read_info, recognise
@@ -65,7 +66,7 @@ def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> P
     """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing."""
     assets = assets or load_head_assets(head)
     key = hash_of([STAGES_VERSION, open_footage(video).content_hash(), assets.fingerprint])[:12]
-    folder = cache_folder() / "tracked" / f"{video.resolve().stem}-{key}"
+    folder = cache_folder() / "tracked" / f"{safe_name(video.resolve().stem)}-{key}"
     if recognise(folder) and read_info(folder).head_fingerprint == assets.fingerprint:
         print(f"using the tracking {folder}")
         return folder

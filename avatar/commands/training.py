@@ -168,7 +168,8 @@ def finish_training(
     print(f"Trained in {seconds:.0f} s ({rate}).")
     print(f"Avatar       {run / 'avatar.safetensors'}")
     print(f"Previews     {run / 'previews'}")
-    print(f"Curves       tensorboard --logdir {run / 'tensorboard'}")
+    if next((curves := run / "tensorboard").glob("events*"), None) is not None:
+        print(f"Curves       tensorboard --logdir {curves}")
     print(f"Next         avatar eval {run}")
     return OK
 

@@ -8,11 +8,11 @@ import subprocess
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import torch
 
 from avatar.compute.device import CPU
+from avatar.compute.present import has_gpu_driver
 from avatar.config_values import check_device
 from avatar.errors import UserError
 
@@ -57,7 +57,7 @@ def _ready(device: torch.device, say: Callable[[str], None]) -> torch.device:
 
 def sees_gpu() -> bool:
     """Whether this machine has a GPU, be it one that torch cannot use."""
-    return torch.cuda.is_available() or Path("/dev/nvidiactl").exists() or Path("/dev/kfd").exists()
+    return torch.cuda.is_available() or has_gpu_driver()
 
 
 def describe_gpu(device: torch.device) -> str:

@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files import opening
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 MAX_PIXELS = 2**26  # 8192x8192; a decoder allocates what the header says before it looks how much there is
+MAX_BYTES = 2**28  # of a file
 _TAIL = 4096  # some writers pad after the end marker
 
 
@@ -77,10 +79,8 @@ def _transparency(data: bytes, path: Path) -> np.ndarray | None:
 
 
 def read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from None
+    """The bytes of an image file. Raises UserError naming it."""
+    return opening.read_bytes(path, MAX_BYTES)
 
 
 def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:

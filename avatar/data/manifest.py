@@ -14,6 +14,8 @@ from typing import Any
 
 from avatar.data.refinement import Refinement
 from avatar.errors import UserError
+from avatar.files.names import safe_name
+from avatar.files.opening import MissingFile, read_json
 
 MANIFEST_VERSION = 4
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
@@ -66,13 +68,11 @@ def read_manifest(prepared: Path) -> Manifest:
     """Read and check `prepared/manifest.json`. Raises UserError with the file and what is wrong with it."""
     file = Path(prepared) / MANIFEST_FILE
     try:
-        if file.stat().st_size > _MAX_BYTES:
-            raise UserError(f"{file} is larger than a manifest can be; prepare the subject again")
-        raw = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        raw = read_json(file, _MAX_BYTES)
+    except MissingFile:
         raise UserError(f"{prepared} is not a prepared subject: it has no {MANIFEST_FILE}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{file} cannot be read ({error}); prepare the subject again") from None
+    except UserError as error:
+        raise UserError(f"{error}; prepare the subject again") from None
     if not isinstance(raw, dict) or raw.get("version") != MANIFEST_VERSION:
         version = raw.get("version") if isinstance(raw, dict) else None
         raise UserError(
@@ -89,7 +89,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
     frames = tuple(_parse_frame(entry) for entry in _of(raw, "frames", list))
     count = len(frames)
     manifest = Manifest(
-        name=_of(raw, "name", str),
+        name=safe_name(_of(raw, "name", str)),
         format=_of(raw, "format", str),
         source=_of(raw, "source", str),
         tracking=_of(raw, "tracking", str),

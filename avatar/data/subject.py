@@ -11,18 +11,18 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from avatar.data.images import read_image, read_mask, read_matte
 from avatar.data.manifest import GIVEN, TRACKS_FILE, FrameRecord, Manifest, read_manifest
 from avatar.data.recording import Recording, checked_tracks
 from avatar.data.split import Split
+from avatar.data.tensor_file import read_tensors
 from avatar.errors import UserError
 from avatar.types import Camera, Frame, HeadParams
 
 FAINTEST_MATTE = 10  # of 255: below it a JPEG matte is noise, not foreground
+_MAX_TRACKS = 2**30  # bytes
 _LONGEST_SHOWN = 1000  # characters of a path in a sentence
 
 
@@ -184,11 +184,9 @@ class Subject:
 def _read_tracks(file: Path, manifest: Manifest) -> tuple[dict[str, Tensor], dict[str, Tensor] | None]:
     """The tracks, and what they were before their refinement."""
     try:
-        tracks = load_file(file)
-    except FileNotFoundError:
-        raise UserError(f"{file} is missing; prepare the subject again") from None
-    except (SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{file} is damaged ({error}); prepare the subject again") from None
+        tracks = read_tensors(file, _MAX_TRACKS)
+    except UserError as error:
+        raise UserError(f"{error}; prepare the subject again") from None
     count = len(manifest.frames)
     given = {name.removeprefix(GIVEN): value for name, value in tracks.items() if name.startswith(GIVEN)}
     try:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,10 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.evaluation.bootstrap import BlockBootstrap, Interval
+from avatar.evaluation.earlier import MAX_TABLE_BYTES
 from avatar.evaluation.evaluate import RESULTS_FORMAT
+from avatar.evaluation.protocol import NAME
+from avatar.files.opening import MissingFile, read_bytes, read_json
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "protocols"}  # of results.json
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
@@ -38,9 +40,9 @@ class Evaluation:
         """Name of the frame -> figures, in the order of the video, as frames.csv holds them."""
         path = self.folder / protocol / "frames.csv"
         try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise UserError(f"{path} cannot be read ({error.strerror}); evaluate the run again") from None
+            data = read_bytes(path, MAX_TABLE_BYTES)
+        except UserError as error:
+            raise UserError(f"{error}; evaluate the run again") from None
         entry = self.results["protocols"][protocol]
         if hashlib.sha256(data).hexdigest() != entry["frames_sha256"]:
             raise UserError(f"{path} is not the file that results.json was written with; evaluate the run again")
@@ -110,15 +112,18 @@ def compare_runs(runs: Sequence[Path], protocols: Sequence[str] | None = None) -
 def read_evaluation(label: str, run: Path) -> Evaluation:
     path = run / "eval" / "results.json"
     try:
-        results = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        results = read_json(path)
+    except MissingFile:
         raise UserError(f"{run} was not evaluated (there is no {path}): run avatar eval {run} first") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read ({error}); evaluate the run again") from None
+    except UserError as error:
+        raise UserError(f"{error}; evaluate the run again") from None
     if not isinstance(results, dict) or results.get("format") != RESULTS_FORMAT:
         raise UserError(f"{path} was written by another version of this program; evaluate the run again")
     if missing := NEEDED - results.keys():
         raise UserError(f"{path} is damaged ({', '.join(sorted(missing))} missing); evaluate the run again")
+    names = results["protocols"]
+    if not isinstance(names, dict) or not all(NAME.fullmatch(name) for name in names):  # they name folders
+        raise UserError(f"{path} is damaged (the names of its protocols); evaluate the run again")
     return Evaluation(label, path.parent, results)
 
 

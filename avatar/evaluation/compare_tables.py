@@ -99,7 +99,7 @@ FORMATS: dict[str, tuple[str, Callable[[Comparison], str]]] = {
 def write_tables(folder: Path, comparison: Comparison) -> None:
     """folder/compare.{txt,md,tex,csv}; UserError when the disk refuses."""
     for suffix, table in FORMATS.values():
-        write_atomically(folder / f"compare.{suffix}", table(comparison).encode())
+        write_atomically(folder / f"compare.{suffix}", table(comparison).encode(errors="backslashreplace"))
 
 
 def _caption(each: ProtocolComparison, first: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from avatar.errors import check_installed
 from avatar.evaluation.protocol import REGIONS, Protocol, column
 from avatar.evaluation.results import FrameResult
 
@@ -15,7 +16,9 @@ def curves(protocols: Sequence[Protocol], results: Mapping[str, Sequence[FrameRe
     """A PNG file: main PSNR and SSIM of each protocol, PSNR by region, jitter and conditions against the frame's index.
 
     worst  indices of the first protocol's worst frames, marked on its PSNR.
+    Raises MissingPackage without matplotlib.
     """
+    check_installed("curves.png", "plots", "matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
     from matplotlib.figure import Figure
 

@@ -11,9 +11,11 @@ from typing import Any
 
 from avatar.errors import UserError
 from avatar.evaluation.pictures import clear_pictures
-from avatar.evaluation.protocol import Protocol
+from avatar.evaluation.protocol import NAME, Protocol
+from avatar.files.opening import read_bytes, read_json
 
 FRAMES_FILE = "frames.csv"
+MAX_TABLE_BYTES = 2**28  # of it
 # Of results.json: where these agree, figures by different protocols may stand side by side.
 _IDENTITY = ("format", "data_hash", "image_size", "head_fingerprint", "step", "config", "shared_choices")
 _NO_MATTER = ("threads",)  # of the versions: the figures are the same to rounding
@@ -22,13 +24,15 @@ _NO_MATTER = ("threads",)  # of the versions: the figures are the same to roundi
 def earlier_results(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
     """Entries by other protocols that RUN/eval holds of what `results` are about, with their tables of frames in place."""
     try:
-        earlier = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        earlier = read_json(folder / "results.json")
         if _identity(earlier) != _identity(json.loads(json.dumps(results))):
             return {}
         asked = {*results["protocols"], *results["left_out"]}
-        others = {name: entry for name, entry in earlier["protocols"].items() if name not in asked}
+        others = {
+            name: entry for name, entry in earlier["protocols"].items() if name not in asked and NAME.fullmatch(name)
+        }
         return {name: entry for name, entry in others.items() if _is_whole(folder / name, entry)}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):  # none, or not of this program
+    except (UserError, ValueError, KeyError, TypeError, AttributeError):  # none, or not of this program
         return {}
 
 
@@ -66,5 +70,5 @@ def _identity(results: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_whole(place: Path, entry: Mapping[str, Any]) -> bool:
     """Whether an entry can be read, and its table of frames is the one that it was written with."""
-    table = (place / FRAMES_FILE).read_bytes()
+    table = read_bytes(place / FRAMES_FILE, MAX_TABLE_BYTES)
     return bool(protocol_of(place.name, entry)) and hashlib.sha256(table).hexdigest() == entry["frames_sha256"]

@@ -2,7 +2,7 @@
 
     RUN/eval/results.json                  every choice, what was evaluated, means, intervals; by the protocols of earlier
                                            evaluations too, where they are of the same avatar and frames
-    RUN/eval/curves.png                    the figures along the video
+    RUN/eval/curves.png                    the figures along the video, where matplotlib is installed
     RUN/eval/worst.png                     truth, render and error of the first protocol's worst frames
     RUN/eval/truth_render_error.mp4        frames and background of the first protocol
     RUN/eval/<protocol>/frames.csv         the figures of each frame
@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from avatar.data.background import colour_name
 from avatar.data.loader import FrameLoader
-from avatar.errors import UserError
+from avatar.errors import MissingPackage, UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
@@ -137,10 +137,14 @@ def evaluate(
         write_atomically(folder / protocol.name / FRAMES_FILE, rows)
         summary["protocols"][protocol.name]["frames_sha256"] = hashlib.sha256(rows).hexdigest()
     worst = summary["protocols"][chosen[0].name]["worst"]
-    (folder / "worst.png").unlink(missing_ok=True)
+    for name in ("worst.png", "curves.png"):
+        (folder / name).unlink(missing_ok=True)
     if worst:  # none where every frame is drawn without an error
         write_atomically(folder / "worst.png", worst_sheet(run, renderer, chosen[0], worst))
-    write_atomically(folder / "curves.png", curves(chosen, results, [entry["frame"] for entry in worst]))
+    try:
+        write_atomically(folder / "curves.png", curves(chosen, results, [entry["frame"] for entry in worst]))
+    except MissingPackage as missing:
+        say(f"Note: {missing}")
     others = earlier_results(folder, summary)
     measured = [*chosen, *(protocol_of(name, entry) for name, entry in others.items())]
     whole = {

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-import yaml
-
-from avatar.config import config_dir
+from avatar.config_values import config_dir
 from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
 from avatar.data.split import Split
 from avatar.errors import UserError
+from avatar.files.plain_yaml import read_yaml
 from avatar.losses.lpips_network import Net
 
 Region = str  # one of REGIONS
@@ -29,6 +28,7 @@ Levels = Literal["round", "truncate", "float"]
 MEASURES = ("psnr", "ssim", "lpips")
 REGIONS: tuple[Region, ...] = ("head", "mouth", "eyes", "rest")
 HELD_OUT = "held-out"
+NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a protocol, and of its folder
 MAX_BYTES = 1 << 16  # of a protocol file: those that come with the program have 2 KB
 
 SHARED_CHOICES = {
@@ -139,7 +139,7 @@ def choose_protocols(given: Sequence[str] | None) -> list[Protocol]:
 def read_protocol(path: Path) -> Protocol:
     """The protocol of a file. Raises UserError naming the file and the key for anything that is not as it should be."""
     values = _read_yaml(path)
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", path.stem):
+    if not NAME.fullmatch(path.stem):
         raise UserError(f"{path}: the file's name names the protocol and a folder; use letters, digits, - and _ only")
     keys = [field.name for field in dataclasses.fields(Protocol) if field.name != "name"]
     for key in values:
@@ -156,37 +156,11 @@ def read_protocol(path: Path) -> Protocol:
     return protocol
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """YAML's plain values only: no object of Python, no alias (a small file could stand for gigabytes), no key twice."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases (*name) are not allowed")
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value]
-        if twice := next((key for key in keys if keys.count(key) > 1), None):
-            raise yaml.YAMLError(f"{twice!r} stands there twice")
-        return super().construct_mapping(node, deep)
-
-
 def _read_yaml(path: Path) -> dict[Any, Any]:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path} is larger than a protocol can be ({MAX_BYTES >> 10} KB)")
-        values = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not a YAML file ({_one_line(error)})") from None
+    values = read_yaml(path, MAX_BYTES)
     if not isinstance(values, dict):
         raise UserError(f"{path} is not a protocol: it has to hold lines of the form key: value")
     return values
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _text(path: Path, key: str, value: Any) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,10 +22,13 @@ from skimage.io import imread
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from tqdm import tqdm
 
+from avatar.data.images import MAX_BYTES
 from avatar.errors import UserError
+from avatar.evaluation.earlier import MAX_TABLE_BYTES
 from avatar.evaluation.pictures import MASK_FOLDERS
 from avatar.evaluation.protocol import column
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import read_bytes, read_json
 
 TOLERANCE = 2e-6  # frames.csv is rounded to 5e-7; both sides compute in float64
 _LEVELS = 255
@@ -47,7 +51,7 @@ def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[
     Says one line for each protocol. Raises UserError naming the first frame and figure that differ by more than
     `TOLERANCE`, a picture that is missing, or a table that results.json was not made from.
     """
-    summary = json.loads(_bytes(results))
+    summary = _again(lambda: read_json(results))
     for name, entry in summary["protocols"].items():
         if protocols is not None and name not in protocols:
             continue
@@ -74,7 +78,7 @@ def verify_protocol(folder: Path, entry: Mapping[str, Any]) -> tuple[Difference,
     `entry` is its part of results.json. Raises as `verify` does.
     """
     table = folder / "frames.csv"
-    content = _bytes(table)
+    content = _again(lambda: read_bytes(table, MAX_TABLE_BYTES))
     if hashlib.sha256(content).hexdigest() != entry["frames_sha256"]:
         raise UserError(f"{table} is not the table that results.json was made from; evaluate again")
     rows = list(csv.DictReader(content.decode().splitlines()))
@@ -189,17 +193,18 @@ def _mask(folder: Path, region: str, index: int, shape: tuple[int, ...]) -> Floa
 
 
 def _read(path: Path) -> Float[np.ndarray, "H W ..."]:
+    data = _again(lambda: read_bytes(path, MAX_BYTES))
     try:
-        return imread(path).astype(np.float64)
+        return imread(io.BytesIO(data)).astype(np.float64)
     except (OSError, ValueError, SyntaxError) as error:
         raise UserError(f"{path} cannot be read ({error}); evaluate again with --verify") from None
 
 
-def _bytes(path: Path) -> bytes:
+def _again(read: Callable[[], Any]) -> Any:
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}); evaluate again with --verify") from None
+        return read()
+    except UserError as error:
+        raise UserError(f"{error}; evaluate again with --verify") from None
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, distribution
 
 from avatar.errors import UserError
+from avatar.files.opening import read_bytes
 from avatar.files.third_party import FACE_LANDMARKER, TASKS_VISION, TASKS_VISION_VERSION, require
 
 PACK = "face-landmarker.js"
@@ -33,12 +34,12 @@ def make_pack() -> bytes:
     package, model = require(TASKS_VISION), require(FACE_LANDMARKER)
     files: dict[str, bytes] = {}
     try:
-        with tarfile.open(fileobj=io.BytesIO(package.read_bytes()), mode="r:gz") as archive:
+        with tarfile.open(fileobj=io.BytesIO(read_bytes(package, TASKS_VISION.max_bytes)), mode="r:gz") as archive:
             for name in MEMBERS:
                 member = archive.extractfile(f"package/{name}")
                 assert member is not None  # its SHA-256 has been checked
                 files[name.rpartition("/")[2]] = member.read()
-        files[FACE_LANDMARKER.name] = model.read_bytes()
+        files[FACE_LANDMARKER.name] = read_bytes(model, FACE_LANDMARKER.max_bytes)
     except OSError as error:
         raise UserError(f"{package} or {model} cannot be read ({error.strerror or error})") from None
     return encode_pack(files)

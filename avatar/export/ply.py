@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.splat.sh import MAX_DEGREE
 from avatar.types import Gaussians
 
@@ -24,7 +25,10 @@ LEAST_OPACITY = 1e-6  # a logit must be finite
 
 
 def encode_ply(gaussians: Gaussians, comment: str = "") -> bytes:
-    """The file's bytes. `comment` is text for people, kept in the header."""
+    """The file's bytes. `comment` is text for people, kept in the header.
+
+    Raises UserError for values that are not finite: finite parameters can stand for infinite sizes.
+    """
     N, coefficients = gaussians.sh.shape[:2]
     rest = torch.zeros(N, REST, 3)
     rest[:, : coefficients - 1] = gaussians.sh[:, 1:]
@@ -38,6 +42,9 @@ def encode_ply(gaussians: Gaussians, comment: str = "") -> bytes:
         torch.nn.functional.normalize(gaussians.quats, dim=1),
     ]
     values = torch.cat(columns, dim=1).numpy().astype("<f4")
+    if not (finite := np.isfinite(values)).all():
+        row, field = np.argwhere(~finite)[0]
+        raise UserError(f"Gaussian {row} of this frame has a {FIELDS[field]} of {values[row, field]}; train again")
     header = [
         "ply",
         "format binary_little_endian 1.0",

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from avatar.errors import UserError
 from avatar.export.drawing import ARRAYS, Drawing, reduce_avatar
 from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
@@ -58,7 +59,7 @@ class WebFile:
 
 
 def encode_avatar(trained: TrainedAvatar, precision: Precision = "small") -> WebFile:
-    """The file's bytes. "float" keeps every parameter as it is."""
+    """The file's bytes. "float" keeps every parameter as it is. Raises UserError for values that are not finite."""
     drawing = reduce_avatar(trained)
     blocks: list[bytes] = []
     entries: dict[str, Any] = {}
@@ -79,6 +80,8 @@ def encode_avatar(trained: TrainedAvatar, precision: Precision = "small") -> Web
         offset += len(data)
 
     for name in ARRAYS:
+        if not np.isfinite(drawing.arrays[name]).all():
+            raise UserError(f"the array {name} of {trained.source} would hold values that are not finite; train again")
         if precision == "small" and name in SMALL and drawing.arrays[name].size:
             add(name, *quantised(drawing.arrays[name], *SMALL[name]), by_row=SMALL[name][1] == "row")
         else:

@@ -10,9 +10,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.names import shortened
 
 _COUNTER = itertools.count()
-_HOST = re.sub(r"[^0-9A-Za-z_]", "_", platform.node())
+_HOST = re.sub(r"[^0-9A-Za-z_]", "_", platform.node())[:40]
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -38,7 +39,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def temporary_name(path: Path) -> Path:
     """A name beside `path` that no other process or call uses, with the same suffix: encoders go by it."""
-    return path.with_name(f".{path.stem}.{_HOST}-{os.getpid()}-{next(_COUNTER)}.partial{path.suffix}")
+    return path.with_name(f".{shortened(path.stem)}.{_HOST}-{os.getpid()}-{next(_COUNTER)}.partial{path.suffix[-20:]}")
 
 
 def is_running(pid: int) -> bool:
@@ -55,7 +56,7 @@ def is_running(pid: int) -> bool:
 def _remove_left_overs(path: Path) -> None:
     """Delete what writers of `path` that this machine's kernel no longer knows have left."""
     pattern = re.compile(
-        rf"\.{re.escape(path.stem)}\.{re.escape(_HOST)}-([0-9]+)-[0-9]+\.partial{re.escape(path.suffix)}"
+        rf"\.{re.escape(shortened(path.stem))}\.{re.escape(_HOST)}-([0-9]+)-[0-9]+\.partial{re.escape(path.suffix[-20:])}"
     )
     for other in path.parent.iterdir():
         if (match := pattern.fullmatch(other.name)) and not is_running(int(match[1])):

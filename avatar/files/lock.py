@@ -1,4 +1,4 @@
-"""One writer for each run folder."""
+"""One writer for each folder."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.opening import read_json
 
 try:
     import fcntl
@@ -20,10 +21,11 @@ LOCK_FILE = ".lock"
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, otherwise: str = "choose another --out") -> Iterator[None]:
     """Hold the folder's lock; the system lets go of it when the process ends, however it ends.
 
-    A folder that this made, and that nothing was written into, is gone afterwards.
+    A folder that this made, and that nothing was written into, is gone afterwards. `otherwise` is what a person can do
+    where it cannot be had.
 
     Raises UserError naming the process that holds it, and when the folder cannot be written.
     """
@@ -32,8 +34,10 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = _acquire(path)
+    except BlockingIOError:
+        raise UserError(f"{folder} is being written by {_holder(path)}; wait for it, or {otherwise}") from None
     except OSError as error:
-        raise UserError(f"{folder} cannot be written ({error.strerror}); choose another --out") from None
+        raise UserError(f"{folder} cannot be written ({error.strerror}); {otherwise}") from None
     try:
         yield
     finally:
@@ -46,6 +50,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _acquire(path: Path) -> int:
+    """Raises BlockingIOError where another process holds it."""
     while True:
         if fcntl is None:
             with suppress(OSError):
@@ -53,24 +58,20 @@ def _acquire(path: Path) -> int:
             try:
                 file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
             except FileExistsError:
-                raise _held(path) from None
+                raise BlockingIOError from None
         else:
-            file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)  # a link may name any file
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 os.close(file)
-                raise _held(path) from None
+                raise
             if not _is_same(file, path):  # its holder deleted it between our opening and locking it
                 os.close(file)
                 continue
         os.truncate(file, 0)
         os.write(file, json.dumps({"process": os.getpid(), "machine": platform.node()}).encode())
         return file
-
-
-def _held(path: Path) -> UserError:
-    return UserError(f"{path.parent} is being written by {_holder(path)}; wait for it, or choose another --out")
 
 
 def _is_same(file: int, path: Path) -> bool:
@@ -82,7 +83,7 @@ def _is_same(file: int, path: Path) -> bool:
 
 def _holder(path: Path) -> str:
     try:
-        holder = json.loads(path.read_text(encoding="utf-8"))
+        holder = read_json(path)
         return f"process {holder['process']} on {holder['machine']}"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (UserError, KeyError, TypeError):
         return "another process"

@@ -80,7 +80,17 @@ def make_array(shape: Any, dtype: Any, fortran: Any, raw: Any, budget: Budget) -
     budget.take(needed)
     raw = raw.encode("latin1") if isinstance(raw, str) else raw  # text is the bytes of a Python 2 pickle
     array = np.frombuffer(raw, dtype.value).reshape(shape, order="F" if fortran else "C")
+    if not is_unicode(array):
+        raise Refused("it holds text that is not Unicode")
     return array.astype(dtype.value.newbyteorder("="), order="C", copy=True)
+
+
+def is_unicode(array: np.ndarray) -> bool:
+    """Whether all text in an array can be made a str, and be written; true of arrays without text."""
+    if array.dtype.kind != "U" or array.dtype.itemsize == 0:
+        return True
+    codes = np.ascontiguousarray(array).view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
+    return bool(((codes <= 0x10FFFF) & ((codes < 0xD800) | (codes > 0xDFFF))).all())
 
 
 def make_tensor(storage: Any, offset: Any, size: Any, stride: Any, budget: Budget) -> np.ndarray:

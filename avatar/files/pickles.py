@@ -21,7 +21,8 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.data_unpickler import DataUnpickler
-from avatar.files.pickled_data import Budget, Refused, plain
+from avatar.files.opening import open_file, read_bytes
+from avatar.files.pickled_data import Budget, Refused, is_unicode, plain
 
 MAX_FILE_BYTES = 2**30  # FLAME's largest pickle has 53 MB
 MIN_BUDGET_BYTES = 2**26
@@ -68,13 +69,11 @@ def load_torch_pickle(source: Path | str | bytes, name: str | None = None) -> An
 def load_npz(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a .npz file; pickled objects inside are refused. Raises UserError naming the file."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_file(path, MAX_FILE_BYTES) as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             if sum(info.file_size for info in members) > MAX_FILE_BYTES:
                 raise UserError(f"{path} would unpack to more than {MAX_FILE_BYTES} bytes; such files are not read")
             return {info.filename.removesuffix(".npy"): _parse_npy(archive.read(info), path) for info in members}
-    except FileNotFoundError as error:
-        raise UserError(f"{path} does not exist") from error
     except (*_MALFORMED, *_BAD_ZIP, zlib.error) as error:
         raise UserError(f"{path} is damaged or not a .npz file ({_short(error)})") from error
 
@@ -101,6 +100,8 @@ def _parse_npy(data: bytes, path: Path) -> np.ndarray:
         if min(shape, default=0) < 0 or needed != given:
             raise UserError(f"{path} is damaged: an array of shape {list(shape)} needs {needed} bytes, it has {given}")
         flat = np.frombuffer(data, dtype, offset=stream.tell())
+        if not is_unicode(flat):
+            raise UserError(f"{path} is damaged: it holds text that is not Unicode")
         return flat.reshape(shape, order="F" if is_fortran else "C").copy()
     except (*_MALFORMED, SyntaxError, tokenize.TokenError) as error:
         raise UserError(f"{path} is damaged or holds no numpy arrays ({_short(error)})") from error
@@ -132,16 +133,7 @@ def _read(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
     if isinstance(source, bytes):
         data, name = source, name or "the data"
     else:
-        path = Path(source)
-        name = name or str(path)
-        try:
-            size = path.stat().st_size
-            if size > MAX_FILE_BYTES:
-                raise UserError(f"{name} has {size} bytes; files of more than {MAX_FILE_BYTES} bytes are not read")
-            with path.open("rb") as file:
-                data = file.read(size)  # a device has no size and no end
-        except OSError as error:
-            raise UserError(f"{name} cannot be read: {error.strerror}") from error
+        data, name = read_bytes(source, MAX_FILE_BYTES), name or str(source)
     if not data:
         raise UserError(f"{name} is empty; write or copy it again")
     return data, name

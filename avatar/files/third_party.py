@@ -9,16 +9,15 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-import urllib.error
-import urllib.request
 from pathlib import Path
 from typing import NamedTuple
 
-from tqdm import tqdm
-
 from avatar.errors import UserError
+from avatar.files.download import DownloadFailed, downloaded
+from avatar.files.opening import is_there, open_file
 
-FOLDER_VARIABLE = "AVATAR_MODELS"
+FOLDER_VARIABLE, HEAD_VARIABLE = "AVATAR_MODELS", "AVATAR_HEAD"
+FETCHED_LPIPS = ("squeeze",)  # what training and evaluation use; vgg is 528 MB and alex 233
 
 
 class ThirdPartyFile(NamedTuple):
@@ -29,6 +28,11 @@ class ThirdPartyFile(NamedTuple):
     licence: str = ""
     purpose: str = ""
     is_optional: bool = False
+
+    @property
+    def max_bytes(self) -> int:
+        """No file of this name has more: publishers round, to megabytes of either kind."""
+        return int(1.25 * self.megabytes * 2**20) + 2**20
 
 
 _MEDIAPIPE = "https://storage.googleapis.com/mediapipe-models/"
@@ -106,6 +110,27 @@ def models_folder() -> Path:
     return (Path(cache).expanduser() if cache else Path.home() / ".cache" / "avatar") / "models"
 
 
+def lpips_folder() -> Path:
+    """Where weights of LPIPS are looked for when the caller names no place: $AVATAR_LPIPS, else `lpips` in the cache."""
+    named = os.environ.get("AVATAR_LPIPS")
+    return Path(named).expanduser() if named else models_folder().with_name("lpips")
+
+
+def lpips_place(net: str) -> Path:
+    """The first folder that holds weights of this network: $AVATAR_LPIPS or the cache's, then those of $AVATAR_MODELS."""
+    own = lpips_folder()
+    names = {converted_lpips(net)}, {file.name for file in LPIPS_FILES[net]}
+    for folder in (own, *search_folders()):
+        if any(all((folder / name).is_file() for name in wanted) for wanted in names):
+            return folder
+    return own
+
+
+def converted_lpips(net: str) -> str:
+    """The name of a file with all weights of a network."""
+    return f"lpips_{net}.safetensors"
+
+
 def search_folders() -> list[Path]:
     """The folders that files are looked for in, in this order."""
     named = os.environ.get(FOLDER_VARIABLE)
@@ -118,8 +143,9 @@ def search_folders() -> list[Path]:
 
 
 def find(file: ThirdPartyFile) -> Path | None:
-    """The first place where a file of that name lies, whatever is in it."""
-    return next((path for folder in search_folders() if (path := folder / file.name).is_file()), None)
+    """The first place where the published file lies; where none does, the first where anything has its name."""
+    places = [path for folder in search_folders() if is_there(path := folder / file.name)]
+    return next((path for path in places if _is_published(file, path)), next(iter(places), None))
 
 
 def require(file: ThirdPartyFile) -> Path:
@@ -130,12 +156,22 @@ def require(file: ThirdPartyFile) -> Path:
             f"{file.name} ({file.purpose}; {file.licence}) is missing: run avatar models --download, or fetch "
             f"{file.url} and put it into {models_folder()} or the folder that ${FOLDER_VARIABLE} names"
         )
-    check_sha256(file, sha256_of(path), str(path))
+    check_sha256(file, sha256_of(path, file.max_bytes), str(path))
     return path
 
 
+def _is_published(file: ThirdPartyFile, path: Path) -> bool:
+    try:
+        check_sha256(file, sha256_of(path, file.max_bytes), str(path))
+    except UserError:
+        return False
+    return True
+
+
 def download(file: ThirdPartyFile) -> Path:
-    """Fetch a file from its publisher into `models_folder`, whole and checked or not at all. Raises UserError."""
+    """Fetch a file from its publisher into `models_folder`, whole and checked or not at all; what has its name there is
+    replaced. Raises UserError.
+    """
     target = models_folder() / file.name
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -151,27 +187,24 @@ def fetch(file: ThirdPartyFile, path: Path, target: Path) -> None:
     """Download to `path` and check it; `target` is where a person should put it who gets it by other means."""
     digest = hashlib.sha256()
     try:
-        with urllib.request.urlopen(file.url, timeout=30) as response, path.open("wb") as out:
-            size = int(response.headers.get("Content-Length") or 0) or None
-            with tqdm(total=size, unit="B", unit_scale=True, desc=file.name, leave=False) as bar:
-                while chunk := response.read(1 << 20):
-                    digest.update(chunk)
-                    out.write(chunk)
-                    bar.update(len(chunk))
-    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
-        reason = getattr(error, "reason", error)
-        raise UserError(f"cannot download {file.url} ({reason}); fetch it by other means to {target}") from error
+        with path.open("wb") as out:
+            for chunk in downloaded(file.url, file.max_bytes, file.name):
+                digest.update(chunk)
+                out.write(chunk)
+    except DownloadFailed as error:
+        raise UserError(f"cannot download {file.url} ({error}); fetch it by other means to {target}") from error
     check_sha256(file, digest.hexdigest(), file.url)
 
 
-def sha256_of(path: Path) -> str:
+def sha256_of(path: Path, limit: int | None = None) -> str:
+    """Of a file of at most `limit` bytes. Raises UserError where it cannot be read."""
     digest = hashlib.sha256()
-    try:
-        with path.open("rb") as opened:
+    with open_file(path, limit) as opened:
+        try:
             while chunk := opened.read(1 << 20):
                 digest.update(chunk)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from None
+        except OSError as error:
+            raise UserError(f"{path} cannot be read ({error.strerror})") from None
     return digest.hexdigest()
 
 

@@ -103,7 +103,7 @@ def _failing_as_user_error(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        raise UserError(f"the video {path} cannot be written ({error})") from error
+        raise UserError(f"the video {path} cannot be written ({getattr(error, 'strerror', None) or error})") from error
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: float) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.files.opening import is_there
 from avatar.files.pickles import load_npy, load_npz, load_pickle
 from avatar.head.expression_names import ExpressionNames, load_expression_names
 from avatar.head.unwrap import LAYOUT_METHOD, NoLayout, unwrap
@@ -138,14 +139,14 @@ def load_head_assets(path: Path) -> HeadAssets:
 
 def find_model_file(path: Path) -> Path:
     """The model file itself, or the one file of a folder that is a head model."""
-    if path.is_file():
-        return path
-    if not path.is_dir():
+    if not is_there(path):
         raise UserError(
             f"the head model {path} does not exist; give --head the model file or its folder "
             "(FLAME 2023 Open can be had from https://flame.is.tue.mpg.de)"
         )
-    named = [path / name for name in ("generic_model.pkl", "generic_model.npz") if (path / name).is_file()]
+    if not path.is_dir():
+        return path
+    named = [path / name for name in ("generic_model.pkl", "generic_model.npz") if is_there(path / name)]
     if named:
         return named[0]
     candidates = sorted(p for p in path.iterdir() if p.suffix in (".pkl", ".npz") and "mask" not in p.name.lower())
@@ -163,7 +164,7 @@ def find_model_file(path: Path) -> Path:
 def find_uv_obj(folder: Path) -> Path | None:
     """The OBJ with the UV layout that lies beside the model file, if there is one."""
     named = folder / "head_template.obj"
-    if named.is_file():
+    if is_there(named):
         return named
     candidates = sorted(folder.glob("*.obj"))
     if len(candidates) == 1:
@@ -216,7 +217,7 @@ def _read_eyelids(folder: Path, V: int) -> np.ndarray:
     eyelids = np.zeros((2, V, 3), np.float32)
     for side, name in enumerate(("l_eyelid.npy", "r_eyelid.npy")):
         file = folder / name
-        if not file.is_file():
+        if not is_there(file):
             continue
         eyelids[side] = _array({name: load_npy(file).squeeze()}, name, file, (V, 3))
     return eyelids
@@ -225,7 +226,7 @@ def _read_eyelids(folder: Path, V: int) -> np.ndarray:
 def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
     for name in ("FLAME_masks.pkl", "masks.npz"):
         file = folder / name
-        if not file.is_file():
+        if not is_there(file):
             continue
         regions = {}
         for region, indices in _read_arrays(file).items():

@@ -12,7 +12,6 @@ or the list of names alone. Without an entry of "arkit", a blendshape moves the 
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.errors import UserError
+from avatar.files.opening import is_there, read_json
 
 NAMES_FILE = "expression_names.json"
 JAW_TARGETS = ("jaw_x", "jaw_y", "jaw_z")
@@ -73,15 +73,9 @@ def load_expression_names(folder: Path, num_expressions: int) -> ExpressionNames
     Raises UserError for a file that is not of the form above, or that names coefficients that do not exist.
     """
     path = folder / NAMES_FILE
-    if not path.is_file():
+    if not is_there(path):
         return ExpressionNames()
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise UserError(f"{path} is larger than {_MAX_BYTES} bytes; such files are not read")
-        raw = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read as JSON ({error})") from None
-    return parse_expression_names(raw, num_expressions, path)
+    return parse_expression_names(read_json(path, _MAX_BYTES), num_expressions, path)
 
 
 def parse_expression_names(raw: Any, num_expressions: int, path: Path | str) -> ExpressionNames:

@@ -6,11 +6,15 @@ faces; so the three kinds of line that matter are read here.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.opening import read_bytes
+
+MAX_BYTES, MAX_LINE = 2**25, 10_000  # FLAME's template has 1.5 MB
 
 
 def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -18,25 +22,25 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
 
     Raises UserError when the OBJ has no UVs or another topology than the model.
     """
+    lines = io.BytesIO(read_bytes(file, MAX_BYTES))
     uvs: list[tuple[float, float]] = []
     corners: list[list[tuple[int, int]]] = []
     positions = 0
     number = 0
     try:
-        with file.open(encoding="utf-8", errors="replace") as lines:
-            for number, line in enumerate(lines, start=1):  # noqa: B007 (the message names the line)
-                kind, _, rest = line.partition(" ")
-                if kind == "v":
-                    positions += 1
-                elif kind == "vt":
-                    u, v = rest.split()[:2]
-                    uvs.append((float(u), float(v)))
-                elif kind == "f":
-                    pairs = [corner.split("/")[:2] for corner in rest.split()]
-                    polygon = [(int(v) - 1, int(vt) - 1) for v, vt in pairs]
-                    corners += [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
-    except OSError as error:
-        raise UserError(f"{file} cannot be read ({error.strerror})") from None
+        for number, line in enumerate(lines, start=1):  # noqa: B007 (the message names the line)
+            if len(line) > MAX_LINE:
+                raise ValueError("no line is so long")
+            kind, _, rest = line.decode(errors="replace").partition(" ")
+            if kind == "v":
+                positions += 1
+            elif kind == "vt":
+                u, v = rest.split()[:2]
+                uvs.append((float(u), float(v)))
+            elif kind == "f":
+                pairs = [corner.split("/")[:2] for corner in rest.split()]
+                polygon = [(int(v) - 1, int(vt) - 1) for v, vt in pairs]
+                corners += [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
     except ValueError:
         raise UserError(
             f"{file}, line {number}: not a line of an OBJ file whose faces carry UVs (f v/vt ...)"

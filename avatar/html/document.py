@@ -26,7 +26,12 @@ def escape(value: Content) -> Markup:
     """`value` as HTML text; Markup stays as it is, None is nothing."""
     if isinstance(value, Markup):
         return value
-    return Markup("" if value is None else html.escape(str(value), quote=True))
+    return Markup("" if value is None else _escape(str(value)))
+
+
+def _escape(text: str) -> str:
+    """A path may hold what is not Unicode, which no page can show."""
+    return html.escape(text.encode(errors="backslashreplace").decode(), quote=True)
 
 
 def join(parts: Iterable[Content]) -> Markup:
@@ -41,7 +46,7 @@ def element(tag: str, *content: Content, **attributes: Attribute) -> Markup:
         if value is None or value is False:
             continue
         name = name.rstrip("_").replace("_", "-")
-        words.append(name if value is True else f'{name}="{html.escape(str(value), quote=True)}"')
+        words.append(name if value is True else f'{name}="{_escape(str(value))}"')
     opening = f"<{' '.join(words)}>"
     return Markup(opening if tag in _VOID else f"{opening}{join(content)}</{tag}>")
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 
+from avatar.errors import check_installed
 from avatar.html.document import Content, Markup, element
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 INK, GRID = "#1d2733", "#d9dee5"  # of style.css
 SERIES = ("#2563a8", "#c4572b", "#3d8a5c", "#7a4fa3")  # colours of lines and points, readable by the colour-blind
@@ -58,6 +61,9 @@ def data_uri(image: np.ndarray, format: Literal["jpeg", "png"] = "jpeg", quality
 
 def figure_of(columns: int = 1, *, width: float = 5.4, height: float = 3.0) -> tuple[Figure, list]:
     """A matplotlib figure in the page's style with `columns` axes side by side; the sizes are of one of them, in inches."""
+    check_installed("a plot", "plots", "matplotlib")
+    from matplotlib.figure import Figure  # takes half a second
+
     figure = Figure(figsize=(columns * width, height), layout="constrained")
     axes = figure.subplots(1, columns, squeeze=False)[0]
     for one in axes:

@@ -7,41 +7,32 @@ Weights are looked for in a file or folder that the caller names, else in the fo
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
+from avatar.data.tensor_file import read_tensors
 from avatar.errors import UserError
-from avatar.files.third_party import LPIPS_FILES, ThirdPartyFile, check_sha256, fetch, search_folders, sha256_of
+from avatar.files.third_party import (
+    LPIPS_FILES,
+    ThirdPartyFile,
+    check_sha256,
+    converted_lpips,
+    fetch,
+    lpips_folder,
+    lpips_place,
+    sha256_of,
+)
 from avatar.losses.lpips_network import NETS, Lpips, Net
+
+_MAX_BYTES = 2**30  # of a converted file; VGG16's has 59 MB
 
 
 class MissingWeights(UserError):
     """No weights are where they are looked for, as opposed to weights that are there and wrong."""
-
-
-def lpips_folder() -> Path:
-    """Where weights are looked for when the caller names no place."""
-    named = os.environ.get("AVATAR_LPIPS")
-    if named:
-        return Path(named)
-    cache = os.environ.get("AVATAR_CACHE")
-    return (Path(cache) if cache else Path.home() / ".cache" / "avatar") / "lpips"
-
-
-def _folder_with(net: Net) -> Path:
-    """The first folder that holds weights of this network: $AVATAR_LPIPS or the cache's, then those of $AVATAR_MODELS."""
-    own = lpips_folder()
-    names = {f"lpips_{net}.safetensors"}, {file.name for file in LPIPS_FILES[net]}
-    for folder in (own, *search_folders()):
-        if any(all((folder / name).is_file() for name in wanted) for wanted in names):
-            return folder
-    return own
 
 
 def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False) -> Lpips:
@@ -52,10 +43,10 @@ def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False)
     """
     if net not in NETS:
         raise UserError(f"LPIPS network must be one of {', '.join(NETS)}, not {net!r}")
-    place = _folder_with(net) if weights is None else Path(weights)
+    place = lpips_place(net) if weights is None else Path(weights)
     if place.is_file():
         return from_state(net, _read_safetensors(place), place)
-    converted = place / f"lpips_{net}.safetensors"
+    converted = place / converted_lpips(net)
     if converted.is_file():
         return from_state(net, _read_safetensors(converted), converted)
     backbone, heads = LPIPS_FILES[net]
@@ -75,7 +66,7 @@ def from_published(net: Net, folder: Path, files: tuple[ThirdPartyFile, ThirdPar
     state: dict[str, Tensor] = {}
     for file in (backbone, heads):
         path = folder / file.name
-        check_sha256(file, sha256_of(path), str(path))
+        check_sha256(file, sha256_of(path, file.max_bytes), str(path))
         state |= _renamed(_read_torch(path))
     return from_state(net, state, folder / backbone.name)
 
@@ -112,7 +103,7 @@ def download_lpips(net: Net, folder: Path, files: tuple[ThirdPartyFile, ThirdPar
             for file in files:
                 fetch(file, temporary / file.name, folder / file.name)
             lpips = from_published(net, temporary, files)
-            converted = temporary / f"lpips_{net}.safetensors"
+            converted = temporary / converted_lpips(net)
             save_lpips(lpips, converted)
             converted.replace(folder / converted.name)
     except OSError as error:
@@ -146,6 +137,6 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} is not a readable safetensors file: {error}") from error
+        return read_tensors(path, _MAX_BYTES)
+    except UserError as error:
+        raise UserError(f"{error}; fetch or convert it again") from None

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.pickles import MAX_FILE_BYTES
+from avatar.files.opening import read_text
 from avatar.head.expression_names import JAW_TARGETS, NAMES_FILE, ExpressionNames, plain
 
 EYE_COLUMNS = tuple(f"{side}_eye_{axis}" for side in ("left", "right") for axis in "xyz")
 EYELID_COLUMNS = ("eyelid_left", "eyelid_right")
+MAX_BYTES = 2**27  # 50 minutes of ARKit at 60 frames a second
 ARKIT_FPS = 60.0  # of Live Link Face, where the timecodes do not tell
 # Where the head model does not say otherwise: what ARKit's 1 stands for. Rough means of what people can do; ARKit
 # gives no angles with these blendshapes.
@@ -160,14 +161,10 @@ def _timecode_fps(timecodes: Sequence[str]) -> float:
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
+    text = read_text(path, MAX_BYTES)
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise UserError(f"{path} has more than {MAX_FILE_BYTES} bytes; such files are not read")
-        text = path.read_text(encoding="utf-8-sig")
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), strict=True) if row]
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise UserError(f"{path} cannot be read as CSV ({error})") from None
     if len(lines) < 2:
         raise UserError(f"{path} needs a line of column names and at least one frame")

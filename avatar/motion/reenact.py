@@ -24,6 +24,7 @@ from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.names import shortened
 from avatar.files.video import side_by_side, write_video
 from avatar.head.model import HeadModel
 from avatar.motion.distance_strip import DistanceStrip, distances_csv
@@ -100,7 +101,8 @@ def reenact(
         frames = panels(renders, pictures, trained.name, distances.tolist())
         write_video(out, tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True), drive.fps)
     table, record = sidecars(out)
-    write_atomically(table, distances_csv(drive.names, distances.tolist()).encode())
+    content = distances_csv(drive.names, distances.tolist())
+    write_atomically(table, content.encode(errors="backslashreplace"))
     described = describe(trained, drive, choices, neutral, cameras, own, distances)
     write_atomically(record, json.dumps(described, indent=2, allow_nan=False).encode())
     say(f"{len(drive)} frames written to {out}; its choices in {record.name}, each frame's distance in {table.name}")
@@ -109,7 +111,8 @@ def reenact(
 
 def sidecars(video: Path) -> tuple[Path, Path]:
     """The table of distances and the record of choices that go with a video."""
-    return video.with_name(f"{video.stem}.distances.csv"), video.with_name(f"{video.stem}.choices.json")
+    stem = shortened(video.stem)
+    return video.with_name(f"{stem}.distances.csv"), video.with_name(f"{stem}.choices.json")
 
 
 def check_choices(choices: Choices) -> None:

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import Tensor
 from tqdm import tqdm
@@ -26,6 +25,7 @@ from tqdm import tqdm
 from avatar.compute.device import brought, on_gpu
 from avatar.compute.native import thread_count
 from avatar.data.subject import Subject
+from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
@@ -43,6 +43,7 @@ SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
 UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
+_MAX_PROGRESS = 2**28  # bytes
 PROGRESS_FORMAT = 2  # grows with every change of what refinement finds
 
 
@@ -282,11 +283,11 @@ class _Work:
 def _read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list[tuple[float, ...]]]:
     """Moves and figures of the frames that are done; none from a file that is damaged or of something else."""
     try:
-        with safe_open(path, framework="pt") as file:
-            if (file.metadata() or {}).get("key") != key:
-                return [], []
-            moves, figures = file.get_tensor("moves"), file.get_tensor("figures")
-    except (SafetensorError, OSError, ValueError):
+        if read_metadata(path, _MAX_PROGRESS).get("key") != key:
+            return [], []
+        tensors = read_tensors(path, _MAX_PROGRESS)
+        moves, figures = tensors["moves"], tensors["figures"]
+    except (UserError, KeyError):
         return [], []
     if moves.shape[1:] != (values,) or figures.shape != (len(moves), 3):
         return [], []

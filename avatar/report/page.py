@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
 from avatar.config import flatten
-from avatar.errors import UserError
+from avatar.data.images import MAX_BYTES
+from avatar.errors import UserError, check_installed
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import is_there, read_bytes, read_json
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
 from avatar.report.pictures import frame_panels, uncertainty_map
@@ -34,7 +33,8 @@ if (slider) { slider.addEventListener("input", show); show(); }
 
 def write_report(run: Run) -> Path:
     """Write RUN/report.html and return it. Parts that a run does not have yet (its evaluation, its curves) are named as
-    missing. Raises UserError when the evaluation's results cannot be read, or a frame is gone."""
+    missing. Raises UserError when the evaluation's results cannot be read, a frame is gone, or a package is missing."""
+    check_installed("a report", "plots", "matplotlib", "tensorboard")
     path = run.path / "report.html"
     write_atomically(path, render_report(run).encode())
     return path
@@ -64,12 +64,12 @@ def render_report(run: Run) -> str:
 
 def read_results(path: Path) -> dict[str, Any] | None:
     """What `avatar eval` wrote, or None where it has not run."""
-    if not path.is_file():
+    if not is_there(path):
         return None
     try:
-        results = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read ({error}); run avatar eval again") from None
+        results = read_json(path)
+    except UserError as error:
+        raise UserError(f"{error}; run avatar eval again") from None
     if not isinstance(results, dict) or not isinstance(results.get("protocols"), dict):
         raise UserError(f"{path} is not a results file of this program; run avatar eval again")
     return results
@@ -123,8 +123,8 @@ def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
     parts.append(fold("By head pose and by distance from the training expressions", *bins_tables(results["protocols"])))
     for name, caption in (("curves.png", "The figures along the video"), ("worst.png", "The worst frames")):
         file = run.path / "eval" / name
-        if file.is_file():
-            source = f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
+        if is_there(file):
+            source = f"data:image/png;base64,{base64.b64encode(read_bytes(file, MAX_BYTES)).decode()}"
             image = element("figure", element("img", src=source, alt=caption), element("figcaption", caption))
             parts.append(fold(caption, image))
     choices = {n: e.get("choices", {}).get("summary") for n, e in results["protocols"].items()}
@@ -148,7 +148,10 @@ def _frames(run: Run) -> list[Markup]:
 
 
 def _curves(folder: Path) -> list[Markup]:
-    curves = read_curves(folder)
+    try:
+        curves = read_curves(folder)
+    except UnicodeEncodeError:
+        return [element("p", "Curves are not read from a folder whose name is not UTF-8.", class_="soft")]
     shown = [(tag, title) for tag, title in (("loss/total", "loss"), ("train/psnr", "PSNR, dB")) if curves.get(tag)]
     if not shown:
         return [element("p", "No curves were recorded.", class_="soft")]
@@ -166,6 +169,8 @@ def read_curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
     """(step, value) of every scalar that training recorded, at most `MAX_POINTS` of each; empty without a recording."""
     if not folder.is_dir():
         return {}
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # takes a second
+
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
     events.Reload()
     curves = {}

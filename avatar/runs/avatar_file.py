@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import Tensor
 
@@ -25,8 +24,11 @@ from avatar.config import Config, config_from_dict
 from avatar.data.manifest import parse_intrinsics, parse_number, parse_positions
 from avatar.data.recording import TRACK_SHAPES, Recording, checked_tracks
 from avatar.data.split import Split
+from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.names import safe_name
+from avatar.files.opening import MissingFile
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames, parse_expression_names
 from avatar.head.packed import head_from_tensors, head_tensors
@@ -37,6 +39,7 @@ from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shap
 
 AVATAR_FILE = "avatar.safetensors"
 AVATAR_FORMAT = 1
+MAX_BYTES = 2**32
 _RECORDING, _NEUTRAL, _HEAD = "recording.", "neutral.", "head."
 
 
@@ -108,17 +111,19 @@ def read_portrait(path: Path) -> Portrait:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    if not path.is_file():
-        raise UserError(f"there is no avatar file {path}; give the folder that avatar train wrote, or a file of it")
     try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("avatar", "null"))
-            if not isinstance(header, dict) or header.get("format") != AVATAR_FORMAT or "frames" not in header:
-                found = header.get("format") if isinstance(header, dict) else "none"
-                raise UserError(f"{path} is not an avatar of this program (format {found}, expected {AVATAR_FORMAT})")
-            # Copies: in a file a tensor may lie at any address, and some products are rounded by where their operands lie.
-            return header, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        header = json.loads(read_metadata(path, MAX_BYTES).get("avatar", "null"))
+        if not isinstance(header, dict) or header.get("format") != AVATAR_FORMAT or "frames" not in header:
+            found = header.get("format") if isinstance(header, dict) else "none"
+            raise UserError(f"{path} is not an avatar of this program (format {found}, expected {AVATAR_FORMAT})")
+        return header, read_tensors(path, MAX_BYTES)
+    except MissingFile:
+        raise UserError(
+            f"there is no avatar file {path}; give the folder that avatar train wrote, or a file of it"
+        ) from None
+    except UserError as error:
+        raise UserError(f"{error}; copy it again, or export it again") from None
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged or no avatar file ({error}); copy it again, or export it again") from None
 
 
@@ -140,7 +145,7 @@ def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> Portrait:
         if not isinstance(header[key], kind):
             raise TypeError(f"{key} is a {type(header[key]).__name__}, not a {kind.__name__}")
     recording = Recording(
-        name=header["name"],
+        name=safe_name(header["name"]),
         fps=fps,
         width=width,
         height=height,

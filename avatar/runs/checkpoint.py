@@ -17,15 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import Tensor
 
+from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.tensors import describe_non_finite
 
 CHECKPOINT_FORMAT = 1
+_MAX_BYTES = 2**34  # an avatar and the optimizer's two moments of it
 _MODEL = "model."  # begins the names of parameters
 _NAME = re.compile(r"step_(\d{8})\.safetensors")
 
@@ -67,10 +68,9 @@ def list_checkpoints(folder: Path) -> list[Path]:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read one checkpoint; UserError when it is damaged or of another format."""
     try:
-        with safe_open(path, framework="pt") as file:
-            meta = json.loads((file.metadata() or {}).get("avatar", "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        meta = json.loads(read_metadata(path, _MAX_BYTES).get("avatar", "null"))
+        tensors = read_tensors(path, _MAX_BYTES)
+    except (UserError, ValueError, RecursionError) as error:
         raise UserError(f"the checkpoint {path} is damaged ({error}); delete it to use the one before") from None
     if not isinstance(meta, dict) or meta.get("format") != CHECKPOINT_FORMAT or not isinstance(meta.get("step"), int):
         found = meta.get("format") if isinstance(meta, dict) else "none"

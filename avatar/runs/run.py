@@ -24,6 +24,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import is_there, read_json
 from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.trained import TrainedAvatar
@@ -109,14 +110,11 @@ def write_run_info(run: Path, info: Mapping[str, Any]) -> None:
 def read_run_info(run: Path) -> RunInfo:
     """RUN/run.json. Raises UserError when the folder is not a run, or one of another version of the program."""
     path = run / RUN_FILE
-    if not path.is_file():
+    if not is_there(path):
         raise UserError(
             f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out)"
         )
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read as JSON ({error})") from None
+    info = read_json(path)
     if not isinstance(info, dict) or info.get("format") != RUN_FORMAT:
         found = info.get("format") if isinstance(info, dict) else "none"
         raise UserError(

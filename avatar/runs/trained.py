@@ -15,6 +15,7 @@ from torch import Tensor
 from avatar.config import Config
 from avatar.data.recording import Recording
 from avatar.errors import UserError
+from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
 from avatar.motion.repertoire import Repertoire, learn_repertoire
@@ -22,8 +23,6 @@ from avatar.motion.rest import RestPose
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_portrait
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
-
-HEAD_VARIABLE = "AVATAR_HEAD"
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import subprocess
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,8 @@ from typing import Any, Protocol
 from avatar.compute.device import visible_gpus
 from avatar.compute.memory import available_bytes
 from avatar.errors import UserError
-from avatar.sweep.job import last_words, start_worker, work_until_done
 from avatar.sweep.spec import Resources, Spec
+from avatar.sweep.worker import Worker, work_until_done
 
 ENGINES = ("local", "ray", "slurm")
 LONGEST_MINUTES = 24 * 60
@@ -34,7 +34,7 @@ class Engine(Protocol):
         ...
 
     def stop(self, handles: Sequence[Any]) -> None:
-        """Ask workers to save their state and end."""
+        """Ask workers to save their state and end; those that do not are ended."""
         ...
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class LocalProcesses:
         self._taken: dict[Path, str] = {}
         self._threads = resources.threads
         self._waiting: list[Path] = []
-        self._running: dict[Path, subprocess.Popen[bytes]] = {}
+        self._running: dict[Path, Worker] = {}
 
     def submit(self, folders: Sequence[Path]) -> list[Any]:
         self._waiting += folders
@@ -109,21 +109,22 @@ class LocalProcesses:
         return list(folders)
 
     def poll(self, handle: Any) -> str | None:
-        process = self._running.get(handle)
-        if process is None or process.poll() is None:
+        worker = self._running.get(handle)
+        said = None if worker is None else worker.poll()
+        if said is None:
             return None
-        _, said = process.communicate()
         del self._running[handle]
         self._places.append(self._taken.pop(handle))
         self._start()
-        return last_words(process.returncode, said)
+        return said
 
     def stop(self, handles: Sequence[Any]) -> None:
-        self._waiting.clear()
-        for process in self._running.values():
-            process.terminate()
-        for process in self._running.values():
-            process.wait()
+        self._waiting = [folder for folder in self._waiting if folder not in handles]
+        workers = [self._running[folder] for folder in handles if folder in self._running]
+        for worker in workers:
+            worker.ask_to_end()
+        for worker in workers:
+            worker.end()
 
     def close(self) -> None:
         """Nothing is held."""
@@ -132,11 +133,11 @@ class LocalProcesses:
         while self._waiting and len(self._running) < self.workers:
             folder = self._waiting.pop(0)
             self._taken[folder] = self._places.pop(0)
-            self._running[folder] = start_worker(folder, self._threads, self._taken[folder])
+            self._running[folder] = Worker(folder, self._threads, self._taken[folder])
 
 
 class RayCluster:
-    """An existing Ray cluster, or one of this machine's own when no address is given.
+    """An existing Ray cluster; without an address one of this machine's own, which listens on the loopback interface alone.
 
     Its machines need this program installed and the sweep's folder under the same path.
     """
@@ -144,9 +145,13 @@ class RayCluster:
     name = "ray"
 
     def __init__(self, resources: Resources, gpus: float, address: str | None, workers: int | None) -> None:
+        own = address is None and "RAY_ADDRESS" not in os.environ
+        if own:  # read when Ray is imported; the name is older than its use: without it, Ray takes a public address
+            os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         ray = _import("ray", "ray")
+        options: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if own else {}
         try:
-            ray.init(address=address, num_cpus=None if address else workers, log_to_driver=False, logging_level="error")
+            ray.init(address=address, log_to_driver=False, logging_level="error", **options)
         except (ConnectionError, RuntimeError, ValueError) as error:
             place = f"at {address}" if address else "on this machine"
             raise UserError(f"no Ray cluster answers {place} ({str(error).splitlines()[0]})") from None
@@ -185,6 +190,11 @@ class SlurmCluster:
 
     def __init__(self, resources: Resources, gpus: float, folder: Path, options: EngineOptions) -> None:
         submitit = _import("submitit", "slurm")
+        if options.address is None and shutil.which("sbatch") is None:  # submitit would run the jobs here
+            raise UserError(
+                "there is no SLURM on this machine (no sbatch): start the sweep on one of its cluster's machines, or take "
+                "--engine local"
+            )
         try:
             self._executor = submitit.AutoExecutor(folder=folder, cluster=options.address)
         except (RuntimeError, ValueError) as error:

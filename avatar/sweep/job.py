@@ -1,13 +1,13 @@
 """One job: `avatar train`, resumed where it was stopped, then `avatar eval`. Running it again changes nothing.
 
 As a program, which engines start wherever they like: python -m avatar.sweep.job FOLDER
-What it says goes into FOLDER/log.txt. When it is killed, nothing of it lives on, and the next one goes on.
+What its commands say goes into FOLDER/log.txt, of bounded size. When it is killed, nothing of it lives on, and the next
+one goes on.
 """
 
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -20,6 +20,7 @@ from pathlib import Path
 from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
+from avatar.sweep.output import BoundedLog, end_of, old_of
 from avatar.sweep.spec import Job
 from avatar.sweep.state import HEARTBEAT_SECONDS, State, beat, read_job, read_state, worker_name, write_state
 
@@ -82,7 +83,7 @@ def source_words(job: Job) -> list[str]:
 
 def logged(command: Command, words: list[str], log: Path) -> tuple[int, str]:
     """Run a command, all that it says going into `log`; its exit status and the last line that it said."""
-    with log.open("a", encoding="utf-8", buffering=1) as file:
+    with BoundedLog(log) as file:
         file.write(f"$ avatar {' '.join(words)}\n")
         with redirect_stdout(file), redirect_stderr(file):
             try:
@@ -96,22 +97,26 @@ def logged(command: Command, words: list[str], log: Path) -> tuple[int, str]:
 
 
 def last_line(log: Path) -> str:
-    with log.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
-        lines = file.read().decode(errors="replace").replace("\r", "\n").strip().splitlines()
+    newest = end_of(old_of(log)) + end_of(log)
+    lines = newest.decode(errors="replace").replace("\r", "\n").strip().splitlines()
     return lines[-1].removeprefix("avatar: ") if lines else ""
+
+
+def computed() -> int:
+    """Seconds of processor time of this process and of those that it has waited for."""
+    return int(sum(os.times()[:4]))
 
 
 @contextmanager
 def heart(folder: Path) -> Iterator[None]:
-    """Says every few seconds that the worker lives, until the block ends."""
+    """Says every few seconds that the worker lives and how much it has computed, until the block ends."""
     ended = threading.Event()
 
     def keep_beating() -> None:
         while not ended.wait(HEARTBEAT_SECONDS):
-            beat(folder)
+            beat(folder, computed())
 
-    beat(folder)
+    beat(folder, computed())
     thread = threading.Thread(target=keep_beating, daemon=True)
     thread.start()
     try:
@@ -119,43 +124,6 @@ def heart(folder: Path) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-
-
-def start_worker(folder: Path, threads: int, gpus: str | None = None) -> subprocess.Popen[bytes]:
-    """A process that does the job of `folder`; what it says beside its log is its last words.
-
-    gpus   those that it may use, as CUDA_VISIBLE_DEVICES names them; None: as this process
-    """
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "AVATAR_THREADS": str(threads)}
-    if gpus is not None:
-        environment["CUDA_VISIBLE_DEVICES"] = gpus
-    words = [sys.executable, "-m", "avatar.sweep.job", str(folder)]
-    return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-
-
-def work_until_done(folder: str, threads: int) -> str:
-    """`start_worker`, waited for, as schedulers call it on another machine; its last words, empty when all went well.
-
-    An interruption of this process is passed on, so that the training saves its state.
-    """
-    process = start_worker(Path(folder), threads)
-    try:
-        _, said = process.communicate()
-    except BaseException:
-        process.terminate()
-        process.wait()
-        raise
-    return last_words(process.returncode, said)
-
-
-def last_words(status: int, said: bytes) -> str:
-    """Why a worker ended, empty when it ended as it should."""
-    if status == OK:
-        return ""
-    if status < 0:
-        return f"the worker was killed by signal {-status}"
-    lines = said.decode(errors="replace").strip().splitlines()
-    return lines[-1].removeprefix("avatar: ") if lines else f"the worker ended with status {status}"
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -17,18 +17,19 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from avatar.config import load_config
 from avatar.errors import UserError
+from avatar.files.plain_yaml import read_yaml
 
 MAX_BYTES, MAX_JOBS = 2**20, 100_000
+MAX_VARIANTS = 1000  # each is composed and checked before the first job begins
 KEYS = {
     "subjects",
     "head",
@@ -72,7 +73,18 @@ class Job:
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Job:
-        return cls(**{**raw, "overrides": tuple(raw["overrides"]), "protocols": tuple(raw["protocols"])})
+        """What `to_dict` gave. Raises KeyError, TypeError or ValueError for anything else: each value becomes a word of a
+        command, and no word may be read as an option."""
+        job = cls(**{**raw, "overrides": tuple(raw["overrides"]), "protocols": tuple(raw["protocols"])})
+        source, texts = job.source, (job.name, job.subject, job.variant)
+        if not isinstance(source, dict) or not isinstance(source["folder"], str) or source.keys() - SUBJECT_KEYS:
+            raise TypeError("source is no table with a folder")
+        words = [*job.overrides, *job.protocols, *source.values()]
+        if wrong := [word for word in words if not _is_word(word)]:
+            raise ValueError(f"{str(wrong[0])[:40]!r} is no word")
+        if not all(isinstance(text, str) for text in texts) or job.name in ("", ".", ".."):
+            raise TypeError("a name is not text")
+        return job
 
 
 @dataclass(frozen=True)
@@ -137,12 +149,7 @@ def read_spec(path: Path) -> Spec:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path} has more than {MAX_BYTES} bytes; no sweep has")
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise UserError(f"{path} cannot be read as YAML ({str(error).splitlines()[0]})") from None
+    raw = read_yaml(path, MAX_BYTES)
     if not isinstance(raw, dict):
         raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
     return raw
@@ -160,6 +167,9 @@ def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:
             if not isinstance(value, str):
                 raise UserError(f"{path}: {key} is {value!r}, not a path")
             found[key] = str((path.resolve().parent / Path(value).expanduser()).resolve())
+    for key in ("frame_offset", "format", "fps"):
+        if (value := found.get(key)) is not None and not _is_word(value):
+            raise UserError(f"{path}: {key} is {value!r}, not a word or a number")
     name = found.get("name", Path(found["folder"]).name)
     if not isinstance(name, str) or not name:
         raise UserError(f"{path}: a subject's name is {name!r}, not text")
@@ -174,18 +184,26 @@ def _variants(path: Path, raw: Mapping[str, Any]) -> dict[str, list[str]]:
         product = raw["product"]
         if not isinstance(product, dict) or not all(isinstance(values, list) and values for values in product.values()):
             raise UserError(f"{path}: product must hold a list of values for each key")
-        choices = [[f"{key}={_plain(value)}" for value in values] for key, values in product.items()]
+        count = math.prod(map(len, product.values()))
+        if count > MAX_VARIANTS:
+            raise UserError(f"{path}: product makes {count:,} variants; up to {MAX_VARIANTS:,} are tried")
+        choices = [[f"{key}={_plain(path, key, value)}" for value in values] for key, values in product.items()]
         return {" ".join(words): list(words) for words in itertools.product(*choices)}
     given = raw.get("variants", {"default": []})
     if isinstance(given, list):
         given = {" ".join(_words(path, "variants", words)) or "default": words for words in given}
     if not isinstance(given, dict) or not given:
         raise UserError(f"{path}: variants must name at least one list of overrides")
+    if len(given) > MAX_VARIANTS:
+        raise UserError(f"{path} has {len(given):,} variants; up to {MAX_VARIANTS:,} are tried")
     return {str(name): _words(path, f"variants.{name}", words) for name, words in given.items()}
 
 
-def _plain(value: Any) -> str:
-    return json.dumps(value) if isinstance(value, (bool, list, type(None))) else str(value)
+def _plain(path: Path, key: Any, value: Any) -> str:
+    try:
+        return json.dumps(value) if isinstance(value, (bool, list, type(None))) else str(value)
+    except TypeError as error:  # a date in a list
+        raise UserError(f"{path}: product.{key} holds what no override can be ({error})") from None
 
 
 def _check_overrides(path: Path, variant: str, overrides: list[str]) -> None:
@@ -206,9 +224,14 @@ def _device(overrides: Sequence[str]) -> str:
 
 def _words(path: Path, key: str, value: Any) -> list[str]:
     words = [value] if isinstance(value, str) else value
-    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+    if not isinstance(words, list) or not all(isinstance(word, str) and _is_word(word) for word in words):
         raise UserError(f"{path}: {key} must be a list of texts, such as [model.latent_dim=4]")
     return words
+
+
+def _is_word(value: Any) -> bool:
+    """Whether a command takes the value as such, not as an option."""
+    return isinstance(value, (int, float)) or (isinstance(value, str) and not value.startswith("-"))
 
 
 def _list(path: Path, raw: Mapping[str, Any], key: str, default: list[Any] | None = None) -> list[Any]:

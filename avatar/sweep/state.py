@@ -3,7 +3,8 @@
 SWEEP/sweep.json               the jobs and what one takes
 SWEEP/jobs/NAME/job.json       what it trains
 SWEEP/jobs/NAME/state.json     what became of it
-SWEEP/jobs/NAME/log.txt        what its commands said
+SWEEP/jobs/NAME/log.txt        what its commands said, the newest; log.txt.old what came before
+SWEEP/jobs/NAME/output.txt     what libraries printed, if they did
 SWEEP/jobs/NAME/run/           the run
 """
 
@@ -14,12 +15,15 @@ import os
 import platform
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import MissingFile, read_json
+from avatar.sweep.output import end_of
 from avatar.sweep.spec import Job, Resources, Spec
 
 SWEEP_FILE = "sweep.json"
@@ -83,8 +87,11 @@ def read_jobs(folder: Path) -> tuple[Job, ...]:
 def read_job(folder: Path) -> Job:
     raw = _read_json(folder / "job.json", f"{folder} holds no job of a sweep")
     try:
-        return Job.from_dict(raw)
-    except (KeyError, TypeError) as error:
+        job = Job.from_dict(raw)
+        if job.name != folder.name:
+            raise ValueError(f"it is the job {job.name!r}")
+        return job
+    except (KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{folder / 'job.json'} is damaged ({error}); delete the folder and start the sweep again"
         ) from None
@@ -92,26 +99,33 @@ def read_job(folder: Path) -> Job:
 
 def read_state(folder: Path) -> State:
     """A job's state; one that says `running` and has been silent for a minute is waiting again."""
-    path = folder / "state.json"
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-        state = State(**raw)
-    except FileNotFoundError:
-        return State()
-    except (OSError, ValueError, TypeError):
-        return State()  # torn by a crash of the machine: the job is idempotent
+    state = stored_state(folder)
     if state.status == "running" and silence(folder) > SILENT_SECONDS:
         return replace(state, status="waiting")
     return state
+
+
+def stored_state(folder: Path) -> State:
+    """A job's state as it was last written."""
+    try:
+        return State(**read_json(folder / "state.json"))
+    except (UserError, TypeError):
+        return State()  # there is none, or a crash of the machine has torn it: the job is idempotent
 
 
 def write_state(folder: Path, state: State) -> None:
     write_atomically(folder / "state.json", json.dumps(asdict(state)).encode())
 
 
-def beat(folder: Path) -> None:
-    """Say that the job's worker lives."""
-    (folder / "heartbeat").touch()
+def beat(folder: Path, computed: int) -> None:
+    """Say that the job's worker lives, and the seconds of processor time that it has used."""
+    with suppress(OSError):  # a disk that is full for a moment; who stays silent is missed
+        (folder / "heartbeat").write_text(str(computed))
+
+
+def progress_mark(folder: Path) -> bytes:
+    """Changes while the job's worker computes or says something; a worker that hangs leaves it as it is."""
+    return end_of(folder / "heartbeat") + b" " + end_of(folder / "log.txt")
 
 
 def silence(folder: Path) -> float:
@@ -128,11 +142,9 @@ def worker_name() -> str:
 
 def _read_json(path: Path, absent: str) -> Mapping[str, Any]:
     try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        raw = read_json(path)
+    except MissingFile:
         raise UserError(absent) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read ({error})") from None
     if not isinstance(raw, dict):
         raise UserError(f"{path} holds no object")
     return raw

@@ -1,4 +1,4 @@
-"""What a run shows while it works: a progress bar, tensorboard scalars and preview images."""
+"""What a run shows while it works: a progress bar, preview images and, where tensorboard is installed, its scalars."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import imageio.v3 as iio
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from avatar.errors import MissingPackage, check_installed
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
 
@@ -26,7 +30,7 @@ class TrainingLog:
     def __init__(self, run: Path, start: int, stop: int, every: int) -> None:
         self._previews = run / "previews"
         self._every = every
-        self._writer = SummaryWriter(str(run / "tensorboard"), purge_step=start)
+        self._writer = _open_writer(run / "tensorboard", start)
         self._bar = tqdm(total=stop, initial=start, unit="step", desc="train", dynamic_ncols=True)
         self._loss = self._psnr = math.nan
 
@@ -35,7 +39,8 @@ class TrainingLog:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
 
     def step(self, step: int, loss: PhotometricLoss, render: Tensor, truth: Tensor) -> None:
         """Record one step; `step` counts from 1. The PSNR is computed only for the steps that are logged."""
@@ -57,9 +62,10 @@ class TrainingLog:
         self._bar.update(1)
         if self.shows(step):
             self._psnr = smoothed(self._psnr, quality, self._every)
-            for name, term in terms.items():
-                self._writer.add_scalar(f"loss/{name}", term, step)
-            self._writer.add_scalar("train/psnr", quality, step)
+            if self._writer is not None:
+                for name, term in terms.items():
+                    self._writer.add_scalar(f"loss/{name}", term, step)
+                self._writer.add_scalar("train/psnr", quality, step)
         shown = {"loss": f"{self._loss:.5f}"}
         if not math.isnan(self._psnr):  # none is measured before the first step that is logged
             shown["psnr"] = f"{self._psnr:.2f}"
@@ -75,7 +81,24 @@ class TrainingLog:
         image = np.round(pair.cpu().numpy() * 255).astype(np.uint8)
         self._previews.mkdir(parents=True, exist_ok=True)
         iio.imwrite(self._previews / f"step_{step:08d}.png", image)
-        self._writer.add_image("preview", image, step, dataformats="HWC")
+        if self._writer is not None:
+            self._writer.add_image("preview", image, step, dataformats="HWC")
+
+
+def _open_writer(folder: Path, start: int) -> SummaryWriter | None:
+    """None where no curves can be written, which it says."""
+    try:
+        check_installed("recording curves", "plots", "tensorboard")
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(str(folder), purge_step=start)
+    except MissingPackage as missing:
+        print(f"Note: {missing}")
+    except ImportError as error:  # a package that it needs is of another version
+        print(f"Note: curves are not recorded: tensorboard cannot be imported ({error})")
+    except UnicodeEncodeError:
+        print(f"Note: curves are not recorded: tensorboard cannot write to {folder}, whose name is not UTF-8")
+    return None
 
 
 def smoothed(mean: float, value: float, steps: int) -> float:

@@ -112,6 +112,8 @@ function check(header, arrays) {
   need(header.fps > 0 && header.fps <= 1000, "the frame rate is missing");
   need(header.size >= 1 && header.size <= 2 ** 16, "the size is missing");
   for (const name of [...ARRAYS, "corners", "cells", "motion", "poses"]) need(arrays.has(name), `${name} is missing`);
+  for (const [name, values] of arrays)
+    need(!(values instanceof Float32Array) || values.every(Number.isFinite), `${name} holds values that are not finite`);
   for (const name of ["motion", "poses"]) need(arrays.get(name) instanceof Float32Array, `${name} is not of numbers`);
   need(arrays.get("motion").length % parameters === 0, "the motion is cut short");
   need(arrays.get("poses").length / 12 === arrays.get("motion").length / parameters, "poses and motion differ in length");

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 from pathlib import Path
 
+from avatar.errors import UserError
+from avatar.files.opening import read_bytes
 from avatar.html import Markup, data_table, element, section
 from data_prep.avatar_track import read_info, recognise
 
@@ -40,8 +42,10 @@ def _video(folder: Path) -> list[Markup]:
     path = folder / OVERLAY
     if not path.is_file():
         return []
-    if path.stat().st_size > MAX_EMBEDDED:
+    try:
+        data = read_bytes(path, MAX_EMBEDDED)
+    except UserError:
         return [section("The tracked mesh on every frame", element("p", f"See {path}.", class_="soft"))]
-    source = f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}"
+    source = f"data:video/mp4;base64,{base64.b64encode(data).decode()}"
     video = element("video", src=source, controls=True, loop=True, muted=True, preload="metadata")
     return [section("The tracked mesh on every frame", video)]

@@ -61,7 +61,7 @@ def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
 
 def write_frames(clip: Clip, path: Path) -> None:
     """One line per image: what was measured of it; empty where it could not be."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("image", "change", "covered", "haze", "holes", "specks", *_FIT_COLUMNS))
         for number, view in clip.views.items():

@@ -17,6 +17,8 @@ from typing import Any
 
 from avatar.errors import UserError
 from avatar.files.lock import LOCK_FILE, locked
+from avatar.files.names import shortened
+from avatar.files.opening import read_json
 
 RECORD = ".stage.json"
 _MAX_RECORD = 2**24
@@ -76,7 +78,7 @@ class Stages:
 @contextlib.contextmanager
 def growing(target: Path) -> Iterator[Stages]:
     """The stages of `target`, for one process at a time. Raises UserError where nothing can be written."""
-    folder = target.with_name(f".{target.name}.partial")
+    folder = target.with_name(f".{shortened(target.name)}.partial")
     with locked(folder):
         try:
             yield Stages(folder)
@@ -94,9 +96,7 @@ def hash_of(values: Any) -> str:
 
 def _read_record(path: Path) -> dict[str, Any] | None:
     try:
-        if path.stat().st_size > _MAX_RECORD:
-            return None
-        record = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        record = read_json(path, _MAX_RECORD)
+    except UserError:
         return None
     return record if isinstance(record, dict) and isinstance(record.get("result"), dict) else None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Any
 import pytest
 from command_line import avatar
 from small_runs import SMALL
+
+from avatar.files.lock import locked
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +59,34 @@ def test_measuring_again_replaces_the_own_result(run: Path) -> None:
     avatar("eval", run, "--protocol", "strict")
     assert list(read_results(run)["protocols"]) == ["strict", "flashavatar"]
     assert not (run / "eval" / "strict" / "renders").exists(), "pictures of the evaluation before"
+
+
+def test_a_second_evaluation_waits_and_takes_no_picture_away(run: Path) -> None:
+    before = sorted(path for path in (run / "eval").rglob("*"))
+    with locked(run / "eval"):
+        said = avatar("eval", run, "--protocol", "strict", status=1)
+    assert f"{run / 'eval'} is being written by process" in said
+    assert sorted(path for path in (run / "eval").rglob("*")) == before
+
+
+def test_a_lock_that_is_a_link_does_not_write_elsewhere(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (run / "eval" / ".lock").symlink_to(tmp_path / "mine")
+    assert "eval cannot be written" in avatar("eval", run, "--protocol", "strict", status=1)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_place_that_cannot_be_written_is_named_with_what_to_do(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        said = avatar("eval", run, "--protocol", "strict", status=1)
+    assert f"{run / 'eval'} cannot be written (Read-only file system); free some space" in said and "Errno" not in said
+    shutil.rmtree(run / "eval")
+    (run / "eval").write_text("a file")
+    assert "eval cannot be written (File exists)" in avatar("eval", run, "--protocol", "strict", status=1)
 
 
 def change(key: str, value: object) -> Callable[[Path], None]:

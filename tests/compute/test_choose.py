@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -175,10 +176,10 @@ def test_without_a_gpu_auto_works_on_the_cpu_and_says_nothing(gpu: pytest.Monkey
 
 def test_a_gpu_is_seen_by_torch_or_by_its_device_file(monkeypatch: pytest.MonkeyPatch) -> None:
     files: set[str] = set()
-    monkeypatch.setattr(choose.Path, "exists", lambda path: os.fspath(path) in files)
+    monkeypatch.setattr(Path, "exists", lambda path: os.fspath(path) in files)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert not sees_gpu()
-    for name in ("/dev/nvidiactl", "/dev/kfd"):
+    for name in ("/dev/nvidiactl", "/dev/kfd", "/usr/lib/wsl/lib/libcuda.so.1"):
         files.add(name)
         assert sees_gpu()
         files.clear()

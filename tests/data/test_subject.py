@@ -69,7 +69,7 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "folder missing": (shutil.rmtree, r"out is not a prepared subject: it has no manifest\.json"),
     "manifest cut short": (
         lambda f: (f / "manifest.json").write_text((f / "manifest.json").read_text()[:500]),
-        r"manifest\.json cannot be read \(.*\); prepare the subject again",
+        r"manifest\.json cannot be read as JSON \(.*\); prepare the subject again",
     ),
     "manifest binary": (
         lambda f: (f / "manifest.json").write_bytes(b"\xff\x00" * 40),
@@ -106,7 +106,7 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no training frames": (lambda f: edit_manifest(f, train=[]), r"train is empty or names frames outside"),
     "a frame outside": (lambda f: edit_manifest(f, test=[10]), r"test is empty or names frames outside the 10"),
     "a frame in both": (lambda f: edit_manifest(f, test=[0, 1]), r"a frame is in both train and test"),
-    "tracks missing": (lambda f: (f / "tracks.safetensors").unlink(), r"tracks\.safetensors is missing; prepare"),
+    "tracks missing": (lambda f: (f / "tracks.safetensors").unlink(), r"tracks\.safetensors does not exist; prepare"),
     "tracks cut short": (
         lambda f: (f / "tracks.safetensors").write_bytes((f / "tracks.safetensors").read_bytes()[:-9]),
         r"tracks\.safetensors is damaged",
@@ -135,8 +135,8 @@ def test_a_damaged_subject_is_refused(name: str, broken: Path) -> None:
 
 
 IMAGE_CASES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "image gone": (lambda s: (s / "imgs/00003.png").unlink(), r"imgs/00003\.png cannot be read \(No such file"),
-    "mask gone": (lambda s: (s / "parsing/00003_mouth.png").unlink(), r"00003_mouth\.png cannot be read"),
+    "image gone": (lambda s: (s / "imgs/00003.png").unlink(), r"imgs/00003\.png does not exist"),
+    "mask gone": (lambda s: (s / "parsing/00003_mouth.png").unlink(), r"00003_mouth\.png does not exist"),
     "source gone": (shutil.rmtree, r"the subject's frames are gone: .*subject does not exist; prepare"),
     "image damaged": (lambda s: (s / "imgs/00003.png").write_bytes(b"?"), r"imgs/00003\.png is neither a JPEG nor"),
     "image of another size": (

@@ -138,6 +138,11 @@ def test_damaged_and_missing_results_are_named(tmp_path: Path) -> None:
         UserError, match=r"results\.json is damaged \(data_hash, head_fingerprint, image_size, protocols"
     ):
         compare_runs([a, b])
+    results = json.loads((a / "eval" / "results.json").read_text())
+    results["protocols"] = {"../../elsewhere": next(iter(results["protocols"].values()))}
+    (b / "eval" / "results.json").write_text(json.dumps(results))
+    with pytest.raises(UserError, match="the names of its protocols"):
+        compare_runs([a, b])
     (b / "eval" / "results.json").write_text("{")
     with pytest.raises(UserError, match=r"results\.json cannot be read"):
         compare_runs([a, b])

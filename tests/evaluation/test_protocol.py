@@ -83,10 +83,10 @@ CHANGES = {
     "an empty summary": (("summary: ", "summary: ''\n# "), "summary is '', and has to be a sentence"),
     "an object of Python": (
         ("lpips_scale: 1.0", "lpips_scale: !!python/object/apply:os.getcwd []"),
-        "is not a YAML file",
+        "cannot be read as YAML",
     ),
     "an alias": (("regions: [head", "regions: &a [*a, head"), "aliases (*name) are not allowed"),
-    "depth without end": (("regions: ", "regions: " + "[" * 20000), "is not a YAML file"),
+    "depth without end": (("regions: ", "regions: " + "[" * 20000), "cannot be read as YAML"),
 }
 
 
@@ -110,9 +110,9 @@ def test_files_that_are_no_protocols(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=name):
             read_protocol(tmp_path / name)
     (tmp_path / "latin.yaml").write_bytes(b"summary: \xff")
-    with pytest.raises(UserError, match=r"latin\.yaml is not a YAML file"):
+    with pytest.raises(UserError, match=r"latin\.yaml is not UTF-8 text"):
         read_protocol(tmp_path / "latin.yaml")
-    with pytest.raises(UserError, match=r"none\.yaml cannot be read \(No such file"):
+    with pytest.raises(UserError, match=r"none\.yaml does not exist"):
         choose_protocols([str(tmp_path / "none.yaml")])
     odd = tmp_path / "my protocol.yaml"
     odd.write_text(builtin_protocols()["strict"].read_text())

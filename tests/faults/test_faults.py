@@ -21,9 +21,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_runs import run_info
+from small_runs import run_info, train_small
 from tracked_folder import write_tracked_folder
 
+from avatar.commands.measuring import run_eval
+from avatar.commands.parser import parse
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
@@ -148,6 +150,20 @@ def test_results(fault: int | None, tmp_path: Path) -> None:
     write_atomically(file, b"old" * 1000)
     work = lambda: write_atomically(file, b"new" * 1000)  # noqa: E731
     assert stop_at_every_step(work, fault, lambda: file.read_bytes() in (b"old" * 1000, b"new" * 1000) or 1 / 0) >= 2
+
+
+@pytest.mark.parametrize("fault", [FULL, READ_ONLY], ids=["disk full", "read-only"])
+def test_evaluations(fault: int, tracked_folder: Path, tmp_path: Path) -> None:
+    """What an evaluation could not write, it says in one sentence; the figures before are there still."""
+    run = tmp_path / "run"
+    train_small(tracked_folder, run, ["trainer.iterations=2"])
+    words = ["eval", str(run), "--protocol", "strict", "--frames"]
+    torch.set_num_threads(1)
+    run_eval(parse(words))
+    figures = (run / "eval" / "results.json").read_bytes()
+    for step in (1, 10, 60):
+        assert outcome(lambda: run_eval(parse(words)), lambda: fail_from(step, fault)) == REFUSED  # noqa: B023
+        assert (run / "eval" / "results.json").read_bytes() == figures
 
 
 @FAULTS

@@ -123,5 +123,5 @@ def test_a_deep_nest_is_made_and_thrown_away() -> None:
 
 
 def test_a_device_without_end_is_not_read() -> None:
-    with pytest.raises(UserError, match=r"^/dev/zero is empty"):
+    with pytest.raises(UserError, match=r"^/dev/zero is a device"):
         load_pickle("/dev/zero")

@@ -223,7 +223,7 @@ def test_files_that_are_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(pickles, "MAX_FILE_BYTES", 1000)
     with pytest.raises(UserError, match=r"zeros\.npz would unpack to more than 1000 bytes"):
         load_npz(tmp_path / "zeros.npz")
-    with pytest.raises(UserError, match=r"model\.pkl has \d{4} bytes; files of more than 1000 bytes are not read"):
+    with pytest.raises(UserError, match=r"model\.pkl has 1\.8 KB; files of its kind are read up to 1\.0 KB"):
         load_pickle(tmp_path / "model.pkl")
 
 
@@ -266,3 +266,25 @@ def test_flipped_bytes_never_escape_as_other_errors() -> None:
             assert str(error).startswith("flipped.pkl ")
             refused += 1
     assert refused > 1000  # the rest hit numbers inside the arrays
+
+
+@pytest.mark.parametrize(
+    "codes", [[0x7FFFFFFF], [65, 0x110000], [0xD800]], ids=["huge", "beyond the last", "surrogate"]
+)
+@pytest.mark.parametrize("order", "<>")
+def test_text_that_is_not_unicode_is_refused(codes: list[int], order: str, tmp_path: Path) -> None:
+    """numpy makes no str of it, and says so in an error of its own, where it is used."""
+    text = np.array(codes, f"{order}u4").view(f"{order}U{len(codes)}")
+    np.savez(tmp_path / "text.npz", names=text)
+    with pytest.raises(UserError, match="text that is not Unicode"):
+        load_npz(tmp_path / "text.npz")
+    with pytest.raises(UserError, match="text that is not Unicode"):
+        load_pickle(pickle.dumps(text))
+
+
+def test_text_comes_back(tmp_path: Path) -> None:
+    names = np.array(["Zoë", "", "\N{GRINNING FACE}"])
+    for array in (names, names.astype(">U3"), np.array("one"), np.array([""])):
+        np.savez(tmp_path / "text.npz", names=array)
+        assert load_npz(tmp_path / "text.npz")["names"].tolist() == array.tolist()
+        assert load_pickle(pickle.dumps(array)).tolist() == array.tolist()

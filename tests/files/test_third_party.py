@@ -115,7 +115,7 @@ def test_the_command(
     optional = published._replace(name="other.bin", is_optional=True)
     monkeypatch.setattr(command, "TRACKING_FILES", (published, optional))
     monkeypatch.setattr(command, "NETS", ())
-    monkeypatch.setattr(command, "FETCHED_BY_DEFAULT", ())
+    monkeypatch.setattr(command, "FETCHED_LPIPS", ())
     assert main(["models"]) == 1
     said = capsys.readouterr().out
     assert f"missing: put {published.url} into {models_folder()}" in said and f"SHA-256 {SHA256}" in said

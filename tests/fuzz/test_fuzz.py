@@ -12,6 +12,7 @@ import json
 import os
 import pickletools
 import random
+import re
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutate import mutate
+from special_files import SPECIAL
 from target import Target
 from targets import make_targets
 from watch import Forbidden, memory_cap, watched
@@ -40,6 +42,9 @@ NAMES = (
     "drive .csv", "Live Link Face", "override", "avatar file", "avatar file, its text", "avatar file with its head",
     "tracked folder", "its tracking", "its tracking, checksums right", "landmarks", "embedding", "sweep",
 )  # fmt: skip
+
+# These read no file by themselves, or go on without the frame.
+FROM_MEMORY = {"pickle", "torch", "torch, checksums right", "image", "override", ".frame"}
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +102,25 @@ def is_read(target: Target, data: bytes, where: str) -> bool:
         raise AssertionError(f"{where}: {type(error).__name__}: {error}") from error
     assert not events, where
     return True
+
+
+@pytest.mark.timeout(20, func_only=True)
+@pytest.mark.parametrize("kind", SPECIAL)
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in FROM_MEMORY])
+def test_what_is_no_file_is_refused_at_once(name: str, kind: str, targets: dict[str, Target]) -> None:
+    """In its place lies a FIFO, a device, a file larger than memory: none is waited for or read to its end."""
+    target, (make, word) = targets[name], SPECIAL[kind]
+    file, read = target.reader
+    assert file is not None
+    file.unlink(missing_ok=True)
+    make(file)
+    try:
+        with memory_cap(), pytest.raises(UserError, match=re.escape(word)) as refusal:
+            read(b"")
+        assert file.name in str(refusal.value)
+    finally:
+        file.rmdir() if file.is_dir() else file.unlink()
+        file.write_bytes(target.wrap(target.seeds[0]))
 
 
 @pytest.mark.parametrize(

@@ -53,3 +53,8 @@ def test_the_policy_forbids_all_but_the_pages_own_script() -> None:
     assert "let a = 1 < 2;" in document("t", [], "let a = 1 < 2;")
     with pytest.raises(ValueError, match="must not contain"):
         document("t", [], "'</SCRIPT>'")
+
+
+def test_a_path_that_is_not_utf_8_is_shown_as_far_as_it_can_be() -> None:
+    page = document("caf\udce9", [element("p", "caf\udce9", title="caf\udce9")])
+    assert page.encode().count(b"caf\\udce9") == 3

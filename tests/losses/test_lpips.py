@@ -45,8 +45,8 @@ def publish(folder: Path, lpips: Lpips) -> tuple[ThirdPartyFile, ThirdPartyFile]
     )
     sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in ("backbone.pth", "heads.pth")}
     return (
-        ThirdPartyFile("backbone.pth", (folder / "backbone.pth").as_uri(), sums["backbone.pth"][:8]),
-        ThirdPartyFile("heads.pth", (folder / "heads.pth").as_uri(), sums["heads.pth"]),
+        ThirdPartyFile("backbone.pth", (folder / "backbone.pth").as_uri(), sums["backbone.pth"][:8], 3),
+        ThirdPartyFile("heads.pth", (folder / "heads.pth").as_uri(), sums["heads.pth"], 3),
     )
 
 
@@ -218,7 +218,7 @@ def test_damaged_safetensors(tmp_path: Path, content: str) -> None:
             "pickle": pickle.dumps(Bomb(marker)),
         }[content]
     )
-    with pytest.raises(UserError, match=r"lpips_squeeze\.safetensors is not a readable safetensors file"):
+    with pytest.raises(UserError, match=r"lpips_squeeze\.safetensors is damaged or no safetensors file"):
         load_lpips("squeeze", tmp_path)
     assert not marker.exists()
 
@@ -234,5 +234,5 @@ def test_weights_of_another_network_or_with_nan(tmp_path: Path) -> None:
     broken = Lpips("squeeze")
     broken.heads[2].data[7] = float("nan")
     save_lpips(broken, path)
-    with pytest.raises(UserError, match=r"w\.safetensors holds non-finite values in heads\.2"):
+    with pytest.raises(UserError, match=r"w\.safetensors cannot be used: heads\.2 has 1 non-finite"):
         load_lpips("squeeze", path)

@@ -85,7 +85,7 @@ def test_published_linear_heads_fit(net: Net, tmp_path: Path) -> None:
     backbone = Lpips(net)
     state = {name: tensor for name, tensor in backbone.state_dict().items() if name.startswith("features.")}
     torch.save(state, tmp_path / "backbone.pth")
-    lpips = from_published(net, tmp_path, (ThirdPartyFile("backbone.pth", "", ""), LPIPS_FILES[net][1]))
+    lpips = from_published(net, tmp_path, (ThirdPartyFile("backbone.pth", "", "", 600), LPIPS_FILES[net][1]))
     published = torch.load(heads, map_location="cpu", weights_only=True)
     for index, head in enumerate(lpips.heads):
         torch.testing.assert_close(head.data, published[f"lin{index}.model.1.weight"].flatten())

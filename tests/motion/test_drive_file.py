@@ -157,7 +157,7 @@ def test_a_bad_csv_gets_one_sentence(mistake: str, tmp_path: Path) -> None:
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_bytes(b"\xff\xfe\x00\x81" * 40)
-    with pytest.raises(UserError, match="cannot be read as CSV"):
+    with pytest.raises(UserError, match="bad.csv is not UTF-8 text"):
         read(tmp_path / "bad.csv")
 
 

@@ -24,15 +24,12 @@ def spec_of(*devices: str, gpus: float | None = None) -> Spec:
 
 
 class Worker:
-    """A process that ends when it is told to."""
+    """One that ends when it is told to."""
 
-    returncode: int | None = None
+    said: str | None = None
 
-    def poll(self) -> int | None:
-        return self.returncode
-
-    def communicate(self) -> tuple[bytes, bytes]:
-        return b"", b""
+    def poll(self) -> str | None:
+        return self.said
 
 
 @pytest.fixture
@@ -45,7 +42,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[Worker, str]]:
         found[folder.name] = Worker(), gpus
         return found[folder.name][0]
 
-    monkeypatch.setattr(engines, "start_worker", start)
+    monkeypatch.setattr(engines, "Worker", start)
     monkeypatch.setattr(engines, "workers_that_fit", lambda _: 8)
     return found
 
@@ -65,10 +62,10 @@ def test_every_job_has_a_gpu_of_its_own_and_the_next_one_takes_its_place(
     engine.submit([Path(name) for name in "abcd"])
     assert {name: gpus for name, (_, gpus) in started.items()} == {"a": "0", "b": "1"}
     assert engine.poll(Path("a")) is None
-    started["b"][0].returncode = 0
+    started["b"][0].said = ""
     assert engine.poll(Path("b")) == ""
     assert started["c"][1] == "1" and "d" not in started
-    started["a"][0].returncode = 0
+    started["a"][0].said = ""
     engine.poll(Path("a"))
     assert started["d"][1] == "0"
 
@@ -127,7 +124,7 @@ def test_slurm_is_asked_for_whole_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(AutoExecutor=lambda **_: executor)
     monkeypatch.setitem(sys.modules, "submitit", fake)  # type: ignore[arg-type]
     for spec in (spec_of("cuda"), spec_of("", gpus=0.25), spec_of("")):
-        make_engine("slurm", spec, Path(), EngineOptions())
+        make_engine("slurm", spec, Path(), EngineOptions(address="slurm"))
     assert [parameters["gpus_per_node"] for parameters in asked] == [1, 1, 0]
 
 

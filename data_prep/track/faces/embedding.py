@@ -13,6 +13,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets, find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
@@ -48,7 +49,7 @@ def official_embedding(head: Path, assets: HeadAssets) -> LandmarkEmbedding | No
     Its 105 points are contours of eyes, brows, nose and lips. Raises UserError for a file that does not fit the model.
     """
     path = find_model_file(head).parent / OFFICIAL_FILE
-    if not path.is_file():
+    if not is_there(path):
         return None
     arrays = load_npz(path)
     missing = [key for key in ("lmk_face_idx", "lmk_b_coords", "landmark_indices") if key not in arrays]

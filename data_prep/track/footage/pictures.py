@@ -60,10 +60,7 @@ class PictureFolder:
         if not self._hash:
             digest = hashlib.sha256()
             for file in self.files:
-                try:
-                    digest.update(file.name.encode(errors="surrogateescape") + b"\0" + file.read_bytes())
-                except OSError as error:
-                    raise UserError(f"{file} cannot be read ({error.strerror})") from None
+                digest.update(file.name.encode(errors="surrogateescape") + b"\0" + read_bytes(file))
             self._hash.append(digest.hexdigest())
         return self._hash[0]
 
@@ -109,7 +106,7 @@ def open_pictures(folder: Path) -> PictureFolder:
         found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     except OSError as error:
         raise UserError(f"{folder} cannot be read ({error.strerror})") from None
-    files = tuple(sorted((p for p in found if p.is_file()), key=_natural))
+    files = tuple(sorted((p for p in found if not p.is_dir()), key=_natural))
     if not files:
         inside = next((name for name in ("imgs", "frames", "images") if (folder / name).is_dir()), None)
         hint = f"; it looks like a tracked folder: give {folder / inside} to track its pictures again" if inside else ""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.opening import open_file
 from data_prep.track.footage.ffmpeg import Decoder, Shown, describe, first_picture
 from data_prep.track.footage.source import LAID_OVER_GREY, Box, Span, TimedPicture, View, check_size, opaque, stride
 from data_prep.track.footage.tone import HDR_TRANSFERS, tone_filters
@@ -106,7 +107,7 @@ class Video:
         if not self._hash:
             digest = hashlib.sha256()
             try:
-                with self.path.open("rb") as file:
+                with open_file(self.path, None) as file:
                     while chunk := file.read(2**22):
                         digest.update(chunk)
             except OSError as error:
@@ -164,14 +165,9 @@ def open_video(path: Path) -> Video:
 
 def _check_file(path: Path) -> None:
     try:
-        if not path.exists():
-            raise UserError(f"{path} does not exist")
-        if not path.is_file():
-            raise UserError(f"{path} is not a file")
-        if path.stat().st_size == 0:
-            raise UserError(f"{path} is empty; copy or record it again")
-        with path.open("rb") as file:
-            file.read(1)
+        with open_file(path, None) as file:
+            if not file.read(1):
+                raise UserError(f"{path} is empty; copy or record it again")
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror})") from None
 
@@ -187,7 +183,7 @@ def _unreadable(path: Path, said: str) -> str:
 
 def _is_cut_short(path: Path, said: str) -> bool:
     """Whether it is a file of MP4's kind whose index is missing, wholly or in part."""
-    with path.open("rb") as file:
+    with open_file(path, None) as file:
         head = file.read(64)
     is_of_the_kind = head[4:8] in (b"ftyp", b"mdat", b"wide", b"free")
     return is_of_the_kind and ("moov atom not found" in said or ("Audio:" not in said and "Video:" not in said))

@@ -1,0 +1,25 @@
+"""Names that come out of files, fit to be names of files: what a file says must not choose where something is written."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+
+MAX_NAME_BYTES = 100  # in UTF-8; file systems take 255, and suffixes follow
+_FORBIDDEN = frozenset('/\\:*?"<>|')  # separators, and what Windows refuses
+_NOT_AT_THE_ENDS = " .-~"  # hidden files, options, home folders
+
+
+def safe_name(text: str, otherwise: str = "unnamed") -> str:
+    """`text` as a name without folders, of printable letters and at most `MAX_NAME_BYTES`; `otherwise` for nothing."""
+    letters = "".join(letter if letter.isprintable() and letter not in _FORBIDDEN else "_" for letter in text)
+    short = letters.lstrip(_NOT_AT_THE_ENDS).encode()[:MAX_NAME_BYTES].decode(errors="ignore")
+    return short.rstrip(_NOT_AT_THE_ENDS) or otherwise
+
+
+def shortened(name: str) -> str:
+    """`name`, so short that something can be put before and behind it; a long one ends in its hash."""
+    data = os.fsencode(name)
+    if len(data) <= MAX_NAME_BYTES:
+        return name
+    return f"{data[: MAX_NAME_BYTES - 9].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"

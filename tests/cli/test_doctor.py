@@ -1,0 +1,111 @@
+"""`avatar doctor`: a table of name, state and what to do, at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+from command_line import avatar
+
+from avatar import doctor
+from avatar.errors import UserError
+from avatar.files.third_party import FACE_LANDMARKER, LPIPS_FILES, TRACKING_FILES, lpips_folder, models_folder
+
+NAMES = [
+    *("PyTorch", "compiled core", "configuration", "video encoder", "GPU", "head model"),
+    *(file.name for file in TRACKING_FILES),
+    *(f"LPIPS {net}" for net in LPIPS_FILES),
+    *doctor.EXTRAS,
+]
+
+
+@pytest.fixture(autouse=True)
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One without a GPU and without files of others."""
+    monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
+    for name in ("AVATAR_MODELS", "AVATAR_LPIPS", "AVATAR_HEAD"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(doctor, "has_gpu_driver", lambda: False)
+
+
+def rows(output: str) -> dict[str, tuple[str, str]]:
+    """State and advice by name, read by the columns of the heading."""
+    lines = output.partition("\nAddresses")[0].splitlines()
+    begin = next(i for i, line in enumerate(lines) if line.startswith("name"))
+    state, advice = lines[begin].index("state"), lines[begin].index("what to do")
+    return {line[:state].strip(): (line[state:advice].strip(), line[advice:].strip()) for line in lines[begin + 1 :]}
+
+
+def test_it_is_a_table_with_whole_names_and_the_addresses_below() -> None:
+    output = avatar("doctor")
+    found = rows(output)
+    assert list(found) == NAMES
+    assert found["compiled core"] == ("works", "") and found["configuration"] == ("found", "")
+    assert found["video encoder"][0].startswith("ffmpeg ")
+    assert found["face_landmarker.task"] == ("missing", "avatar models --download")
+    assert found["selfie_multiclass_256x256.tflite"] == ("missing", "optional: avatar models --download")
+    assert "AVATAR_HEAD" in found["head model"][1] and found["GPU"][0] == "none"
+    table, _, below = output.partition("\nAddresses")
+    assert "http" not in table and max(map(len, table.splitlines())) <= 120
+    for file in (*TRACKING_FILES, *(file for both in LPIPS_FILES.values() for file in both)):
+        assert f"    {file.url}\n" in below
+    assert str(models_folder()) in below and str(lpips_folder()) in below
+
+
+def test_it_does_not_wait_for_pytorch() -> None:
+    program = (
+        "import sys; from avatar.cli import main; main(['doctor']); assert 'torch' not in sys.modules; print('light')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "light" in done.stdout, done.stderr
+
+
+def test_what_is_damaged_is_not_called_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    models_folder().mkdir(parents=True)
+    (models_folder() / FACE_LANDMARKER.name).write_bytes(b"another file")
+    lpips_folder().mkdir()
+    (lpips_folder() / "lpips_squeeze.safetensors").write_bytes(b"another file")
+    for file in LPIPS_FILES["alex"]:
+        (lpips_folder() / file.name).write_bytes(b"another file")
+    monkeypatch.setenv("AVATAR_HEAD", str(tmp_path / "none"))
+    output = avatar("doctor")
+    found = rows(output)
+    for name in (FACE_LANDMARKER.name, "LPIPS squeeze", "LPIPS alex"):
+        assert found[name][0] == "damaged" and FACE_LANDMARKER.url not in output
+    assert found["head model"][0] == "missing" and str(tmp_path / "none") in found["head model"][1]
+
+
+def test_a_package_that_is_missing_has_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name in doctor.EXTRAS:
+            raise PackageNotFoundError(name)
+        return "1"
+
+    monkeypatch.setattr(doctor, "version", version)
+    found = rows(avatar("doctor"))
+    assert found["viser"] == ("missing", "avatar view: pip install 'hyperavatar[view]'")
+    assert "hyperavatar[plots]" in found["matplotlib"][1] and "hyperavatar[track]" in found["mediapipe"][1]
+
+
+@pytest.mark.parametrize("part", ["draw_one_triangle", "config_dir"])
+def test_what_every_command_needs_decides_the_status(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> str:
+        raise UserError("it is not there")
+
+    monkeypatch.setattr(doctor, part, fail)
+    assert "broken" in avatar("doctor", status=1)
+
+
+def test_a_gpu_is_tested_where_there_is_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "has_gpu_driver", lambda: True)
+    monkeypatch.setattr(doctor, "find_gpu", lambda: "cuda:0 computes what the CPU does")
+    assert rows(avatar("doctor"))["GPU"] == ("cuda:0 computes what the CPU does", "")
+
+    def fail() -> str:
+        raise UserError("its driver is too old")
+
+    monkeypatch.setattr(doctor, "find_gpu", fail)
+    assert rows(avatar("doctor"))["GPU"] == ("not used", "its driver is too old")
