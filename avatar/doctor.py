@@ -14,6 +14,7 @@ import avatar
 from avatar.compute.choose import check_gpu, describe_gpu
 from avatar.config import config_dir
 from avatar.errors import UserError
+from avatar.files.places import named_path
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import load_head_assets
 from avatar.losses.lpips import load_lpips
@@ -90,8 +91,8 @@ def find_gpu() -> str:
 
 
 def find_default_head() -> str:
-    named = os.environ.get(HEAD_VARIABLE)
+    named = named_path(HEAD_VARIABLE)
     if not named:
         return f"{HEAD_VARIABLE} is not set; give --head, or put head_model/ into the subject"
-    assets = load_head_assets(Path(named))
+    assets = load_head_assets(named)
     return f"{named}: {assets.num_vertices} vertices, {assets.num_expressions} expressions"

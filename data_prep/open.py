@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.places import named_path
 from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets, load_head_assets
 from data_prep import avatar_track
 from data_prep.prepare import prepare
@@ -27,8 +27,8 @@ def find_head(folder: Path, given: Path | None = None) -> Path:
         return folder / "head_model"
     if (recorded := recorded_head(folder)) is not None:
         return recorded
-    if named := os.environ.get(HEAD_VARIABLE):
-        return Path(named)
+    if named := named_path(HEAD_VARIABLE):
+        return named
     raise UserError(
         f"no head model for {folder}: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can be had "
         "from https://flame.is.tue.mpg.de; docs/data.md says which files belong into its folder"

@@ -71,7 +71,7 @@ class Plan:
         """Raises UserError for a file that `save` did not write."""
         path = plan_file(run)
         try:
-            raw = json.loads(path.read_text(encoding="utf-8"))
+            raw = json.loads(path.read_bytes())
         except (OSError, ValueError, RecursionError) as error:
             raise UserError(f"{path} cannot be read ({error})") from None
         if not isinstance(raw, dict) or raw.get("format") != PLAN_FORMAT:

@@ -68,7 +68,7 @@ def read_manifest(prepared: Path) -> Manifest:
     try:
         if file.stat().st_size > _MAX_BYTES:
             raise UserError(f"{file} is larger than a manifest can be; prepare the subject again")
-        raw = json.loads(file.read_text(encoding="utf-8"))
+        raw = json.loads(file.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{prepared} is not a prepared subject: it has no {MANIFEST_FILE}") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -110,7 +110,7 @@ def compare_runs(runs: Sequence[Path], protocols: Sequence[str] | None = None) -
 def read_evaluation(label: str, run: Path) -> Evaluation:
     path = run / "eval" / "results.json"
     try:
-        results = json.loads(path.read_text(encoding="utf-8"))
+        results = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{run} was not evaluated (there is no {path}): run avatar eval {run} first") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -22,7 +22,7 @@ _NO_MATTER = ("threads",)  # of the versions: the figures are the same to roundi
 def earlier_results(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
     """Entries by other protocols that RUN/eval holds of what `results` are about, with their tables of frames in place."""
     try:
-        earlier = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        earlier = json.loads((folder / "results.json").read_bytes())
         if _identity(earlier) != _identity(json.loads(json.dumps(results))):
             return {}
         asked = {*results["protocols"], *results["left_out"]}

@@ -175,7 +175,7 @@ def _read_yaml(path: Path) -> dict[Any, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise UserError(f"{path} is larger than a protocol can be ({MAX_BYTES >> 10} KB)")
-        values = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
+        values = yaml.load(path.read_bytes(), _PlainLoader)
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror})") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

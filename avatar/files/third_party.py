@@ -7,7 +7,6 @@ $AVATAR_CACHE, else in ~/.cache/avatar). A file counts only with the published S
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 import urllib.error
 import urllib.request
@@ -17,6 +16,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from avatar.errors import UserError
+from avatar.files.places import cache_folder, named_path
 
 FOLDER_VARIABLE = "AVATAR_MODELS"
 
@@ -102,16 +102,14 @@ LPIPS_FILES = {
 
 def models_folder() -> Path:
     """Where downloads go: `models` in the cache."""
-    cache = os.environ.get("AVATAR_CACHE")
-    return (Path(cache).expanduser() if cache else Path.home() / ".cache" / "avatar") / "models"
+    return cache_folder() / "models"
 
 
 def search_folders() -> list[Path]:
     """The folders that files are looked for in, in this order."""
-    named = os.environ.get(FOLDER_VARIABLE)
+    place = named_path(FOLDER_VARIABLE)
     folders = [models_folder()]
-    if named:
-        place = Path(named).expanduser()
+    if place is not None:
         inside = sorted(path for path in place.iterdir() if path.is_dir()) if place.is_dir() else []
         folders = [place, *inside, *folders]
     return folders

@@ -7,7 +7,6 @@ Weights are looked for in a file or folder that the caller names, else in the fo
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.files.places import cache_folder, named_path
 from avatar.files.third_party import LPIPS_FILES, ThirdPartyFile, check_sha256, fetch, search_folders, sha256_of
 from avatar.losses.lpips_network import NETS, Lpips, Net
 
@@ -27,11 +27,7 @@ class MissingWeights(UserError):
 
 def lpips_folder() -> Path:
     """Where weights are looked for when the caller names no place."""
-    named = os.environ.get("AVATAR_LPIPS")
-    if named:
-        return Path(named)
-    cache = os.environ.get("AVATAR_CACHE")
-    return (Path(cache) if cache else Path.home() / ".cache" / "avatar") / "lpips"
+    return named_path("AVATAR_LPIPS") or cache_folder() / "lpips"
 
 
 def _folder_with(net: Net) -> Path:

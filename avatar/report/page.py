@@ -67,7 +67,7 @@ def read_results(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        results = json.loads(path.read_text(encoding="utf-8"))
+        results = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read ({error}); run avatar eval again") from None
     if not isinstance(results, dict) or not isinstance(results.get("protocols"), dict):

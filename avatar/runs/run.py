@@ -114,7 +114,7 @@ def read_run_info(run: Path) -> RunInfo:
             f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out)"
         )
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
+        info = json.loads(path.read_bytes())
     except (ValueError, OSError, RecursionError) as error:
         raise UserError(f"{path} cannot be read as JSON ({error})") from None
     if not isinstance(info, dict) or info.get("format") != RUN_FORMAT:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from torch import Tensor
 from avatar.config import Config
 from avatar.data.recording import Recording
 from avatar.errors import UserError
+from avatar.files.places import named_path
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
 from avatar.motion.repertoire import Repertoire, learn_repertoire
@@ -138,8 +138,8 @@ def avatar_path(path: Path) -> Path:
 def _find_head(path: Path, recorded: Path | None) -> Path:
     if recorded is not None and recorded.exists():
         return recorded
-    if named := os.environ.get(HEAD_VARIABLE):
-        return Path(named)
+    if named := named_path(HEAD_VARIABLE):
+        return named
     gone = f" (that of the training, {recorded}, is gone)" if recorded is not None else ""
     raise UserError(
         f"{path} needs its head model{gone}: give --head PATH, or set {HEAD_VARIABLE}; avatar export --with-head makes "

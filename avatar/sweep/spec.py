@@ -27,6 +27,7 @@ import yaml
 
 from avatar.config import load_config
 from avatar.errors import UserError
+from avatar.files.places import expanded
 
 MAX_BYTES, MAX_JOBS = 2**20, 100_000
 KEYS = {
@@ -140,7 +141,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise UserError(f"{path} has more than {MAX_BYTES} bytes; no sweep has")
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        raw = yaml.safe_load(path.read_bytes())
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise UserError(f"{path} cannot be read as YAML ({str(error).splitlines()[0]})") from None
     if not isinstance(raw, dict):
@@ -159,7 +160,7 @@ def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:
         if (value := found.get(key)) is not None:
             if not isinstance(value, str):
                 raise UserError(f"{path}: {key} is {value!r}, not a path")
-            found[key] = str((path.resolve().parent / Path(value).expanduser()).resolve())
+            found[key] = str((path.resolve().parent / expanded(value, f"{path}: {key} {value}")).resolve())
     name = found.get("name", Path(found["folder"]).name)
     if not isinstance(name, str) or not name:
         raise UserError(f"{path}: a subject's name is {name!r}, not text")

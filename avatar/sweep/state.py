@@ -94,7 +94,7 @@ def read_state(folder: Path) -> State:
     """A job's state; one that says `running` and has been silent for a minute is waiting again."""
     path = folder / "state.json"
     try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
+        raw = json.loads(path.read_bytes())
         state = State(**raw)
     except FileNotFoundError:
         return State()
@@ -128,7 +128,7 @@ def worker_name() -> str:
 
 def _read_json(path: Path, absent: str) -> Mapping[str, Any]:
     try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
+        raw = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(absent) from None
     except (OSError, ValueError, RecursionError) as error:
