@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
     try:
         # The commands import torch and the compiled core; --help must answer without them.
         from avatar.commands import find_command
-        from avatar.commands.parser import parse
+        from avatar.commands.arguments import parse
 
         arguments = parse(argv)
         command = find_command(arguments.command)

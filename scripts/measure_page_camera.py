@@ -32,13 +32,13 @@ from playwright.sync_api import sync_playwright
 from torch import Tensor
 
 from avatar.commands.driving import head_of
-from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.export.drawing import reduce_avatar
 from avatar.export.landmarker_pack import PACK, make_pack
 from avatar.export.web_page import WEB, write_page, write_web_avatar
 from avatar.head.lips import lip_gap, lip_pairs
 from avatar.motion.rest import stacked
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.live import Live

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands import OK
-from avatar.commands.opening import open_driver, open_run, open_trained
+from avatar.commands.opening import open_driver, open_run
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.tracking import bar, can_track
 from avatar.commands.training import resume_run, train_new
@@ -16,13 +16,15 @@ from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
+from avatar.files.video import VIDEO_SUFFIXES
 from avatar.head.assets import load_head_assets
 from avatar.motion.reenact import reenact
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.run import RUN_FILE, read_run_info
+from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from data_prep.track.track import track
 
 RECIPE = ["experiment=demo"]
+NAMES_OF_VIDEOS = (*VIDEO_SUFFIXES, ".avi", ".m4v", ".webm")  # what a person calls so is no folder
 SUBJECT_SIZE, VIDEO_SIZE = 192, 384  # pixels of the pictures, a side
 
 
@@ -37,7 +39,7 @@ ACTOR, DRIVER = Person("actor", 500, 1), Person("driver", 100, 2)
 
 def run_demo_data(arguments: Namespace) -> int:
     check_outputs([arguments.out], [])
-    if arguments.video:
+    if arguments.video or arguments.out.suffix.lower() in NAMES_OF_VIDEOS:
         size = 512 if arguments.size is None else arguments.size
         make_video(arguments.out, arguments.frames, size, arguments.seed, arguments.motion)
         if not (head := head_beside(arguments.out)).exists():

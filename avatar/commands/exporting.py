@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from avatar.commands import OK
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_trained
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
@@ -23,6 +23,7 @@ from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
 

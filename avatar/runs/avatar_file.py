@@ -37,6 +37,13 @@ from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shap
 
 AVATAR_FILE = "avatar.safetensors"
 AVATAR_FORMAT = 1
+# How files begin that are taken for avatar files, and what they are for.
+OTHER_FILES = {
+    b"<!doctype html": "is a page: open it in a browser",
+    b"\x1f\x8b": "is for <avatar-view> in a web page",
+    b"ply\n": "holds the Gaussians of one frame, for viewers of 3D Gaussian splatting",
+    b"glTF": "is a mesh, for viewers of glTF",
+}
 _RECORDING, _NEUTRAL, _HEAD = "recording.", "neutral.", "head."
 
 
@@ -111,6 +118,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not path.is_file():
         raise UserError(f"there is no avatar file {path}; give the folder that avatar train wrote, or a file of it")
     try:
+        with path.open("rb") as file:
+            start = file.read(16)
+        for beginning, what in OTHER_FILES.items():
+            if start.lower().startswith(beginning.lower()):
+                raise UserError(f"{path} {what}; this takes the run that it was exported from, or its {AVATAR_FILE}")
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("avatar", "null"))
             if not isinstance(header, dict) or header.get("format") != AVATAR_FORMAT or "frames" not in header:

@@ -19,7 +19,7 @@ from lively import lively_run
 from pythonosc.osc_message_builder import OscMessageBuilder
 from waiting import until
 
-from avatar.commands.parser import parse
+from avatar.commands.arguments import parse
 from avatar.commands.viewing import run_send
 from avatar.errors import UserError
 from avatar.head.expression_names import ExpressionNames
