@@ -92,7 +92,7 @@ def measure_live(trained: TrainedAvatar, video: Path, seconds: float, renderer: 
     film = folder / "film.mjpeg"
     words = ["-loglevel", "error", "-y", "-i", str(video), "-pix_fmt", "yuvj420p", "-q:v", "3", str(film)]
     subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True)
-    page_file = write_page(trained, folder / "page.html").path
+    page_file = write_page(trained, folder / "page.html", webcam=True).path
     camera = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
     flags = [*FLAGS, *camera, f"--use-file-for-fake-video-capture={film}"]
     with sync_playwright() as playwright:

@@ -71,7 +71,7 @@ def check_options(arguments: Namespace, format: str) -> None:
 
 def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     pack = make_pack() if arguments.webcam else None
-    page = write_page(trained, out, arguments.precision or "small")
+    page = write_page(trained, out, arguments.precision or "small", webcam=arguments.webcam)
     print(f"Page     {out} ({page.bytes / MIB:.1f} MiB): opens in any browser, without a network")
     if page.note:
         print(f"Note     {page.note}")
