@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
@@ -71,16 +72,28 @@ def run_demo(arguments: Namespace) -> int:
         return status
     trained = open_trained(run)
     video = reenact(trained, open_driver(driver, trained), run / "reenact" / "driver-relative.mp4")
-    results = evaluate(open_run(run), None, write_frames=False)
+    results = evaluate(open_run(run, say=discard), None, write_frames=False, say=discard)
     page = write_page(trained, out / "avatar.html")
-    print("\nThe demo is done. Look at")
+    print("\nThe demo is done.")
     if (film := out / f"{ACTOR.name}.mp4").is_file():
         print(f"  {film}   the video that the avatar was made from")
-    print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
+    print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error; {figures(results)}")
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
-    print(f"  {page.path}   the avatar itself, alive in any browser: open this first")
+    print(f"  avatar eval {run}   prints all its figures, avatar view {run} moves it by hand")
+    print(f"\nOpen this first: {page.path}, the avatar in a browser")
     return OK
+
+
+def discard(_: str) -> None:
+    """What `avatar eval` prints is a screen of its own."""
+
+
+def figures(results: Path) -> str:
+    """Of the protocol that masks nothing away."""
+    strict = json.loads(results.read_bytes())["protocols"]["strict"]
+    means = strict["means"]
+    return f"PSNR {means['psnr']:.2f}, SSIM {means['ssim']:.4f} over {len(strict['frames'])} of them"
 
 
 def film_and_track(person: Person, out: Path) -> None:
