@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The first session on a machine with a GPU: everything that cannot be checked without one, into OUT (default gpu-session).
 #   scripts/first_gpu_session.sh [OUT]
-# Needs `make setup`, a torch build for the GPU and `.venv/bin/pip install triton` where torch did not bring it. About half
+# Needs `make setup-dev`, a torch build for the GPU and `.venv/bin/pip install triton` where torch did not bring it. About half
 # an hour; each part goes on where another failed, and the last lines say which did.
 set -uo pipefail
 cd "$(dirname "$0")/.."

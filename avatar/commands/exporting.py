@@ -167,7 +167,7 @@ def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -
     if licence:
         print(f"Licence  {licence}")
     else:
-        print(f"Next     avatar reenact {out} --head HEAD --driver DRIVER; it needs the head model it was trained with")
+        print(f"Next     avatar reenact {out} DRIVER --head HEAD; it needs the head model it was trained with")
 
 
 SUFFIXES = {
