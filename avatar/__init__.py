@@ -22,8 +22,9 @@ def load(file: Path | str, head: Path | str | None = None) -> TrainedAvatar:
     """Open a trained avatar: a run folder, its avatar.safetensors, or a copy of that anywhere.
 
     `head` is the FLAME-format head model that it was trained with, a file or folder; None takes the one packed into the
-    file, or the one at $AVATAR_HEAD. Raises UserError (`avatar.errors`) with what is wrong and what to do.
+    file, else the one that the run was trained with, where that still is, else the one at $AVATAR_HEAD. Raises UserError
+    (`avatar.errors`) with what is wrong and what to do.
     """
-    from avatar.runs.trained import load_avatar  # imports torch; `avatar --help` must not wait for it
+    from avatar.runs.run import open_trained  # imports torch; `avatar --help` must not wait for it
 
-    return load_avatar(file, head)
+    return open_trained(Path(file), None if head is None else Path(head))

@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
     try:
         # The commands import torch and the compiled core; --help must answer without them.
         from avatar.commands import find_command
-        from avatar.commands.parser import parse
+        from avatar.commands.arguments import parse
 
         arguments = parse(argv)
         command = find_command(arguments.command)
@@ -39,6 +39,10 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
     except OSError as error:
         place = "" if error.filename is None else f"{error.filename}: "
         return _failed(f"{place}{error.strerror or error}")
+    except UnicodeEncodeError as error:
+        if error.reason != "surrogates not allowed":
+            raise
+        return _failed(f"{error.object} has a name that is not UTF-8, which a library needs here: rename it")
     except (MemoryError, RuntimeError) as error:
         if type(error).__name__ == "OutOfMemoryError":  # torch's for a GPU, which need not be imported yet
             return _failed(
@@ -60,9 +64,7 @@ def run() -> NoReturn:
     While libraries are imported, an exception would come out of the middle of them, and some print it themselves; nothing
     is lost by leaving at once. At the end Python's own clearing up is as little to be interrupted by an exception.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a file's name may hold what a terminal cannot show
+    _prepare_streams()
     try:
         interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is to be ignored
         if interruptible:
@@ -70,23 +72,49 @@ def run() -> NoReturn:
         status = main(when_loaded=lambda: interruptible and signal.signal(signal.SIGINT, signal.default_int_handler))
         if interruptible:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        sys.stdout.flush()
     except KeyboardInterrupt:  # in the moments between
         _leave(signal.SIGINT, None)
+    except SystemExit as stop:  # of argparse
+        status = stop.code
+    try:
+        sys.stdout.flush()
     except BrokenPipeError:
         status = _nobody_reads()
+    except OSError as error:
+        _drop_output()
+        status = status or _failed(f"the output cannot be written ({error.strerror})")
     sys.exit(status)
 
 
+def _prepare_streams() -> None:
+    """Print a letter that the console does not have by its number; let closed output go nowhere, and let no file that is
+    opened later get the number of a closed stream."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def _failed(reason: str) -> int:
-    print(f"avatar: {reason}", file=sys.stderr)
+    with suppress(OSError):
+        print(f"avatar: {reason}", file=sys.stderr)
     return EXIT_ERROR
 
 
 def _nobody_reads() -> int:
     """What was printed went to a program that has ended, such as `head`."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at the end
+    _drop_output()
     return EXIT_ERROR
+
+
+def _drop_output() -> None:
+    """Python flushes at the end, and would complain again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _leave(_: int, __: FrameType | None) -> NoReturn:

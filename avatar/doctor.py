@@ -14,6 +14,7 @@ from avatar.compute.present import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError
 from avatar.files.opening import check_file, is_there
+from avatar.files.places import named_path
 from avatar.files.third_party import (
     FETCHED_LPIPS,
     HEAD_VARIABLE,
@@ -120,16 +121,18 @@ def find_gpu() -> str:
 
 
 def head_model() -> Finding:
-    named = os.environ.get(HEAD_VARIABLE)
-    if not named:
+    try:
+        path = named_path(HEAD_VARIABLE)
+    except UserError as error:
+        return Finding("head model", "missing", str(error))
+    if path is None:
         return Finding(
             "head model", "not set", f"give --head, set {HEAD_VARIABLE}, or put head_model/ into the subject"
         )
-    path = Path(named)
     if not is_there(path):
-        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {named}, which does not exist")
+        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {path}, which does not exist")
     if path.is_dir() and not any(file.suffix in (".pkl", ".npz") for file in path.iterdir()):
-        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {named}, which holds no .pkl or .npz")
+        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {path}, which holds no .pkl or .npz")
     return Finding("head model", "found")
 
 

@@ -90,8 +90,8 @@ class Renderer:
             return self._avatar.draw(gaussians, camera, background)
         except CannotDraw as error:
             raise UserError(
-                f"the avatar cannot be drawn: {error}; its training has gone wrong, train again with lower "
-                "trainer.learning_rates"
+                f"this frame cannot be drawn: {error}; its coefficients are out of range or, where no frame can be drawn, "
+                "the training has gone wrong: train again with lower trainer.learning_rates"
             ) from error
 
     def stream(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:

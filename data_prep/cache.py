@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from pathlib import Path
 
 from avatar.data.manifest import MANIFEST_VERSION
+from avatar.files.places import cache_folder
 from data_prep.frame_files import FrameFiles
-
-
-def cache_folder() -> Path:
-    """Where prepared subjects are kept: $AVATAR_CACHE, else ~/.cache/avatar."""
-    given = os.environ.get("AVATAR_CACHE")
-    return Path(given).expanduser() if given else Path.home() / ".cache" / "avatar"
 
 
 def default_location(files: FrameFiles, options: dict[str, object]) -> Path:

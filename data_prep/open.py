@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets, load_head_assets
 from data_prep import avatar_track
@@ -26,8 +26,8 @@ def find_head(folder: Path, given: Path | None = None) -> Path:
         return folder / "head_model"
     if (recorded := recorded_head(folder)) is not None:
         return recorded
-    if named := os.environ.get(HEAD_VARIABLE):
-        return Path(named)
+    if named := named_path(HEAD_VARIABLE):
+        return named
     raise UserError(
         f"no head model for {folder}: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can be had "
         "from https://flame.is.tue.mpg.de; docs/data.md says which files belong into its folder"
@@ -45,6 +45,8 @@ def recorded_head(folder: Path) -> Path | None:
 def check_folder(folder: Path) -> None:
     if folder.is_file():
         raise UserError(f"{folder} is a file; if it is a video, avatar track makes a tracked folder of it")
+    if not folder.exists():
+        raise UserError(f"{folder}: there is no such file or folder")
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder; give the tracked video folder (docs/data.md)")
 

@@ -44,7 +44,10 @@ def write_prepared(
         target.parent.mkdir(parents=True, exist_ok=True)
         building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     except OSError as error:
-        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another place") from None
+        raise UserError(
+            f"nothing can be written in {target.parent} ({error.strerror}); name another folder with --out, "
+            "or another cache with AVATAR_CACHE"
+        ) from None
     try:
         (building / TRACKS_FILE).write_bytes(save(arrays))
         write_masks(building)

@@ -20,8 +20,8 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from playwright.sync_api import sync_playwright
 
-from avatar.commands.opening import open_trained
 from avatar.export.web_page import write_page
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.cpu import thread_count
 from avatar.view.stage import Look, Setting, Stage

@@ -32,13 +32,13 @@ from playwright.sync_api import sync_playwright
 from torch import Tensor
 
 from avatar.commands.driving import head_of
-from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.export.drawing import reduce_avatar
 from avatar.export.landmarker_pack import PACK, make_pack
 from avatar.export.web_page import WEB, write_page, write_web_avatar
 from avatar.head.lips import lip_gap, lip_pairs
 from avatar.motion.rest import stacked
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.live import Live
@@ -92,7 +92,7 @@ def measure_live(trained: TrainedAvatar, video: Path, seconds: float, renderer: 
     film = folder / "film.mjpeg"
     words = ["-loglevel", "error", "-y", "-i", str(video), "-pix_fmt", "yuvj420p", "-q:v", "3", str(film)]
     subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True)
-    page_file = write_page(trained, folder / "page.html").path
+    page_file = write_page(trained, folder / "page.html", webcam=True).path
     camera = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
     flags = [*FLAGS, *camera, f"--use-file-for-fake-video-capture={film}"]
     with sync_playwright() as playwright:

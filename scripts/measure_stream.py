@@ -21,8 +21,8 @@ from measure_webcam import Record
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from avatar.commands.opening import open_trained
 from avatar.runs.clips import own_clip
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.packets import BLENDSHAPES, LIVE_LINK, LIVE_LINK_VERSION

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from avatar.commands.driving import head_of
-from avatar.commands.opening import open_trained
 from avatar.head.assets import HeadAssets
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.live import Live, Pace
 from avatar.view.player import WEBCAM, Player

@@ -19,10 +19,10 @@ from typing import Any
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.export.web_page import write_page
 from avatar.files.atomic import write_atomically
+from avatar.runs.run import open_trained
 
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 FPS, QUALITY = 10, 75  # of the picture; more of either hardly shows and makes it half as large again

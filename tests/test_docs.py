@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from avatar.commands.parser import parse
+from avatar.commands.arguments import parse
 from avatar.config import load_config
 
 COMMANDS = (

@@ -22,10 +22,10 @@ from avatar.bench.machine import limited_to
 from avatar.bench.render_plot import write_plot
 from avatar.bench.results import leave
 from avatar.bench.splat_gpu import settle
-from avatar.commands.opening import open_trained
 from avatar.compute.device import brought, on_gpu
 from avatar.errors import UserError
 from avatar.render import Renderer
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams, Rendering
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands import OK
 from avatar.commands.measuring import writing_figures
-from avatar.commands.opening import open_driver, open_run, open_trained
+from avatar.commands.opening import open_driver, open_run
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.tracking import bar, can_track
 from avatar.commands.training import resume_run, train_new
@@ -17,13 +18,15 @@ from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
+from avatar.files.video import VIDEO_SUFFIXES
 from avatar.head.assets import load_head_assets
 from avatar.motion.reenact import reenact
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.run import RUN_FILE, read_run_info
+from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from data_prep.track.track import track
 
 RECIPE = ["experiment=demo"]
+NAMES_OF_VIDEOS = (*VIDEO_SUFFIXES, ".avi", ".m4v", ".webm")  # what a person calls so is no folder
 SUBJECT_SIZE, VIDEO_SIZE = 192, 384  # pixels of the pictures, a side
 
 
@@ -38,7 +41,7 @@ ACTOR, DRIVER = Person("actor", 500, 1), Person("driver", 100, 2)
 
 def run_demo_data(arguments: Namespace) -> int:
     check_outputs([arguments.out], [])
-    if arguments.video:
+    if arguments.video or arguments.out.suffix.lower() in NAMES_OF_VIDEOS:
         size = 512 if arguments.size is None else arguments.size
         make_video(arguments.out, arguments.frames, size, arguments.seed, arguments.motion)
         if not (head := head_beside(arguments.out)).exists():
@@ -71,16 +74,28 @@ def run_demo(arguments: Namespace) -> int:
     trained = open_trained(run)
     video = reenact(trained, open_driver(driver, trained), run / "reenact" / "driver-relative.mp4")
     with writing_figures(run):
-        results = evaluate(open_run(run), None, write_frames=False)
+        results = evaluate(open_run(run, say=discard), None, write_frames=False, say=discard)
     page = write_page(trained, out / "avatar.html")
-    print("\nThe demo is done. Look at")
+    print("\nThe demo is done.")
     if (film := out / f"{ACTOR.name}.mp4").is_file():
         print(f"  {film}   the video that the avatar was made from")
-    print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
+    print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error; {figures(results)}")
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
-    print(f"  {page.path}   the avatar itself, alive in any browser: open this first")
+    print(f"  avatar eval {run}   prints all its figures, avatar view {run} moves it by hand")
+    print(f"\nOpen this first: {page.path}, the avatar in a browser")
     return OK
+
+
+def discard(_: str) -> None:
+    """What `avatar eval` prints is a screen of its own."""
+
+
+def figures(results: Path) -> str:
+    """Of the protocol that masks nothing away."""
+    strict = json.loads(results.read_bytes())["protocols"]["strict"]
+    means = strict["means"]
+    return f"PSNR {means['psnr']:.2f}, SSIM {means['ssim']:.4f} over {len(strict['frames'])} of them"
 
 
 def film_and_track(person: Person, out: Path) -> None:

@@ -6,7 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from avatar.commands import OK
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, open_trained, source_of
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, source_of
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.commands.tracking import is_video, tracked_once
 from avatar.compute.choose import choose_device
@@ -15,7 +15,7 @@ from avatar.files.video import VIDEO_SUFFIXES
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
 from avatar.motion.reenact import Choices, reenact, sidecars
-from avatar.runs.run import RUN_FILE, read_run_info
+from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained import TrainedAvatar
 from data_prep.open import open_subject
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from avatar.commands import OK
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_trained
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
@@ -24,6 +24,7 @@ from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
 
@@ -71,7 +72,7 @@ def check_options(arguments: Namespace, format: str) -> None:
 
 def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     pack = make_pack() if arguments.webcam else None
-    page = write_page(trained, out, arguments.precision or "small")
+    page = write_page(trained, out, arguments.precision or "small", webcam=arguments.webcam)
     print(f"Page     {out} ({page.bytes / MIB:.1f} MiB): opens in any browser, without a network")
     if page.note:
         print(f"Note     {page.note}")
@@ -167,7 +168,7 @@ def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -
     if licence:
         print(f"Licence  {licence}")
     else:
-        print(f"Next     avatar reenact {out} --head HEAD --driver DRIVER; it needs the head model it was trained with")
+        print(f"Next     avatar reenact {out} DRIVER --head HEAD; it needs the head model it was trained with")
 
 
 SUFFIXES = {

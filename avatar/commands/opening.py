@@ -15,8 +15,8 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.motion.drive import Drive
 from avatar.motion.drive_file import read_drive
-from avatar.runs.run import RUN_FILE, Run, RunInfo, read_run_info
-from avatar.runs.trained import TrainedAvatar, load_avatar
+from avatar.runs.run import Run, RunInfo, open_trained, read_run_info
+from avatar.runs.trained import TrainedAvatar
 from data_prep.open import check_folder, find_head, open_subject
 
 DRIVE_SUFFIXES = (".npz", ".csv")
@@ -38,12 +38,6 @@ def source_of(arguments: Namespace) -> Source:
 
 def split_sizes(config: Config) -> SplitSizes:
     return SplitSizes(config.data.train_frames, config.data.test_frames)
-
-
-def open_trained(path: Path, head: Path | None = None) -> TrainedAvatar:
-    """An avatar from a run or a file; a run knows where its head model was."""
-    recorded = read_run_info(path).source.head if (path / RUN_FILE).is_file() else None
-    return load_avatar(path, head, recorded_head=recorded)
 
 
 def open_run(

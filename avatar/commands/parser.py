@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 import avatar
@@ -21,45 +20,12 @@ from avatar.commands.options import (
 )
 
 
-def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """The arguments of one command. `key=value` overrides may stand anywhere among train's options.
-
-    Exits with status 2 and the usage, as argparse does, on anything that it does not know.
-    """
-    parser = build_parser()
-    arguments, rest = parser.parse_known_args(argv)
-    unknown = [word for word in rest if word.startswith("-") or "=" not in word]
-    if arguments.command not in ("train", "bench"):
-        unknown = rest
-    if unknown:
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
-    if arguments.command == "train":
-        words = [*arguments.words, *rest]
-        arguments.overrides = [word for word in words if "=" in word]
-        folders = [Path(word) for word in words if "=" not in word]
-        if len(folders) > 1 or not (folders or arguments.resume):
-            parser.error(f"train takes one FOLDER, {len(folders)} given")
-        arguments.folder = arguments.folder or (folders[0] if folders else None)
-    if arguments.command == "bench":
-        words = [*arguments.inputs, *rest]
-        arguments.overrides = [word for word in words if "=" in word]
-        arguments.inputs = [Path(word) for word in words if "=" not in word]
-        check_bench(parser, arguments.part, len(arguments.inputs))
-    return arguments
-
-
-def check_bench(parser: argparse.ArgumentParser, part: str, given: int) -> None:
-    """Each part of the benchmark takes a number of folders of its own."""
-    inputs = PARTS[part].inputs
-    most = len(inputs.split())
-    fits = given >= 1 if inputs.endswith("...") else most - inputs.count("[") <= given <= most
-    if not fits:
-        parser.error(f"bench {part} takes {inputs or 'no folder'}, {given} given")
-
-
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser, and those of its commands."""
     parser = argparse.ArgumentParser(
-        prog="avatar", description="Animatable 3D Gaussian head avatars from one tracked video, on a CPU."
+        prog="avatar",
+        description="Animatable 3D Gaussian head avatars from a video of one person, on a CPU or a GPU.",
+        epilog="To begin: avatar demo OUT. avatar COMMAND --help lists a command's options.",
     )
     parser.add_argument("--version", action="version", version=f"avatar {avatar.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -80,7 +46,9 @@ def build_parser() -> argparse.ArgumentParser:
     track.add_argument("--matte", type=Path, metavar="DIR", help="your own mattes: a folder or a video of all pictures")
 
     train = commands.add_parser("train", help="train an avatar on a tracked video folder, or on a video")
-    train.add_argument("words", nargs="*", metavar="FOLDER | VIDEO", help="what avatar track wrote; --resume knows it")
+    train.add_argument(
+        "words", nargs="*", metavar="FOLDER | VIDEO", help="what avatar track wrote; with --resume the RUN"
+    )
     add_head(train)
     add_reading(train)
     add_tracking(train)
@@ -89,7 +57,7 @@ def build_parser() -> argparse.ArgumentParser:
     train.add_argument("--size", type=int, help="width of the training images in pixels (default: the video's)")
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the preset's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
-    train.add_argument("--resume", action="store_true", help="go on from RUN's newest checkpoint")
+    train.add_argument("--resume", action="store_true", help="go on with RUN from its newest checkpoint")
     train.add_argument(
         "--refine", type=int, metavar="N", help="first improve the tracking N times through a shorter training's avatar"
     )
@@ -140,12 +108,9 @@ def build_parser() -> argparse.ArgumentParser:
     reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
     add_avatar(reenact)
     reenact.add_argument(
-        "--driver",
-        type=Path,
-        required=True,
-        metavar="DRIVER",
-        help="tracked folder, video, or a drive file (.npz, .csv)",
+        "words", nargs="*", metavar="DRIVER", help="tracked folder, video, or a drive file (.npz, .csv)"
     )
+    reenact.add_argument("--driver", type=Path, metavar="DRIVER", help="the same")
     add_reading(reenact)
     reenact.add_argument("--driver-tracking", type=Path, metavar="DIR", help="its checkpoint/ folder, if elsewhere")
     reenact.add_argument("--frame-offset", type=int, metavar="N", help="the driver's image number minus .frame number")
@@ -198,7 +163,7 @@ def build_parser() -> argparse.ArgumentParser:
     demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
     demo_data.add_argument("out", type=Path, metavar="OUT")
     demo_data.add_argument("--frames", type=int, default=600)
-    demo_data.add_argument("--video", action="store_true", help="OUT is a plain .mp4, head_model/ beside it")
+    demo_data.add_argument("--video", action="store_true", help="film it: OUT is an .mp4, head_model/ beside it")
     demo_data.add_argument("--size", type=int, help="width and height in pixels (default: 256, of a video 512)")
     demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
     demo_data.add_argument("--motion", choices=("speech", "turn"), default="speech")
@@ -209,7 +174,7 @@ def build_parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure time and error of a part on this machine")
     bench.add_argument("part", choices=tuple(PARTS))
     wanted = "; ".join(f"{name}: {part.inputs}" for name, part in PARTS.items() if part.inputs)
-    bench.add_argument("inputs", nargs="*", metavar="FOLDER | RUN", help=f"what is measured ({wanted}) and key=value")
+    bench.add_argument("words", nargs="*", metavar="FOLDER | RUN", help=f"what is measured ({wanted}) and key=value")
     add_tracking(bench)
     add_head(bench)
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
@@ -234,7 +199,7 @@ def build_parser() -> argparse.ArgumentParser:
     sweep.add_argument("--retry-failed", action="store_true", help="try jobs again that have failed with a sentence")
 
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
-    return parser
+    return parser, commands.choices
 
 
 def add_export(export: argparse.ArgumentParser) -> None:

@@ -31,6 +31,7 @@ MAX_ROUNDS = 10
 
 def run_train(arguments: Namespace) -> int:
     """With rounds where they are asked for, or were when the run began; else `training`."""
+    settle_paths(arguments)
     run = arguments.out or training.default_run(arguments.folder)
     overrides = training.config_overrides(arguments)
     if arguments.device is not None and (arguments.refine is not None or plan_file(run).exists()):
@@ -53,6 +54,21 @@ def run_train(arguments: Namespace) -> int:
     check_rounds(run, arguments.refine, arguments.minutes, overrides)
     source = training.tracked_source(arguments)
     return begin_rounds(run, arguments.refine, arguments.minutes, source, overrides, begin)
+
+
+def settle_paths(arguments: Namespace) -> None:
+    """Which of the paths that were typed without an option is the run, and which the tracked folder."""
+    runs = [path for path in arguments.paths if (path / RUN_FILE).is_file() or plan_file(path).is_file()]
+    if runs and not arguments.resume:
+        raise UserError(f"{runs[0]} is a run: add --resume to go on with it, or give the tracked folder of a new one")
+    named = [*([] if arguments.out is None else [arguments.out]), *runs]
+    if len({path.resolve() for path in named}) > 1:
+        raise UserError(f"{named[0]} and {named[1]} are two runs: one at a time is resumed")
+    arguments.out = next(iter(named), None)
+    folders = [path for path in arguments.paths if path not in runs]
+    if len(folders) > 1:
+        raise UserError(f"neither {folders[0]} nor {folders[1]} is a run: say which to resume with --out RUN")
+    arguments.folder = arguments.folder or next(iter(folders), None)
 
 
 def check_rounds(run: Path, rounds: int, minutes: float | None, overrides: list[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from argparse import Namespace
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -13,10 +12,10 @@ from avatar.commands import OK
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.files.names import safe_name
+from avatar.files.places import cache_folder, named_path
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.avatar_track import read_info, recognise
-from data_prep.cache import cache_folder
 from data_prep.open import HEAD_VARIABLE
 from data_prep.track.crop import parse_crop
 from data_prep.track.faces.detect import load_mediapipe
@@ -49,8 +48,8 @@ def head_for_video(video: Path, given: Path | None) -> Path:
     """The head model to track a video with: the one given, else $AVATAR_HEAD. Raises UserError without one."""
     if given is not None:
         return given
-    if named := os.environ.get(HEAD_VARIABLE):
-        return Path(named)
+    if named := named_path(HEAD_VARIABLE):
+        return named
     raise UserError(
         f"no head model to track {video} with: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can "
         "be had from https://flame.is.tue.mpg.de; docs/data.md says which files belong into its folder"

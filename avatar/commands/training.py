@@ -68,7 +68,7 @@ def asked_device(overrides: list[str]) -> str | None:
 
 def default_run(folder: Path | None) -> Path:
     if folder is None:
-        raise UserError("say which run to go on with: avatar train --resume --out RUN")
+        raise UserError("say which run to go on with: avatar train --resume RUN")
     return Path("runs") / (folder.resolve().stem if folder.is_file() else folder.resolve().name)
 
 

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from avatar.commands import INTERRUPTED, OK
 from avatar.commands.driving import head_of
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_run, open_trained
+from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_run
 from avatar.compute.choose import choose_device
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.motion.drive_file import read_drive
 from avatar.runs.clips import Clip, driven_clip, own_clip
-from avatar.runs.run import RUN_FILE, Run
+from avatar.runs.run import RUN_FILE, Run, open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.gate import LOCAL
 from avatar.view.player import Player

@@ -24,7 +24,7 @@ TRACK_SHAPES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """N usable frames of one person. Indices are positions among them, 0-based."""
 
@@ -39,6 +39,9 @@ class Recording:
     data_hash: str  # of pictures and tracking
     head_fingerprint: str
 
+    def __repr__(self) -> str:
+        return f"<recording of {self.name}: {len(self)} frames of {self.width}x{self.height}, {self.fps:g} a second>"
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -51,8 +54,8 @@ class Recording:
         """(width, height) of the frames when the width is resized to `size` pixels; None keeps the video's size."""
         if size is None:
             return self.width, self.height
-        if size < 1:
-            raise ValueError(f"size must be at least 1 pixel, got {size}")
+        if size < 1 or size != int(size):
+            raise ValueError(f"size must be at least 1 pixel, and a whole number, got {size}")
         return size, max(1, round(size * self.height / self.width))
 
     def camera(self, index: int, size: int | None = None) -> Camera:

@@ -219,5 +219,5 @@ def _write_frame(
 
 
 def _write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
-    if not cv2.imwrite(str(path), image, options):
-        raise OSError(f"could not write {path.name}")
+    # cv2.imwrite does not notice a full disk, and a name that is not UTF-8 ends the process.
+    path.write_bytes(cv2.imencode(path.suffix, image, options)[1].tobytes())

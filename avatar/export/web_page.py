@@ -18,7 +18,7 @@ from avatar.runs.trained import TrainedAvatar
 WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
 PAGE_MODULES = (
-    *("core.js", "motion.js", "webgl.js", "drive.js", "view.js", "steer.js"),
+    *("core.js", "motion.js", "canvas.js", "webgl.js", "drive.js", "settings.js", "view.js", "steer.js"),
     *("landmarker.js", "camera.js", "controls.js", "panel.js", "page.js"),
 )
 WORKER_MODULES = ("core.js", "worker.js")
@@ -33,11 +33,15 @@ class WebPage:
     note: str  # what a person should know before passing it on; empty for nothing
 
 
-def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small") -> WebPage:
-    """Write the page. Raises UserError when a part of the installation is missing or the disk refuses."""
+def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small", *, webcam: bool = False) -> WebPage:
+    """Write the page. With `webcam` it offers the reader's camera; the landmarker has to lie beside it then.
+
+    Raises UserError when a part of the installation is missing or the disk refuses.
+    """
     encoded = encode_avatar(trained, precision)
     parts = {
         "title": html.escape(trained.name),
+        "webcam": " data-webcam" if webcam else "",
         "licence": html.escape(licence_of(SKINNING)),
         "style": read("page.css"),
         "script": f"(() => {{\n{bundle(PAGE_MODULES)}\n}})();",

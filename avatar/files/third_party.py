@@ -7,7 +7,6 @@ $AVATAR_CACHE, else in ~/.cache/avatar). A file counts only with the published S
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from typing import NamedTuple
 from avatar.errors import UserError
 from avatar.files.download import DownloadFailed, downloaded
 from avatar.files.opening import is_there, open_file
+from avatar.files.places import cache_folder, named_path
 
 FOLDER_VARIABLE, HEAD_VARIABLE = "AVATAR_MODELS", "AVATAR_HEAD"
 FETCHED_LPIPS = ("squeeze",)  # what training and evaluation use; vgg is 528 MB and alex 233
@@ -106,14 +106,12 @@ LPIPS_FILES = {
 
 def models_folder() -> Path:
     """Where downloads go: `models` in the cache."""
-    cache = os.environ.get("AVATAR_CACHE")
-    return (Path(cache).expanduser() if cache else Path.home() / ".cache" / "avatar") / "models"
+    return cache_folder() / "models"
 
 
 def lpips_folder() -> Path:
     """Where weights of LPIPS are looked for when the caller names no place: $AVATAR_LPIPS, else `lpips` in the cache."""
-    named = os.environ.get("AVATAR_LPIPS")
-    return Path(named).expanduser() if named else models_folder().with_name("lpips")
+    return named_path("AVATAR_LPIPS") or cache_folder() / "lpips"
 
 
 def lpips_place(net: str) -> Path:
@@ -133,10 +131,9 @@ def converted_lpips(net: str) -> str:
 
 def search_folders() -> list[Path]:
     """The folders that files are looked for in, in this order."""
-    named = os.environ.get(FOLDER_VARIABLE)
+    place = named_path(FOLDER_VARIABLE)
     folders = [models_folder()]
-    if named:
-        place = Path(named).expanduser()
+    if place is not None:
         inside = sorted(path for path in place.iterdir() if path.is_dir()) if place.is_dir() else []
         folders = [place, *inside, *folders]
     return folders

@@ -33,7 +33,7 @@ EYES = ("left eye", "right eye")
 REQUIRED_KEYS = ("v_template", "f", "shapedirs", "J_regressor", "weights", "kintree_table")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HeadAssets:
     """Everything that a head model consists of, as float32 tensors in metres; V vertices, F faces, J joints."""
 
@@ -52,6 +52,11 @@ class HeadAssets:
     fingerprint: str  # SHA-256 over all of the above
     names: ExpressionNames = field(default_factory=ExpressionNames)  # of the expression coefficients
     layout_method: int = 0  # LAYOUT_METHOD of `uvs` that the program made because no OBJ lay beside the model file
+
+    def __repr__(self) -> str:
+        return (
+            f"<head model: {self.num_vertices} vertices, {self.num_expressions} expressions, {self.fingerprint[:12]}>"
+        )
 
     @property
     def layout_is_made(self) -> bool:

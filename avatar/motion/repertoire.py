@@ -11,7 +11,7 @@ from avatar.motion.rest import RestPose, find_mean, find_neutral
 from avatar.types import HeadParams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Repertoire:
     """Of the training frames."""
 

@@ -28,7 +28,7 @@ from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import safe_name
-from avatar.files.opening import MissingFile
+from avatar.files.opening import MissingFile, open_file
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames, parse_expression_names
 from avatar.head.packed import head_from_tensors, head_tensors
@@ -40,6 +40,13 @@ from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shap
 AVATAR_FILE = "avatar.safetensors"
 AVATAR_FORMAT = 1
 MAX_BYTES = 2**32
+# How files begin that are taken for avatar files, and what they are for.
+OTHER_FILES = {
+    b"<!doctype html": "is a page: open it in a browser",
+    b"\x1f\x8b": "is for <avatar-view> in a web page",
+    b"ply\n": "holds the Gaussians of one frame, for viewers of 3D Gaussian splatting",
+    b"gltf": "is a mesh, for viewers of glTF",
+}
 _RECORDING, _NEUTRAL, _HEAD = "recording.", "neutral.", "head."
 
 
@@ -112,15 +119,20 @@ def read_portrait(path: Path) -> Portrait:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
+        with open_file(path, MAX_BYTES) as file:
+            start = file.read(16).lower()
+    except MissingFile:
+        raise UserError(
+            f"there is no avatar file {path}; give the folder that avatar train wrote, or a file of it"
+        ) from None
+    if what := next((what for beginning, what in OTHER_FILES.items() if start.startswith(beginning)), None):
+        raise UserError(f"{path} {what}; this takes the run that it was exported from, or its {AVATAR_FILE}")
+    try:
         header = json.loads(read_metadata(path, MAX_BYTES).get("avatar", "null"))
         if not isinstance(header, dict) or header.get("format") != AVATAR_FORMAT or "frames" not in header:
             found = header.get("format") if isinstance(header, dict) else "none"
             raise UserError(f"{path} is not an avatar of this program (format {found}, expected {AVATAR_FORMAT})")
         return header, read_tensors(path, MAX_BYTES)
-    except MissingFile:
-        raise UserError(
-            f"there is no avatar file {path}; give the folder that avatar train wrote, or a file of it"
-        ) from None
     except UserError as error:
         raise UserError(f"{error}; copy it again, or export it again") from None
     except (ValueError, RecursionError) as error:

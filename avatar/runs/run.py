@@ -26,8 +26,9 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there, read_json
 from avatar.model import Avatar
+from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained import TrainedAvatar, load_avatar, runs_in
 
 RUN_FILE = "run.json"
 RUN_FORMAT = 2
@@ -67,6 +68,13 @@ class Run:
     @property
     def step(self) -> int:
         return self.trained.step
+
+
+def open_trained(path: Path, head: Path | None = None) -> TrainedAvatar:
+    """The avatar of a run or of a file. A run, and the file in it, know where the head model of the training was."""
+    run = path.parent if path.name == AVATAR_FILE else path
+    is_recorded = head is None and (run / RUN_FILE).is_file()
+    return load_avatar(path, head, recorded_head=read_run_info(run).source.head if is_recorded else None)
 
 
 def start_run(
@@ -112,7 +120,7 @@ def read_run_info(run: Path) -> RunInfo:
     path = run / RUN_FILE
     if not is_there(path):
         raise UserError(
-            f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out)"
+            f"{run} is not a run folder: it has no run.json; give the folder that avatar train wrote (--out){runs_in(run)}"
         )
     info = read_json(path)
     if not isinstance(info, dict) or info.get("format") != RUN_FORMAT:

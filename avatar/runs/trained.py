@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from torch import Tensor
 from avatar.config import Config
 from avatar.data.recording import Recording
 from avatar.errors import UserError
+from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
@@ -22,10 +22,11 @@ from avatar.motion.repertoire import Repertoire, learn_repertoire
 from avatar.motion.rest import RestPose
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_portrait
+from avatar.runs.inputs import checked_camera, checked_params
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TrainedAvatar:
     """An avatar with everything that drawing and driving it needs; the video that it was trained on is not.
 
@@ -39,6 +40,12 @@ class TrainedAvatar:
     neutral: RestPose
     step: int  # optimizer steps that it was trained for
     perceptual: str
+
+    def __repr__(self) -> str:
+        return (
+            f"<avatar of {self.name}: {len(self.avatar):,} Gaussians ({self.config.model.name}), trained for "
+            f"{self.step:,} steps on {len(self.recording.split.train)} frames, {self.source}>"
+        )
 
     @property
     def name(self) -> str:
@@ -65,7 +72,7 @@ class TrainedAvatar:
     def rest_camera(self, size: int | None = None) -> Camera:
         """The camera of the neutral face, `size` pixels wide; by default as in training."""
         train = self.recording.split.train
-        return self.recording.camera(train[self.neutral.frame or 0], size or self.config.data.size)
+        return self.recording.camera(train[self.neutral.frame or 0], self.config.data.size if size is None else size)
 
     def rest_params(self) -> HeadParams:
         """The neutral face, looking ahead with open eyes."""
@@ -75,17 +82,36 @@ class TrainedAvatar:
 
     def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
         """The Gaussians of one frame, activated, world space (metres), as `camera` sees the head; by default turned as on
-        average in training. To avatars without `model.facing` it is the same."""
-        return self.renderer.gaussians(params, camera)
+        average in training. To avatars without `model.facing` it is the same. Raises UserError as `render`."""
+        return self.renderer.gaussians(self._params(params), None if camera is None else checked_camera(camera))
 
     def render(self, params: HeadParams, camera: Camera | None = None) -> Rendering:
-        """One picture, by default from the camera of the neutral face; [H, W, 3] and alpha [H, W], not clamped."""
-        return self.renderer.render(params, camera or self.rest_camera())
+        """One picture, by default from the camera of the neutral face; [H, W, 3] and alpha [H, W], not clamped.
+
+        Raises UserError, naming the tensor, for parameters or a camera of another type, shape or dtype, or not finite.
+        """
+        return self.renderer.render(
+            self._params(params), self.rest_camera() if camera is None else checked_camera(camera)
+        )
 
     def stream(self, motion: Iterable[HeadParams | tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
-        """Pictures in order, several drawn at a time; `motion` may be endless."""
+        """Pictures in order, several drawn at a time; `motion` may be endless.
+
+        Raises UserError as `render` does, when the frame's turn comes.
+        """
+        if not isinstance(motion, Iterable):
+            raise UserError(f"a stream takes frames one after another, in a list or an iterator, not {motion!r:.60}")
         rest = self.rest_camera()
-        return self.renderer.stream((item, rest) if isinstance(item, HeadParams) else item for item in motion)
+        return self.renderer.stream(self._frame(item, rest) for item in motion)
+
+    def _frame(self, item: object, rest: Camera) -> tuple[HeadParams, Camera]:
+        if isinstance(item, tuple) and len(item) == 2:
+            return self._params(item[0]), checked_camera(item[1])
+        return self._params(item), rest
+
+    def _params(self, params: object) -> HeadParams:
+        recorded = self.recording.tracks["expression"].shape[1]
+        return checked_params(params, {recorded, self.assets.num_expressions})
 
 
 def load_avatar(
@@ -129,16 +155,22 @@ def avatar_path(path: Path) -> Path:
             )
         raise UserError(
             f"{path} is neither a run nor an avatar file; give the folder that avatar train wrote (--out), or its "
-            f"{AVATAR_FILE}"
+            f"{AVATAR_FILE}{runs_in(path)}"
         )
     return path / AVATAR_FILE
+
+
+def runs_in(folder: Path) -> str:
+    """The end of a sentence about a folder that is no run: which runs it holds."""
+    runs = sorted(path.parent for path in folder.glob("*/run.json"))
+    return f"; {folder} holds {', '.join(map(str, runs[:3]))}{' ...' if len(runs) > 3 else ''}" if runs else ""
 
 
 def _find_head(path: Path, recorded: Path | None) -> Path:
     if recorded is not None and recorded.exists():
         return recorded
-    if named := os.environ.get(HEAD_VARIABLE):
-        return Path(named)
+    if named := named_path(HEAD_VARIABLE):
+        return named
     gone = f" (that of the training, {recorded}, is gone)" if recorded is not None else ""
     raise UserError(
         f"{path} needs its head model{gone}: give --head PATH, or set {HEAD_VARIABLE}; avatar export --with-head makes "

@@ -26,6 +26,7 @@ from typing import Any
 
 from avatar.config import load_config
 from avatar.errors import UserError
+from avatar.files.places import expanded
 from avatar.files.plain_yaml import read_yaml
 
 MAX_BYTES, MAX_JOBS = 2**20, 100_000
@@ -166,7 +167,7 @@ def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:
         if (value := found.get(key)) is not None:
             if not isinstance(value, str):
                 raise UserError(f"{path}: {key} is {value!r}, not a path")
-            found[key] = str((path.resolve().parent / Path(value).expanduser()).resolve())
+            found[key] = str((path.resolve().parent / expanded(value, f"{path}: {key} {value}")).resolve())
     for key in ("frame_offset", "format", "fps"):
         if (value := found.get(key)) is not None and not _is_word(value):
             raise UserError(f"{path}: {key} is {value!r}, not a word or a number")

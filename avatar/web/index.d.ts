@@ -62,8 +62,8 @@ export class AvatarView extends EventTarget {
   pause(): void;
   seek(seconds: number): void;
   look(view: { yaw?: number; pitch?: number; zoom?: number }): void;
-  resize(width: number): void;
-  screenshot(): Promise<Blob>;
+  resize(width: number, still?: number): void; // pixels of what moves, and of what does not
+  screenshot(width?: number): Promise<Blob>; // a PNG of what is shown, drawn anew where a width is given
   close(): void;
 }
 /** A camera that drives a view, once. Event: "state". `worker` is of watcher.js, a classic one. Nothing leaves the page. */

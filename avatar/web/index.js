@@ -81,6 +81,7 @@ export class AvatarViewElement extends HTMLElement {
       const view = new AvatarView(canvas, { worker, wasm, file }, { renderer: this.getAttribute("renderer") ?? "auto", still });
       this.#view = view;
       const header = await view.ready;
+      view.resize(header.size, canvas.clientWidth * devicePixelRatio);
       canvas.setAttribute("aria-label", `Avatar of ${header.name}. Arrow keys turn it.`);
       this.#letGo = steer(view, canvas);
       view.addEventListener("drawn", () => this.dispatchEvent(new Event("drawn")));

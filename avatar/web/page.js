@@ -4,7 +4,9 @@ import { connectCamera } from "./panel.js";
 import { steer } from "./steer.js";
 import { AvatarView } from "./view.js";
 
-const MOST_PIXELS = 640, LEAST_PIXELS = 160;
+const MOST_PIXELS = 640, LEAST_PIXELS = 160; // of a picture that moves
+const SHARPEST = 2048; // pixels of one that does not
+const SAVED = 1024; // pixels of the shorter side of a picture that is saved, or more
 const TOO_SLOW = 45, FAST = 20; // milliseconds of a picture between which its size is left alone
 const find = (id) => document.getElementById(id);
 const wantsStillness = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -22,7 +24,7 @@ async function start() {
   view.addEventListener("drawn", () => say(""), { once: true });
   view.addEventListener("view", () => (find("guess").hidden = view.isSupported));
   connectBar(view, header, putBack);
-  connectCamera(view, () => makeWorker("watcher"), putBack);
+  if ("webcam" in document.body.dataset) connectCamera(view, () => makeWorker("watcher"), putBack);
   const width = Number(asked.get("width"));
   if (width > 0) view.resize(width);
   else fitSize(view, header);
@@ -68,20 +70,36 @@ function connectBar(view, header, putBack) {
     view.play(wantsStillness() ? "rest" : "idle");
   });
   find("shot").addEventListener("click", async () => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(await view.screenshot());
+    const link = document.createElement("a"), least = SAVED * Math.max(1, header.camera.aspect);
+    try {
+      link.href = URL.createObjectURL(await view.screenshot(Math.max(least, shownWidth(header))));
+    } catch (error) {
+      return say(error.message);
+    }
     link.download = `${header.name}.png`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   });
 }
 
-/** As many pixels as the machine draws fluently: fewer while it is too slow, more while there is time. */
+/** How many of the screen's own pixels the picture is wide. */
+function shownWidth(header) {
+  const { clientWidth, clientHeight } = find("canvas");
+  return Math.min(clientWidth, clientHeight * header.camera.aspect) * devicePixelRatio;
+}
+
+/**
+ * As many pixels as the machine draws fluently: fewer while it is too slow, more while there is time. A picture that is still
+ * gets those of the screen.
+ */
 function fitSize(view, header) {
+  const fit = () => view.resize(size, Math.min(shownWidth(header), SHARPEST, SHARPEST * header.camera.aspect));
   const most = Math.min(MOST_PIXELS, 2 * header.size);
   let size = Math.min(header.size, most), since = performance.now(), times = [];
-  view.resize(size);
+  fit();
+  new ResizeObserver(fit).observe(view.canvas);
   view.addEventListener("drawn", () => {
+    if (view.canvas.width !== size) return; // a still one
     const now = performance.now();
     times.push(view.statistics.milliseconds);
     if (now - since < 1500) return;
@@ -89,7 +107,9 @@ function fitSize(view, header) {
     [since, times] = [now, []];
     const wanted = typical > TOO_SLOW ? size * 0.8 : typical < FAST ? size * 1.2 : size;
     const fitted = Math.round(Math.min(Math.max(wanted, LEAST_PIXELS), most) / 16) * 16;
-    if (fitted !== size) view.resize((size = fitted));
+    if (fitted === size) return;
+    size = fitted;
+    fit();
   });
 }
 

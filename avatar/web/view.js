@@ -1,13 +1,17 @@
 // An avatar on a canvas: loads it and draws it whenever it has changed. No interface of its own; <avatar-view> and the page
 // are built on this.
+import { paint, png } from "./canvas.js";
 import { AvatarError } from "./core.js";
 import { FaceDriver } from "./drive.js";
-import { idle, mix, multiply, orbit, places, recorded, rotation, sixD } from "./motion.js";
+import { idle, mix, multiply, orbit, recorded, rotation } from "./motion.js";
+import { Settings } from "./settings.js";
 import { WebglRenderer, hasRealGpu } from "./webgl.js";
 
 const BLEND_SECONDS = 0.4; // from one motion to another
 const MARGIN = 10; // degrees by which the camera may leave what the training video shows
 const ZOOM = [0.5, 4];
+const STILL_AFTER = 250; // milliseconds without a change, after which the picture is drawn sharp
+const LEAST_SIDE = 32, MOST_SIDE = 4096; // pixels
 
 export class AvatarView extends EventTarget {
   /**
@@ -41,13 +45,13 @@ export class AvatarView extends EventTarget {
   #driver;
   #previous; // the pose that a new motion blends from
   #pose;
-  #pinned = new Map(); // parameter index -> value that a caller has set
-  #controls = new Map(); // control -> value that a caller has set
-  #turned = [0, 0];
+  #settings;
   #shown; // what was asked for last
+  #changed = 0; // when something else was to be seen for the last time
+  #saving = []; // pictures that were asked for, in order
   #inFlight = false;
   #loop;
-  #size = 0;
+  #width = { moving: 0, still: 0 }; // pixels
   #times = [];
 
   get header() {
@@ -81,48 +85,23 @@ export class AvatarView extends EventTarget {
     return this.#core ? this.#core.poses.length / 12 : 0;
   }
 
-  /**
-   * Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); they stay until `release`.
-   * Unknown names are ignored and returned.
-   */
+  /** Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); returns unknown names. */
   setExpression(values) {
-    const { header } = this, unknown = [];
-    for (const [key, value] of Object.entries(values)) {
-      const control = header.controls.find((c) => `${c.group}: ${c.name}` === key);
-      const index = /^\d+$/.test(key) ? Number(key) : header.expressions.indexOf(key);
-      if (!Number.isFinite(value)) unknown.push(key);
-      else if (control) this.#controls.set(control, value);
-      else if (index >= 0 && index < header.sizes.expressions) this.#pinned.set(index, value);
-      else unknown.push(key);
-    }
-    return unknown;
+    return this.#settings.setExpression(values);
   }
 
   /** Jaw, gaze and neck as rotation vectors in radians, lids from 0 (open) to 1; `head`: [yaw, pitch] in degrees. */
-  setPose({ jaw, gaze, neck, lids, head } = {}) {
-    const at = places(this.header.sizes.expressions);
-    const pin = (start, values) => values.forEach((v, i) => this.#pinned.set(start + i, v));
-    if (jaw) pin(at.jaw, sixD(rotation(jaw)));
-    if (neck) pin(at.neck, sixD(rotation(neck)));
-    if (gaze) [at.eyes, at.eyes + 6].forEach((start) => pin(start, sixD(rotation(gaze))));
-    if (lids) pin(at.eyelids, lids);
-    if (head) this.#turned = head;
+  setPose(pose) {
+    this.#settings.setPose(pose);
   }
 
   /** All parameters at once, in the order of `header.rest`; null lets go of them. Throws AvatarError for another number. */
   setParameters(values) {
-    const count = this.header.rest.length;
-    if (values && (values.length !== count || !Array.from(values).every(Number.isFinite)))
-      throw new AvatarError(`This avatar takes ${count} parameters, all of them numbers.`);
-    this.release();
-    if (values) values.forEach((value, i) => this.#pinned.set(i, value));
+    this.#settings.setParameters(values);
   }
 
-  /** Let go of what was set. */
   release() {
-    this.#pinned.clear();
-    this.#controls.clear();
-    this.#turned = [0, 0];
+    this.#settings?.release();
   }
 
   /** Play "idle", "recorded" (the motion that came with the avatar) or "rest"; `from` in seconds. */
@@ -194,14 +173,22 @@ export class AvatarView extends EventTarget {
     });
   }
 
-  /** Width of the drawn picture in pixels. */
-  resize(width) {
-    this.#size = Math.min(Math.max(32, Math.round(width)), 4096);
+  /** Width of the drawn picture in pixels, and of one that nothing has changed for a moment. */
+  resize(width, still = width) {
+    const bounded = (size) => Math.min(Math.max(LEAST_SIDE, Math.round(size)), MOST_SIDE);
+    this.#width = { moving: bounded(width), still: bounded(Math.max(width, still)) };
   }
 
-  /** A PNG of what is shown. */
-  screenshot() {
-    return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
+  /** A PNG of what is shown; drawn anew where a `width` is given, with no side above MOST_SIDE. */
+  async screenshot(width) {
+    if (!this.#shown) throw new AvatarError("The avatar is not drawn yet.");
+    if (width === undefined) return png(this.canvas);
+    const asked = Math.round(Math.min(Math.max(LEAST_SIDE, width), MOST_SIDE, MOST_SIDE * this.#shown.base.aspect));
+    return new Promise((resolve, reject) => {
+      const frame = this.#frame(this.#shown, asked);
+      this.#saving.push({ resolve, reject, ...frame });
+      this.#worker.postMessage({ ...frame, wants: "saved" });
+    });
   }
 
   close() {
@@ -216,14 +203,17 @@ export class AvatarView extends EventTarget {
   #receive(data) {
     if (data.type === "failed") return this.#fail(data.sentence);
     if (data.type === "ready") return this.#start(data);
+    if (data.type === "saved") {
+      const { resolve, width, height } = this.#saving.shift(), canvas = document.createElement("canvas");
+      paint(canvas, canvas.getContext("2d"), data.values, width, height);
+      return resolve(png(canvas));
+    }
     this.#inFlight = false;
     const { camera, width, height } = this.#shown;
     if (data.type === "gaussians") {
       this.#gpu.draw(data.values, camera, width, height, this.header.background, this.header.blur);
     } else {
-      const { canvas } = this;
-      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-      this.#context.putImageData(new ImageData(data.values, width, height), 0, 0);
+      paint(this.canvas, this.#context, data.values, width, height);
     }
     this.#count(data.milliseconds);
     this.dispatchEvent(new CustomEvent("drawn", { detail: { taken: this.#shown.taken } }));
@@ -232,7 +222,8 @@ export class AvatarView extends EventTarget {
   #start({ header, motion, poses }) {
     this.#core = { header, motion, poses };
     this.#driver = new FaceDriver(header);
-    this.#size ||= header.size;
+    this.#settings = new Settings(header);
+    if (this.#width.moving === 0) this.resize(header.size);
     if (this.#wantsGpu) {
       try {
         this.#gpu = new WebglRenderer(this.canvas);
@@ -254,18 +245,22 @@ export class AvatarView extends EventTarget {
   #request(now) {
     const { header } = this, pose = this.#current(now), base = { ...header.camera };
     if (pose.rotation) Object.assign(base, { rotation: pose.rotation, translation: pose.translation });
-    const [yaw, pitch] = [0, 1].map((i) => (pose.turn?.[i] ?? 0) + this.#turned[i]);
+    const [yaw, pitch] = [0, 1].map((i) => (pose.turn?.[i] ?? 0) + this.#settings.turned[i]);
     base.rotation = multiply(base.rotation, rotation([(pitch * Math.PI) / 180, (yaw * Math.PI) / 180, 0]));
-    const width = this.#size, height = Math.max(1, Math.round(width / base.aspect));
-    const camera = orbit(base, this.view, width);
-    const key = JSON.stringify([Array.from(pose.parameters), camera, width]);
-    if (key === this.#shown?.key) return; // nothing has changed
-    this.#shown = { camera, width, height, key, taken: this.#source.taken };
+    const { parameters } = pose, { view } = this, key = JSON.stringify([Array.from(parameters), base, view]);
+    if (key !== this.#shown?.key) this.#changed = now;
+    const width = now - this.#changed < STILL_AFTER ? this.#width.moving : this.#width.still;
+    if (key === this.#shown?.key && width === this.#shown.width) return; // nothing has changed
+    const frame = this.#frame({ parameters, base, view }, width);
+    this.#shown = { ...frame, base, view, key, taken: this.#source.taken };
     this.#inFlight = true;
-    this.#worker.postMessage({
-      type: "frame", parameters: pose.parameters, camera, width, height, background: header.background,
-      wants: this.#gpu ? "gaussians" : "picture",
-    });
+    this.#worker.postMessage({ ...frame, wants: this.#gpu ? "gaussians" : "picture" });
+  }
+
+  /** What the worker draws. */
+  #frame({ parameters, base, view }, width) {
+    const height = Math.max(1, Math.round(width / base.aspect)), { background } = this.header;
+    return { type: "frame", parameters, camera: orbit(base, view, width), width, height, background };
   }
 
   #current(now) {
@@ -282,11 +277,7 @@ export class AvatarView extends EventTarget {
     const since = this.#previous ? (now - this.#previous.since) / 1000 : Infinity;
     let parameters = Float32Array.from(pose.parameters);
     if (since < BLEND_SECONDS) parameters = mix(this.#previous.pose.parameters, parameters, Math.max(since, 0) / BLEND_SECONDS);
-    if (this.#controls.size > 0) {
-      parameters.set(header.rest.slice(0, header.sizes.expressions));
-      for (const [{ values }, share] of this.#controls) values.forEach((value, i) => (parameters[i] += share * value));
-    }
-    for (const [index, value] of this.#pinned) parameters[index] = value;
+    this.#settings.apply(parameters);
     this.#pose = { ...pose, parameters };
     return this.#pose;
   }
@@ -299,7 +290,7 @@ export class AvatarView extends EventTarget {
   }
 
   #fail(sentence) {
-    this.#settle.reject(new AvatarError(sentence));
+    for (const { reject } of [this.#settle, ...this.#saving.splice(0)]) reject(new AvatarError(sentence));
     this.dispatchEvent(new CustomEvent("failed", { detail: sentence }));
   }
 

@@ -24,11 +24,11 @@ from systems import TABLES, Rows, add_arguments, is_measured, read_table, reques
 
 from avatar.bench.render import inputs, stream_rate
 from avatar.bench.results import new_figure
-from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.evaluation.compare import Cell
 from avatar.model import Avatar
 from avatar.render import Renderer
+from avatar.runs.run import open_trained
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Spec, read_spec
 from avatar.sweep.state import read_state

@@ -10,9 +10,9 @@ from small_runs import train_small
 
 from avatar.bench.render import STEPS, compare, inputs, measure, next_of
 from avatar.cli import main
-from avatar.commands.opening import open_trained
 from avatar.errors import UserError
 from avatar.render import Renderer
+from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,12 @@ def test_an_interrupted_demo_goes_on(tmp_path: Path) -> None:
     output = avatar("demo", tmp_path / "demo")
     assert "Resuming" in output and "The demo is done" in output
     page = tmp_path / "demo" / "avatar.html"
-    assert output.rstrip().splitlines()[-1].startswith(f"  {page} ") and page.stat().st_size > 10**5
+    last = output.rstrip().splitlines()[-1]
+    assert "Open this first" in last and str(page) in last and page.stat().st_size > 10**5
+    assert len([line for line in output.splitlines() if "\r" not in line]) < 40, "nothing is lost above it"
     assert newest_checkpoint(run).step == 16
-    assert "strict" in output, "the whole avatar is measured"
+    means = json.loads((run / "eval" / "results.json").read_bytes())["protocols"]["strict"]["means"]
+    assert f"PSNR {means['psnr']:.2f}" in output, "the whole avatar is measured"
 
 
 def test_people_are_filmed_and_tracked_where_that_is_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

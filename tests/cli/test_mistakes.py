@@ -23,7 +23,13 @@ def _no_network(*_: object, **__: object) -> None:
 
 
 MISTAKES = {
-    "no such folder": (["train", "{tmp}/nothing"], "nothing is not a folder; give the tracked video folder"),
+    "no such folder": (["train", "{tmp}/nothing"], "nothing: there is no such file or folder"),
+    "no such video": (["train", "{tmp}/nothing.mp4"], "nothing.mp4: there is no such file or folder"),
+    "no such folder to prepare": (["prepare", "{tmp}/nothing"], "nothing: there is no such file or folder"),
+    "no such video as driver": (["reenact", "{run}", "{tmp}/x.mp4"], "x.mp4: there is no such file or folder"),
+    "no such sweep": (["sweep", "{tmp}/x.yaml"], "x.yaml cannot be read (No such file or directory)"),
+    "a folder of runs": (["view", "{run}/.."], "holds {run}/../run"),
+    "eval of a folder of runs": (["eval", "{run}/.."], "holds {run}/../run"),
     "no head model": (["train", "{tmp}"], "no head model for {tmp}: give --head PATH, or set AVATAR_HEAD"),
     "head model gone": (["train", "{data}", "--head", "{tmp}/x.pkl"], "x.pkl does not exist; give --head"),
     "unknown key": (["train", "{data}", "trainer.iteration=5"], "the nearest is 'trainer.iterations'"),
@@ -48,7 +54,7 @@ MISTAKES = {
     "reenactment of a missing avatar": (["reenact", "{tmp}/x", "--driver", "{data}"], "there is no avatar file"),
     "eval with another head": (["eval", "{run}", "--head", "{other}/head_model"], "trained with another head model"),
     "unknown protocol": (["eval", "{run}", "--protocol", "paper"], "paper"),
-    "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody is not a folder"),
+    "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody: there is no such file or folder"),
     "driver of another head": (
         ["reenact", "{run}", "--driver", "{other}", "--frame-offset", "1"],
         "was tracked with another head model",

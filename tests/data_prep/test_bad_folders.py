@@ -86,7 +86,7 @@ def test_a_folder_that_is_something_else_is_not_overwritten(good_folder: Path, t
 def test_a_place_that_cannot_be_written(good_folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(
-        UserError, match=r"nothing can be written in .*file/sub \(Not a directory\); choose another place"
+        UserError, match=r"nothing can be written in .*file/sub \(Not a directory\); name another .* AVATAR_CACHE"
     ):
         prepare_with(good_folder, tmp_path / "file/sub/out")
 

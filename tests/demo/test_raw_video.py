@@ -61,8 +61,15 @@ def test_the_command_writes_a_video_and_a_head_model(tmp_path: Path, capsys: pyt
     assert len(list(video.read(whole(96, 96), Span(), lambda said: None))) == 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["head_model", "me.mp4"]
     assert load_head_assets(head).num_vertices > 1000
-    assert main(["demo-data", str(tmp_path / "you.mp4"), *options, "--seed", "2"]) == 0
-    assert f"--head {head}" in capsys.readouterr().out  # one is enough for all of them
+    # The name alone says that it is a video; one head model is enough for all of them.
+    assert main(["demo-data", str(tmp_path / "you.mp4"), *options[1:], "--seed", "2"]) == 0
+    assert f"--head {head}" in capsys.readouterr().out and open_video(tmp_path / "you.mp4").width == 96
+
+
+@pytest.mark.parametrize("name", ["me.webm", "me.MOV", "me.avi"])
+def test_a_folder_is_not_called_like_a_video(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo-data", str(tmp_path / name), "--frames", "1", "--size", "64"]) == 1
+    assert "a video is written as .mp4" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_refusals(tmp_path: Path) -> None:

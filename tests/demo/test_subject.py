@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,12 @@ SEED_WITH_GLASSES, SEED_WITHOUT = 1, 3
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("demo") / "someone"
     return make_subject(out, frames=FRAMES, size=SIZE, seed=SEED_WITH_GLASSES, progress=False)
+
+
+def test_a_frame_is_written_under_a_name_that_is_not_utf8(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"Zo\xeb.png")
+    subject._write_image(path, np.zeros((4, 4, 3), np.uint8), [])
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def _tracked(folder: Path, index: int) -> tuple[HeadParams, Camera, np.ndarray]:

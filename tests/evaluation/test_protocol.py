@@ -39,6 +39,13 @@ def test_frames_are_never_those_of_the_training() -> None:
     assert by_name["insta350"].select(2, tiny) == (1,)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_protocol_is_read_as_an_editor_on_windows_saves_it(encoding: str, tmp_path: Path) -> None:
+    text = builtin_protocols()["strict"].read_text(encoding="utf-8")
+    (tmp_path / "mine.yaml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    assert read_protocol(tmp_path / "mine.yaml").regions == ("head", "mouth", "eyes", "rest")
+
+
 def test_unknown_protocols_are_refused_and_repeated_ones_run_once(tmp_path: Path) -> None:
     assert [protocol.name for protocol in choose_protocols(["insta350", "insta350"])] == ["insta350"]
     with pytest.raises(UserError, match="no protocol 'hyper'; choose from hypergaussians, flashavatar, insta350"):

@@ -117,7 +117,7 @@ def real_pack(monkeypatch: pytest.MonkeyPatch) -> bytes:
 def real_page(real_pack: bytes, tracked_folder: Path, tmp_path: Path) -> Path:
     (tmp_path / PACK).write_bytes(real_pack)
     trained = lively_avatar(tracked_folder, tmp_path / "run")
-    return write_page(trained, tmp_path / "someone.html", "float").path
+    return write_page(trained, tmp_path / "someone.html", "float", webcam=True).path
 
 
 @pytest.mark.chromium

@@ -56,7 +56,7 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 @pytest.fixture(scope="module")
 def page_text(trained: TrainedAvatar, tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = write_page(trained, tmp_path_factory.mktemp("page") / "someone.html", "float").path
+    path = write_page(trained, tmp_path_factory.mktemp("page") / "someone.html", "float", webcam=True).path
     return knowing(path.read_text(encoding="utf-8"), FAKE)
 
 

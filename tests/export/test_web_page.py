@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import pytest
 import torch
 from browsers import WEB, chromium, served
@@ -162,15 +161,6 @@ def test_keys_mouse_and_wheel_turn_the_head(opened: Any) -> None:
     name = "(e.ariaLabel || e.labels?.[0]?.innerText || e.innerText)"
     unnamed = f"Array.from(document.querySelectorAll('input,button')).filter(e => !{name})"
     assert opened.evaluate(f"{unnamed}.length") == 0
-
-
-@pytest.mark.chromium
-def test_a_picture_is_saved_under_the_avatars_name(opened: Any, tmp_path: Path) -> None:
-    with opened.expect_download() as download:
-        opened.get_by_role("button", name="Save picture").click()
-    assert download.value.suggested_filename == "someone.png"
-    download.value.save_as(tmp_path / "someone.png")
-    assert iio.imread(tmp_path / "someone.png").shape[:2] == (64, 64)
 
 
 @pytest.mark.chromium

@@ -15,8 +15,8 @@ from avatar.bench import PARTS, render, render_plot, train, train_report
 from avatar.bench.clock import Time
 from avatar.commands import benchmarking
 from avatar.commands.benchmarking import bench_device
-from avatar.commands.opening import open_trained
 from avatar.errors import UserError
+from avatar.runs.run import open_trained
 
 TINY = ("model.uv_size=10", "data.size=24", "trainer.perceptual=dssim", "model.latent_grid=4")
 

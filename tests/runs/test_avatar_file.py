@@ -14,6 +14,9 @@ from torch import Tensor
 
 import avatar
 from avatar.errors import UserError
+from avatar.export.glb import encode_glb
+from avatar.export.ply import encode_ply
+from avatar.export.web_page import write_page, write_web_avatar
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.trained import TrainedAvatar
 
@@ -144,3 +147,27 @@ def test_a_damaged_file_gets_a_sentence(name: str, run: Path, tracked_folder: Pa
 def test_checkpoints_are_not_avatars(run: Path) -> None:
     with pytest.raises(UserError, match="is not an avatar of this program"):
         avatar.load(run / "checkpoints" / "step_00000012.safetensors")
+
+
+def test_what_was_exported_for_others_is_not_called_damaged(trained: TrainedAvatar, tmp_path: Path) -> None:
+    """`avatar view avatar.html`."""
+    files = {"a.html": "open it in a browser", "a.avatar": "<avatar-view>", "a.ply": "splatting", "a.glb": "glTF"}
+    write_page(trained, tmp_path / "a.html")
+    write_web_avatar(trained, tmp_path / "a.avatar")
+    (tmp_path / "a.ply").write_bytes(encode_ply(trained.gaussians(trained.rest_params()), ""))
+    (tmp_path / "a.glb").write_bytes(encode_glb(trained, trained.rest_params(), 64, "")[0])
+    for name, purpose in files.items():
+        with pytest.raises(UserError, match=f"{name} .*{purpose}.*avatar.safetensors") as error:
+            avatar.load(tmp_path / name)
+        assert "damaged" not in str(error.value)
+
+
+def test_a_run_and_the_file_in_it_find_their_head(run: Path, trained: TrainedAvatar, tmp_path: Path) -> None:
+    for place in (run, str(run), run / "avatar.safetensors"):
+        assert avatar.load(place).assets.fingerprint == trained.assets.fingerprint
+    moved = Path(shutil.copytree(run, tmp_path / "moved"))
+    info = json.loads((moved / "run.json").read_text())
+    info["source"]["head"] = str(tmp_path / "gone")
+    (moved / "run.json").write_text(json.dumps(info))
+    with pytest.raises(UserError, match=r"that of the training, .*gone, is gone\): give --head PATH"):
+        avatar.load(moved)

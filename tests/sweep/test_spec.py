@@ -55,6 +55,13 @@ def test_a_list_of_variants_is_named_by_its_overrides(tmp_path: Path) -> None:
     assert [job.variant for job in spec.jobs] == ["default", "model=flashavatar", "model.latent_dim=2"]
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_specification_is_read_as_an_editor_on_windows_saves_it(encoding: str, tmp_path: Path) -> None:
+    (tmp_path / "sweep.yaml").write_bytes("subjects: [Zoë]\r\nseeds: [3]\r\n".encode(encoding))
+    (job,) = read_spec(tmp_path / "sweep.yaml").jobs
+    assert job.subject == "Zoë" and job.seed == 3
+
+
 MISTAKES = {
     "not YAML": ("subjects: [", "cannot be read as YAML"),
     "nothing": ("", "holds no keys"),

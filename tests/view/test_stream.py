@@ -14,7 +14,7 @@ import torch
 from stream_packets import live_link
 from waiting import until
 
-from avatar.commands.parser import parse
+from avatar.commands.arguments import parse
 from avatar.commands.viewing import run_send
 from avatar.errors import UserError
 from avatar.motion.drive import Drive

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from avatar.errors import UserError
+from avatar.files.places import cache_folder
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
-from data_prep.cache import cache_folder
 from data_prep.track.faces.embedding import LandmarkEmbedding, load_embedding, save_embedding
 from data_prep.track.faces.landmark_groups import NUM_MESH
 from data_prep.track.faces.tinted_heads import render_tinted_heads

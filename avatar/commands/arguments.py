@@ -1,0 +1,97 @@
+"""What was typed after `avatar`, as the arguments of one command."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from avatar.bench import PARTS
+from avatar.commands.parser import build_parser
+
+KEY = re.compile(r"[+~]*[A-Za-z_][\w.]*")  # Hydra's own signs are no part of our keys, and refused as such
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments of one command. Folders and `key=value` overrides may stand anywhere among its options.
+
+    Without a command, prints the help and exits with status 0. Exits with status 2 and the usage, as argparse does, on
+    anything that it does not know.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    parser, commands = build_parser()
+    if not words:
+        parser.print_help()
+        parser.exit()
+    name = next((word for word in words if not word.startswith("-")), None)
+    if name is not None and name not in commands:
+        parser.error(f"there is no command '{name}'{nearest(name, commands)}; avatar --help lists them")
+    arguments, rest = parser.parse_known_args(words)
+    takes_words = "words" in arguments
+    unknown = [word for word in rest if word.startswith("-") or not takes_words]
+    if unknown:
+        known = re.findall(r"--[a-z-]+", commands[arguments.command].format_help())
+        hint = nearest(unknown[0].partition("=")[0], known) if unknown[0].startswith("--") else ""
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+    if takes_words:
+        arguments.words += rest
+        SORTED_BY[arguments.command](commands[arguments.command], arguments)
+    return arguments
+
+
+def nearest(word: str, known: Iterable[str] | Mapping[str, object]) -> str:
+    found = difflib.get_close_matches(word.lower(), known, n=1)
+    return f"; the nearest is {found[0]}" if found else ""
+
+
+def is_override(word: str) -> bool:
+    """Whether a word is `key=value`. A path may have `=` in its name: a file or folder that exists is a path, unless what
+    is before the `=` is a key of the configuration."""
+    key, sign, _ = word.partition("=")
+    if not sign or not KEY.fullmatch(key):
+        return False
+    if not Path(word).exists():
+        return True
+    from avatar.config import chosen_options, flatten, load_config  # imports hydra
+
+    return key in chosen_options() or key in flatten(load_config().to_dict())
+
+
+def sort_words(arguments: argparse.Namespace) -> list[Path]:
+    """The paths among a command's words; the others become its overrides."""
+    arguments.overrides = [word for word in arguments.words if is_override(word)]
+    return [Path(word) for word in arguments.words if not is_override(word)]
+
+
+def sort_train(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """FOLDER and, with --resume, RUN. Which of the two a single path is then, the folder itself says."""
+    arguments.paths = sort_words(arguments)
+    given = len(arguments.paths)
+    if arguments.resume and given > 2:
+        parser.error(f"train --resume takes a RUN, and its FOLDER where that has moved; {given} paths are given")
+    if not arguments.resume and given != 1:
+        parser.error(f"train takes one FOLDER, {given} given")
+
+
+def sort_reenact(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """DRIVER, with --driver or without."""
+    drivers = [*map(Path, arguments.words), *([] if arguments.driver is None else [arguments.driver])]
+    if len(drivers) != 1:
+        parser.error(f"reenact takes one DRIVER after the AVATAR, {len(drivers)} given")
+    (arguments.driver,) = drivers
+
+
+def sort_bench(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Each part of the benchmark takes a number of folders of its own."""
+    arguments.inputs = sort_words(arguments)
+    given, inputs = len(arguments.inputs), PARTS[arguments.part].inputs
+    most = len(inputs.split())
+    fits = given >= 1 if inputs.endswith("...") else most - inputs.count("[") <= given <= most
+    if not fits:
+        parser.error(f"bench {arguments.part} takes {inputs or 'no folder'}, {given} given")
+
+
+SORTED_BY = {"train": sort_train, "reenact": sort_reenact, "bench": sort_bench}

@@ -1,0 +1,66 @@
+"""Head parameters and cameras that a Python program gives: checked before they meet the network."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import fields
+
+import torch
+from torch import Tensor
+
+from avatar.errors import UserError
+from avatar.tensors import check_shapes, describe_non_finite
+from avatar.types import Camera, HeadParams
+
+PARAM_SHAPES = {"expression": "E", "jaw": "6", "eyes": "12", "eyelids": "2", "neck": "6"}
+CAMERA_SHAPES = {"R_cam_world": "3 3", "t_cam_world": "3"}
+
+
+def checked_params(params: object, coefficients: Collection[int]) -> HeadParams:
+    """The head parameters, with one of the numbers of expression `coefficients`.
+
+    Raises UserError, naming the tensor, for another type, shape or dtype, and for values that are not finite.
+    """
+    if not isinstance(params, HeadParams):
+        raise UserError(
+            f"a frame is given as avatar.types.HeadParams, such as rest_params() or recording.params(0), not as "
+            f"{_kind(params)}"
+        )
+    sizes = _checked_tensors("params", params, PARAM_SHAPES)
+    if sizes["E"] not in coefficients:
+        own = " or ".join(map(str, sorted(coefficients)))
+        raise UserError(f"params.expression has {sizes['E']} coefficients: give the {own} of this avatar")
+    return params
+
+
+def checked_camera(camera: object) -> Camera:
+    """The camera. Raises UserError as `checked_params` does; the splatter checks its numbers."""
+    if not isinstance(camera, Camera):
+        raise UserError(
+            f"a view is given as avatar.types.Camera, such as rest_camera() or recording.camera(0), not as "
+            f"{_kind(camera)}"
+        )
+    _checked_tensors("camera", camera, CAMERA_SHAPES)
+    return camera
+
+
+def _checked_tensors(owner: str, values: HeadParams | Camera, shapes: dict[str, str]) -> dict[str, int]:
+    tensors: dict[str, Tensor] = {
+        f"{owner}.{field.name}": getattr(values, field.name) for field in fields(values) if field.name in shapes
+    }
+    try:
+        sizes = check_shapes(**{name: (value, shapes[name.split(".")[1]]) for name, value in tensors.items()})
+    except (TypeError, ValueError) as error:
+        raise UserError(str(error)) from None
+    for name, value in tensors.items():
+        if value.dtype != torch.float32:
+            raise UserError(f"{name} is {_kind(value)}, not torch.float32: give it as {name}.float()")
+    if not bool(torch.isfinite(torch.cat([value.flatten() for value in tensors.values()])).all()):
+        for name, value in tensors.items():
+            if (sentence := describe_non_finite(name, value)) is not None:
+                raise UserError(sentence)
+    return sizes
+
+
+def _kind(value: object) -> str:
+    return str(value.dtype) if isinstance(value, Tensor) else type(value).__name__

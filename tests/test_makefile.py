@@ -1,0 +1,33 @@
+"""What the Makefile's targets would run."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def commands(target: str, environment: Path) -> str:
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    words = ["make", "--dry-run", target, f"VENV={environment}"]
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize("target", ["setup", "demo"])
+def test_a_demo_installs_no_developers_tools(target: str, tmp_path: Path) -> None:
+    said = commands(target, tmp_path / "new")
+    assert "-e '.[track,view]'" in said and "dev]" not in said
+
+
+@pytest.mark.parametrize("target", ["test", "check", "stress", "fuzz", "smoke", "paper-smoke", "gpu-check", "wheel"])
+def test_developers_targets_install_their_tools_once(target: str, tmp_path: Path) -> None:
+    assert commands(target, tmp_path / "new").count("-e '.[dev]'") == 1
+    (tmp_path / "used").mkdir()
+    for name in (".tools", ".installed", ".installed-dev"):
+        (tmp_path / "used" / name).touch()
+    assert "-e '.[" not in commands(target, tmp_path / "used") and "-e '.[" not in commands("demo", tmp_path / "used")
