@@ -24,8 +24,8 @@ import torch
 from small_runs import run_info, train_small
 from tracked_folder import write_tracked_folder
 
+from avatar.commands.arguments import parse
 from avatar.commands.measuring import run_eval
-from avatar.commands.parser import parse
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError

@@ -18,7 +18,7 @@ from torch import Tensor
 
 import avatar
 from avatar.commands import driving, exporting, refining
-from avatar.commands.parser import parse
+from avatar.commands.arguments import parse
 from avatar.data.manifest import MANIFEST_FILE, read_manifest
 from avatar.errors import UserError
 from avatar.export.ply import encode_ply
