@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,8 @@ import torch
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
-from avatar.data.subject import Subject
+from avatar.data.subject import FramePixels, Subject
+from avatar.gaussians.facing import learned_turning
 from avatar.head.assets import HeadAssets
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import newest_checkpoint
@@ -55,6 +57,30 @@ def test_noise_in_held_out_frames_changes_no_bit_of_a_trained_avatar(
         assert torch.equal(values[train_frames], known[train_frames])
         assert not torch.equal(values[test_frames], known[test_frames]), f"{name} is not poisoned"
     same_rest(clean, other)
+
+
+def test_training_opens_training_frames_and_one_preview(tracked_folder: Path, tmp_path: Path) -> None:
+    """For first colours, moved tracking, strays and steps, which pass over all frames."""
+    _, subject, assets = open_small(tracked_folder, small_config())
+    opened: list[int] = []
+
+    class Listening(Subject):
+        def pixels(self, index: int, size: int | None = None) -> FramePixels:
+            opened.append(index)
+            return super().pixels(index, size)
+
+    listening = Listening(**{field.name: getattr(subject, field.name) for field in fields(Subject)})
+    trained(assets, listening, tmp_path / "run", f"trainer.iterations={len(subject)}", "trainer.preview_every=1000")
+    assert {*subject.split.train} <= {*opened}
+    assert {*opened} - {*subject.split.train} == {subject.split.test[0]}
+
+
+def test_the_facing_is_measured_from_the_training_frames_mean(tracked_folder: Path, tmp_path: Path) -> None:
+    _, subject, assets = open_small(tracked_folder, small_config())
+    turning = trained(assets, subject, tmp_path / "run", "trainer.iterations=1").avatar.turning
+    rotations = subject.recording.tracks["R"]
+    assert turning is not None and torch.equal(turning, learned_turning(rotations[list(subject.split.train)]))
+    assert not torch.equal(turning, learned_turning(rotations))
 
 
 def same_rest(a: TrainedAvatar, b: TrainedAvatar) -> None:

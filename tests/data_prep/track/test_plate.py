@@ -86,6 +86,22 @@ def test_a_camera_that_moves_has_no_background() -> None:
     assert learn_plate((image, matte) for image, matte, _ in clip(moves=3)) is None
 
 
+@pytest.mark.parametrize(
+    ("share", "away", "is_still"), [(0.0, 0.0, True), (0.3, 2.5, True), (0.03, 6.0, True), (0.08, 6.0, False)]
+)
+def test_a_camera_stands_still_where_few_pixels_change(share: float, away: float, is_still: bool) -> None:
+    """A curtain, of such a share of the wall, is in the second half of the pictures `away` times the noise brighter."""
+    rng, learned = np.random.default_rng(0), learn_plate((image, matte) for image, matte, _ in clip())
+    assert learned is not None
+    changed = rng.random((SIZE // 8, SIZE // 8)) < 2 * share
+    changed = np.kron(changed, np.ones((8, 8), bool))
+    pairs = []
+    for number, (image, matte, _) in enumerate(clip()):
+        lit = image + (number % 2) * away * learned.noise * changed[..., None]
+        pairs.append((np.rint(lit).clip(0, 255).astype(np.uint8), matte))
+    assert (learn_plate(pairs) is not None) == is_still
+
+
 def test_too_few_pictures_or_nothing_behind() -> None:
     pairs = [(image, matte) for image, matte, _ in clip()]
     assert learn_plate(pairs[:2]) is None
