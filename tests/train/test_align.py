@@ -219,6 +219,20 @@ def test_a_step_moves_a_frame_by_its_share_of_a_gauss_newton_step(avatar: Avatar
     assert float((found + 0.5 * whole[:, 0]).norm()) < 0.02 * float(found.norm()) and float(found.norm()) > 1e-3
 
 
+def test_moves_stay_within_their_bounds(avatar: Avatar) -> None:
+    """A step of any size ends where training has been."""
+    clip = wrongly_tracked(drawn_clip(avatar))
+    alignment, frame = begun(avatar, clip), clip.pictures[3]
+    seen = alignment.see(10, frame, Pictures(clip), print)  # type: ignore[arg-type]
+    assert seen.placed is not None
+    freedom = find_freedom(clip.recording.tracks, clip.split.train, avatar.head.neutral_vertices().mean(dim=0))
+    slope = torch.where(torch.arange(freedom.given.shape[1]) % 2 == 0, 1e9, -1e9)
+    seen.placed.gradient = lambda: slope  # type: ignore[method-assign]
+    alignment.learn(seen)
+    moves, (low, high) = alignment.tensors()["align.moves"][3], freedom.bounds(3)
+    assert bool((moves >= low).all()) and bool((moves <= high).all()) and bool(((moves == low) | (moves == high)).all())
+
+
 def test_mouths_count_in_the_curvature_as_in_the_loss(avatar: Avatar) -> None:
     clip = wrongly_tracked(drawn_clip(avatar))
     mouth = torch.zeros(SIZE, SIZE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -10,15 +10,18 @@ import torch
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
+from avatar.data.split import Split
 from avatar.data.subject import FramePixels, Subject
 from avatar.gaussians.facing import learned_turning
 from avatar.head.assets import HeadAssets
+from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import newest_checkpoint
 from avatar.runs.trained import TrainedAvatar, load_avatar
 from avatar.train import align as align_module
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
+from avatar.types import IDENTITY_6D
 
 
 def trained(assets: HeadAssets, subject: Subject, run: Path, *overrides: str) -> TrainedAvatar:
@@ -81,6 +84,19 @@ def test_the_facing_is_measured_from_the_training_frames_mean(tracked_folder: Pa
     rotations = subject.recording.tracks["R"]
     assert turning is not None and torch.equal(turning, learned_turning(rotations[list(subject.split.train)]))
     assert not torch.equal(turning, learned_turning(rotations))
+
+
+def test_the_neutral_face_is_a_training_frames(tracked_folder: Path, tmp_path: Path) -> None:
+    """Although the held-out ones, here the first, are calmer and all alike."""
+    _, subject, assets = open_small(tracked_folder, small_config())
+    tracks = {name: values.clone() for name, values in subject.recording.tracks.items()}
+    tracks["expression"][:6], tracks["jaw"][:6] = 0.0, torch.tensor(IDENTITY_6D)
+    split = Split(tuple(range(6, len(subject))), tuple(range(6)))
+    calm = replace(subject, recording=replace(subject.recording, tracks=tracks, split=split))
+    found = trained(assets, calm, tmp_path / "run", "trainer.iterations=1")
+    training = find_neutral(calm.recording.motion(split.train), found.avatar.head)
+    assert found.neutral.frame == training.frame and torch.equal(found.neutral.expression, training.expression)
+    assert found.neutral.expression.any()
 
 
 def same_rest(a: TrainedAvatar, b: TrainedAvatar) -> None:

@@ -87,18 +87,19 @@ def test_a_camera_that_moves_has_no_background() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "away", "is_still"), [(0.0, 0.0, True), (0.3, 2.5, True), (0.03, 6.0, True), (0.08, 6.0, False)]
+    ("share", "away", "is_still"), [(0.0, 0.0, True), (0.1, 2.8, True), (0.03, 6.0, True), (0.08, 6.0, False)]
 )
-def test_a_camera_stands_still_where_few_pixels_change(share: float, away: float, is_still: bool) -> None:
-    """A curtain, of such a share of the wall, is in the second half of the pictures `away` times the noise brighter."""
-    rng, learned = np.random.default_rng(0), learn_plate((image, matte) for image, matte, _ in clip())
+def test_a_camera_stands_still_where_little_changes(share: float, away: float, is_still: bool) -> None:
+    """A lamp flickers: such a share of the background is `away` times the noise brighter, each place in a third of the
+    pictures."""
+    learned = learn_plate((image, matte) for image, matte, _ in clip())
     assert learned is not None
-    changed = rng.random((SIZE // 8, SIZE // 8)) < 2 * share
-    changed = np.kron(changed, np.ones((8, 8), bool))
+    lit = np.random.default_rng(0).random((SIZE // 8, SIZE // 8)) < 3 * share
+    brighter = away * learned.noise * np.kron(lit, np.ones((8, 8)))[..., None]
     pairs = []
     for number, (image, matte, _) in enumerate(clip()):
-        lit = image + (number % 2) * away * learned.noise * changed[..., None]
-        pairs.append((np.rint(lit).clip(0, 255).astype(np.uint8), matte))
+        shown = image + brighter if number % 3 == 0 else image
+        pairs.append((np.rint(shown).clip(0, 255).astype(np.uint8), matte))
     assert (learn_plate(pairs) is not None) == is_still
 
 
