@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from heads import rest_params
@@ -33,5 +35,5 @@ def test_limits_are_the_turns_that_training_has_shown() -> None:
 
 
 def test_zoom_is_about_the_middle_of_the_picture() -> None:
-    near = orbited(FRONT, zoom=2.0)
-    assert (near.fx, near.fy, near.cx, near.cy) == (160, 160, 32, 28)
+    near = orbited(replace(FRONT, cx=40), zoom=2.0)
+    assert (near.fx, near.fy, near.cx, near.cy) == (160, 160, 48, 28)
