@@ -11,7 +11,7 @@ DEMO ?= demo
 STRESS_EXAMPLES ?= 100000
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup demo test stress fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
+.PHONY: help setup demo test mutate stress fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-16s %s\n", $$1, $$2}'
 
@@ -23,6 +23,9 @@ demo: setup ## make two people, train an avatar of one, evaluate it and let the 
 # A worker for each core, with one thread: most tests have work for one.
 test: setup ## run all tests
 	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+mutate: setup ## plant mistakes in the program, one at a time, and see that tests catch each (ten minutes)
+	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python scripts/mutate.py
 
 stress: setup ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress

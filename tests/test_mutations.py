@@ -6,48 +6,41 @@ import ast
 import runpy
 import tomllib
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
+OWN = tomllib.loads((SCRIPTS / "mutations.toml").read_text(encoding="utf-8"))["mutation"]
+KERNELS = [
+    {"file": f"avatar/kernels/{mutation.module}.py", "what": mutation.what, "old": mutation.old, "new": mutation.new}
+    for mutation in runpy.run_path(str(SCRIPTS / "kernel_mutations.py"))["MUTATIONS"]
+]
 
 
-class Planted(NamedTuple):
-    file: str
-    what: str
-    old: str
-    new: str
-    tests: tuple[str, ...] = ()
+@pytest.mark.parametrize("planted", [OWN, KERNELS], ids=["mutations.toml", "kernel_mutations.py"])
+def test_what_a_planted_mistake_changes_is_there_once(planted: list[dict[str, str]]) -> None:
+    problems = []
+    for mistake in planted:
+        source = (ROOT / mistake["file"]).read_text(encoding="utf-8")
+        if source.count(mistake["old"]) != 1:
+            problems.append(f"{mistake['file']} has {source.count(mistake['old'])} times {mistake['old']!r}")
+        elif mistake["old"].split() == mistake["new"].split():
+            problems.append(f"{mistake['file']}: {mistake['what']}: nothing but the layout changes")
+        else:
+            ast.parse(source.replace(mistake["old"], mistake["new"]), mistake["file"])
+    assert not problems
 
 
-def planted() -> list[Planted]:
-    own = tomllib.loads((SCRIPTS / "mutations.toml").read_text(encoding="utf-8"))["mutation"]
-    kernels = runpy.run_path(str(SCRIPTS / "kernel_mutations.py"))["MUTATIONS"]
-    return [
-        *(Planted(**{**values, "tests": tuple(values["tests"])}) for values in own),
-        *(Planted(f"avatar/kernels/{m.module}.py", m.what, m.old, m.new) for m in kernels),
-    ]
-
-
-@pytest.mark.parametrize("mistake", planted(), ids=lambda m: f"{m.file}: {m.what}")
-def test_a_planted_mistake_fits_the_program(mistake: Planted) -> None:
-    source = (ROOT / mistake.file).read_text(encoding="utf-8")
-    assert source.count(mistake.old) == 1, f"{mistake.file} has {source.count(mistake.old)} times {mistake.old!r}"
-    changed = ast.parse(source.replace(mistake.old, mistake.new))
-    assert ast.dump(changed) != ast.dump(ast.parse(source)), "nothing but the layout changes"
+@pytest.mark.parametrize("planted", [OWN, KERNELS], ids=["mutations.toml", "kernel_mutations.py"])
+def test_no_mistake_is_planted_twice(planted: list[dict[str, str]]) -> None:
+    for keys in (("file", "what"), ("file", "old", "new")):
+        found = [tuple(mistake[key] for key in keys) for mistake in planted]
+        assert len({*found}) == len(found)
 
 
 def test_the_tests_that_catch_mistakes_are_there() -> None:
-    """In the package's own folder of tests, or at the root for modules there."""
-    for mistake in planted():
-        for test in mistake.tests:
-            file, _, name = test.partition("::")
-            path = ROOT / file
-            assert path.is_file() and (not name or f"def {name}(" in path.read_text(encoding="utf-8")), test
-
-
-def test_no_mistake_is_planted_twice() -> None:
-    found = [(mistake.file, mistake.old, mistake.new) for mistake in planted()]
-    assert len({*found}) == len(found) and len({(m.file, m.what) for m in planted()}) == len(found)
+    for test in {test for mistake in OWN for test in mistake["tests"]}:
+        file, _, name = test.partition("::")
+        assert (ROOT / file).is_file(), test
+        assert not name or f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), test

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,20 @@ import numpy as np
 import pytest
 
 from data_prep.root_pose import rotation_matrix
-from data_prep.transforms import ListedFrame, camera_pose, pinhole
+from data_prep.transforms import ListedFrame, camera_pose, pinhole, read_listings
+
+
+def test_validation_is_held_out_where_no_test_is(tmp_path: Path) -> None:
+    def divided(*splits: str) -> dict[str, str | None]:
+        for old in tmp_path.iterdir():
+            old.unlink()
+        for split in splits:
+            frames = {"frames": [{"file_path": f"{split}.png"}]}
+            (tmp_path / f"transforms_{split}.json").write_text(json.dumps(frames))
+        return {frame.values["file_path"]: frame.split for frame in read_listings(tmp_path)}
+
+    assert divided("train", "val") == {"train.png": "train", "val.png": "test"}
+    assert divided("train", "val", "test") == {"train.png": "train", "val.png": "val", "test.png": "test"}
 
 
 def listed(**values: Any) -> ListedFrame:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from spoken_scene import FPS, SIZE, Scene, spoken_scene
 
-from data_prep.live.frame_fit import LOST_AFTER, FrameFit, _Fitted, _is_quick
+from data_prep.live.frame_fit import LOST_AFTER, FrameFit, _Fitted, _follows, _is_quick
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
@@ -144,6 +144,23 @@ def test_a_head_is_expected_where_its_speed_takes_it() -> None:
     assert _is_quick(before, at(0.0), 1.08) and _is_quick(before, at(0.04), 1.08)
     assert not _is_quick(before[1:], at(0.05), 1.08) and _is_quick(before[1:], at(0.08), 1.08)
     assert not _is_quick([], at(5.0), 1.0)
+
+
+def test_smoothness_is_that_of_the_last_two_frames(followed: Followed) -> None:
+    """Scaled by their rate, but never beyond that of a quick camera."""
+    fit = followed.fitter()
+    followed.follow(fit, range(5))
+    assert [one.taken for one in fit._before] == pytest.approx([3 / FPS, 4 / FPS])
+    nominal, last = fit._smoothness, fit._before[-1]
+
+    def stiffness(wait: float) -> float:
+        return float(
+            _follows(nominal, [replace(last, taken=-wait), replace(last, taken=0.0)], wait).smoothness.second[0]
+        )
+
+    usual = float(nominal.second[0])
+    assert stiffness(1 / FPS) == pytest.approx(usual) and stiffness(2 / FPS) == pytest.approx(usual / 8)
+    assert stiffness(1e-4) == pytest.approx(stiffness(1 / 60)) and stiffness(9.0) == pytest.approx(stiffness(1 / 5))
 
 
 def test_landmarks_that_are_no_face_do_no_harm(followed: Followed) -> None:

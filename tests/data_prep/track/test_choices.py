@@ -56,6 +56,7 @@ def test_the_square_around_the_head() -> None:
     assert box.width == box.height and box.x % 2 == box.y % 2 == 0
     assert box.y < 400 - 150 - 100 and box.y + box.height > 400 + 150 + 150  # hair and neck
     assert box.x + box.width / 2 == pytest.approx(1000, abs=2)
+    assert (box.y, box.y + box.height) == pytest.approx((250 - 0.55 * 300, 550 + 0.75 * 300), abs=3)
     moved = np.concatenate((face(900, 400, 300), face(1100, 400, 300)))
     assert head_square(1920, 1080, moved).width > box.width
 
