@@ -133,6 +133,8 @@ def run(tasks: Sequence[Task], jobs: int, load: Callable[[], object]) -> int:
 
     `load` imports what every process needs, and no module that is changed.
     """
+    if not tasks:
+        raise SystemExit("no mistake is chosen: --only takes a part of a file's name or of a description")
     for task in tasks:
         if task.mutation is not None:
             task.mutation.source()
