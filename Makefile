@@ -13,7 +13,7 @@ STRESS_EXAMPLES ?= 100000
 STRESS_MINUTES ?= 60
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup setup-dev demo test stress stress-view fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
+.PHONY: help setup setup-dev demo test mutate stress stress-view fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-18s %s\n", $$1, $$2}'
 
@@ -27,6 +27,9 @@ demo: setup ## make two people, train an avatar of one, evaluate it and let the 
 # A worker for each core, with one thread: most tests have work for one.
 test: setup-dev ## run all tests
 	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+mutate: setup-dev ## plant mistakes in the program, one at a time, and see that tests catch each (ten minutes)
+	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python scripts/mutate.py
 
 stress: setup-dev ## draw a hundred thousand random scenes, and poisoned ones (STRESS_EXAMPLES=100000)
 	AVATAR_STRESS_EXAMPLES=$(STRESS_EXAMPLES) $(BIN)/python -m pytest -q --timeout=0 tests/stress

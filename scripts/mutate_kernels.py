@@ -2,38 +2,19 @@
 
     TRITON_INTERPRET=1 python scripts/mutate_kernels.py [--jobs 2] [--only WORD] [--changed-only]
 
-Every mistake of `kernel_mutations.py` and `kernel_mutations_avatar.py` gets a process, in which its module is loaded from
-a changed copy; the checkout is not touched. It counts as caught where an assertion of a test fails, not where the program
-merely falls over. The same tests pass without a mistake, which is the first thing tried unless --changed-only says that it
-has been. Ends with status 1 when a mistake goes unseen.
+The mistakes are those of `kernel_mutations.py` and `kernel_mutations_avatar.py`. The same tests pass without a mistake,
+which is the first thing tried unless --changed-only says that it has been. Ends with status 1 when a mistake goes unseen.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import io
-import multiprocessing
 import os
 import sys
-import tempfile
-import time
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec
-from importlib.util import spec_from_file_location
-from pathlib import Path
-from typing import Any, NamedTuple
 
-import pytest
-import torch
-from kernel_mutations import SPLATTER_MUTATIONS, Mutation
+import kernel_mutations
 from kernel_mutations_avatar import AVATAR_MUTATIONS
+from mutation_runner import Mutation, Task, options, run
 
-# Without what takes longer than most of these tests do: other plugins, rewritten assertions, a collection of all garbage.
-QUIET = ["-x", "-q", "--no-header", "--assert=plain", "-p", "pytest_timeout", "-p", "no:cacheprovider"]
-QUIET += ["-p", "no:unraisableexception", "-p", "no:threadexception"]
-os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-KERNELS = Path(__file__).resolve().parents[1] / "avatar" / "kernels"
 BACKENDS, CAPACITY, HOSTILE, PLACE = (
     f"tests/{name}.py::"
     for name in ("splat/test_splat_backends", "gpu/test_gpu_capacity", "gpu/test_gpu_hostile", "gpu/test_gpu_place")
@@ -72,73 +53,11 @@ TESTS = {
 }
 
 
-class Outcome(NamedTuple):
-    caught_by: str | None  # the test whose assertion failed
-    passed: int
-    otherwise: str  # what went wrong that is no assertion
-    seconds: float
-
-
-class Changed(MetaPathFinder):
-    """Finds one module in another file."""
-
-    def __init__(self, name: str, path: Path) -> None:
-        self._name, self._path = name, path
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        return spec_from_file_location(name, self._path) if name == self._name else None
-
-
-class Listener:
-    """What pytest's tests come to."""
-
-    def __init__(self) -> None:
-        self.caught_by: str | None = None
-        self.otherwise = ""
-        self.passed = 0
-
-    @pytest.hookimpl(hookwrapper=True)
-    def pytest_runtest_makereport(self, item: pytest.Item, call: pytest.CallInfo[None]) -> Any:
-        report = (yield).get_result()
-        self.passed += report.passed and report.when == "call"
-        if call.excinfo is None:
-            return
-        if call.excinfo.errisinstance(AssertionError) and report.when == "call":
-            self.caught_by = item.nodeid
-        elif report.skipped:
-            self.otherwise = f"{item.nodeid} was skipped"
-        else:
-            self.otherwise = f"{item.nodeid}: {call.excinfo.exconly()}"
-
-
-def run_tests(tests: list[str], mutation: Mutation | None) -> Outcome:
-    """In a process that has not loaded the kernels yet, and will not be used again."""
-    assert not any(name.startswith("avatar.kernels.") for name in sys.modules)
-    torch.set_num_threads(1)
-    begin, listener = time.monotonic(), Listener()
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()) as said:
-        if mutation is not None:
-            path = Path(folder) / f"{mutation.module}.py"
-            path.write_text(mutated(mutation), encoding="utf-8")
-            sys.meta_path.insert(0, Changed(f"avatar.kernels.{mutation.module}", path))
-        status = pytest.main([*QUIET, *tests], plugins=[listener])
-    if listener.caught_by is None and not listener.otherwise and status != pytest.ExitCode.OK:
-        listener.otherwise = said.getvalue().strip().splitlines()[-1]
-    return Outcome(listener.caught_by, listener.passed, listener.otherwise, time.monotonic() - begin)
-
-
-def mutated(mutation: Mutation) -> str:
-    source = (KERNELS / f"{mutation.module}.py").read_text(encoding="utf-8")
-    if source.count(mutation.old) != 1:
-        raise SystemExit(f"{mutation.module}.py has {source.count(mutation.old)} times {mutation.old!r}, not once")
-    return source.replace(mutation.old, mutation.new)
-
-
 def tests_of(module: str) -> list[str]:
     return TESTS.get(module, SPLATTER)
 
 
-def soonest_first(mutation: Mutation) -> list[str]:
+def soonest_first(mutation: kernel_mutations.Mutation) -> list[str]:
     """All tests of its module, beginning with the one that is known to see it."""
     tests = tests_of(mutation.module)
     chosen = [test for test in tests if mutation.first and mutation.first in test]
@@ -147,44 +66,24 @@ def soonest_first(mutation: Mutation) -> list[str]:
     return [*chosen, *(test for test in tests if test not in chosen)]
 
 
-def attempt(task: tuple[str, Mutation | None]) -> Outcome:
-    module, mutation = task
-    return run_tests(tests_of(module) if mutation is None else soonest_first(mutation), mutation)
+def task_of(mutation: kernel_mutations.Mutation) -> Task:
+    file, tests = f"avatar/kernels/{mutation.module}.py", tuple(soonest_first(mutation))
+    planted = Mutation(file, mutation.what, mutation.old, mutation.new, tests)
+    return Task(f"{mutation.module}: {mutation.what}", tests, planted)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--changed-only", action="store_true", help="the tests are known to pass without a mistake")
-    parser.add_argument("--only", default="", metavar="WORD", help="mistakes in a module or a description with it")
-    arguments = parser.parse_args()
+    arguments = options(__doc__).parse_args()
     if os.environ.get("TRITON_INTERPRET") != "1":
         raise SystemExit("the kernels are interpreted: set TRITON_INTERPRET=1")
-    chosen = [m for m in SPLATTER_MUTATIONS + AVATAR_MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
-    for mutation in chosen:
-        mutated(mutation), soonest_first(mutation)
+    chosen = [m for m in kernel_mutations.SPLATTER_MUTATIONS + AVATAR_MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
     areas = {id(tests_of(m.module)): m.module for m in reversed(chosen)}.values()  # the first module of each
-    tasks: list[tuple[str, Mutation | None]] = [] if arguments.changed_only else [(module, None) for module in areas]
-    tasks += [(mutation.module, mutation) for mutation in chosen]
-    import_all()
-    wrong = 0
-    # Forked, so that nobody waits for torch and Triton to be imported again.
-    with multiprocessing.get_context("fork").Pool(arguments.jobs, maxtasksperchild=1) as pool:
-        for (module, mutation), found in zip(tasks, pool.imap(attempt, tasks, chunksize=1), strict=True):
-            if mutation is None:
-                wrong += found.caught_by is not None or bool(found.otherwise) or not found.passed
-                verdict = found.caught_by or found.otherwise or f"{found.passed} tests pass"
-                print(f"{module}, as it is: {verdict} ({found.seconds:.0f} s)", flush=True)
-                continue
-            wrong += found.caught_by is None
-            verdict = found.caught_by or f"UNSEEN {found.otherwise or f'by {found.passed} tests'}"
-            print(f"{module}: {mutation.what}: {verdict} ({found.seconds:.0f} s)", flush=True)
-    print(f"{len(chosen)} mistakes, {wrong} of {len(tasks)} runs not as they must be")
-    return 1 if wrong else 0
+    unchanged = [Task(f"{module}, as it is", tuple(tests_of(module)), None) for module in areas]
+    tasks = [*([] if arguments.changed_only else unchanged), *map(task_of, chosen)]
+    return run(tasks, arguments.jobs, load)
 
 
-def import_all() -> None:
-    """What every process needs; none of it loads a kernel."""
+def load() -> None:
     import triton.runtime.interpreter  # noqa: F401
 
     import avatar.bench.scenes

@@ -44,7 +44,7 @@ SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
 UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
 _MAX_PROGRESS = 2**28  # bytes
-PROGRESS_FORMAT = 2  # grows with every change of what refinement finds
+PROGRESS_FORMAT = 3  # grows with every change of what refinement finds
 
 
 @dataclass(frozen=True)
@@ -245,15 +245,17 @@ class _Work:
 
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, keep the given tracking of frames that then fit no better than with it, and centre the rest."""
-        freedom, numbers = self.freedom, [record.tracking for record in self.subject.manifest.frames]
-        moves = smoothed(moves, matrix, freedom.acceleration, freedom.calm, numbers)
+        freedom, numbers = self.freedom, np.array([record.tracking for record in self.subject.manifest.frames])
+        trained_on = torch.zeros(len(moves), dtype=torch.bool)
+        trained_on[list(self.subject.split.train)] = True
+        for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one
+            given, own_numbers = freedom.acceleration[part], numbers[part.numpy()]
+            moves[part] = smoothed(moves[part], matrix, given, freedom.calm, own_numbers)
         values = freedom.all_values(moves)
         after = np.array(list(self.measured(range(len(values)), values)))
         kept = ~(after[:, 0] <= before[:, 0])
         after[kept] = before[kept]
         keep = torch.from_numpy(kept)
-        trained_on = torch.zeros(len(kept), dtype=torch.bool)
-        trained_on[list(self.subject.split.train)] = True
         values = freedom.all_values(freedom.centred(moves, trained_on & ~keep))
         tracks = moved_tracks(self.tracks, values, freedom.changed(), self.centre)
         for name, given in self.tracks.items():

@@ -27,7 +27,7 @@ def smoothed(
     curvature: Float[Tensor, "F F"],
     acceleration: Float[Tensor, "T F"],
     calm: Float[Tensor, " F"],
-    numbers: Sequence[int],
+    numbers: Sequence[int] | np.ndarray,
 ) -> Float[Tensor, "T F"]:
     """The joint minimum, computed in float64; `curvature` positive definite, `calm` positive.
 
@@ -51,7 +51,7 @@ def smoothed(
     return ((torch.from_numpy(solved) @ basis.T) / root).to(moves.dtype)
 
 
-def second_differences(numbers: Sequence[int]) -> csr_array:
+def second_differences(numbers: Sequence[int] | np.ndarray) -> csr_array:
     """A row (1, -2, 1) for every three frames that follow each other, [rows, T]."""
     middles = _middles(numbers)
     rows = np.repeat(np.arange(len(middles)), 3)
@@ -60,7 +60,7 @@ def second_differences(numbers: Sequence[int]) -> csr_array:
     return csr_array((weights, (rows, columns)), shape=(len(middles), len(numbers)))
 
 
-def _middles(numbers: Sequence[int]) -> np.ndarray:
+def _middles(numbers: Sequence[int] | np.ndarray) -> np.ndarray:
     """Positions of the frames that have both their neighbours."""
     steps = np.diff(np.asarray(numbers, np.int64))
     return np.flatnonzero((steps[:-1] == 1) & (steps[1:] == 1)) + 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.head.assets import load_head_assets
+from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.prepare import prepare
 
 
@@ -53,6 +54,20 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     (first / "tracks.safetensors").unlink()
     assert not run()[2] and run()[2]
     assert sorted(p.name for p in (tmp_path / "cache" / "subjects").iterdir()) == sorted([first.name, other.name])
+
+
+def test_another_head_model_prepares_again(tmp_path: Path) -> None:
+    """Also in a place that was chosen, which the key of the cache does not name."""
+    folder = write_tracked_folder(tmp_path / "subject", frames=12)
+    head = load_head_assets(folder / "head_model")
+
+    def run(which: HeadAssets) -> str:
+        prepared = prepare(Source(folder, folder / "head_model"), which, out=tmp_path / "out", say=lambda _: None)
+        return read_manifest(prepared).head_fingerprint
+
+    assert run(head) == head.fingerprint
+    assert run(replace(head, fingerprint="f" * 64)) == "f" * 64
+    assert run(head) == head.fingerprint
 
 
 def test_a_failed_preparation_keeps_the_old_one(tmp_path: Path) -> None:

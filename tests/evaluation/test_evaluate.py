@@ -137,6 +137,26 @@ def test_pictures_of_an_earlier_evaluation_do_not_stay(tmp_path: Path, subject: 
     assert sorted(path.name for path in stale.parent.iterdir()) == ["00007.png", "00008.png", "00009.png"]
 
 
+@pytest.mark.parametrize("what", ["step", "data", "head model"])
+def test_figures_of_something_else_do_not_stay(tmp_path: Path, subject: Subject, what: str) -> None:
+    """Beside those by another protocol, of the avatar as it is now."""
+    run = make_run(tmp_path / "run", subject)
+    said: list[str] = []
+
+    def measured(protocol: str) -> list[str]:
+        return sorted(json.loads(evaluate(run, [protocol], say=said.append).read_text())["protocols"])
+
+    assert measured("insta350") == ["insta350"] and measured("strict") == ["insta350", "strict"]
+    if what == "step":
+        run.step += 100
+    elif what == "data":
+        run.subject = replace(subject, recording=replace(subject.recording, data_hash="0" * 64))
+    else:
+        run.avatar.head.assets.fingerprint = "0" * 64
+    assert measured("flashavatar") == ["flashavatar"]
+    assert "Removed" in said[-1] and not (run.path / "eval" / "strict").exists()
+
+
 def test_a_failure_on_the_way_keeps_the_old_results(tmp_path: Path, subject: Subject) -> None:
     run = make_run(tmp_path / "run", subject)
     path = evaluate(run, ["insta350"], say=lambda _: None)

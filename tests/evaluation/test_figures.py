@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,23 @@ def test_jitter_can_be_recomputed_from_the_pictures(tmp_path: Path, subject: Sub
     entry = results["protocols"]["flashavatar"]
     assert entry["means"]["jitter"] == pytest.approx(expected, rel=1e-9) and expected > 0.1
     assert entry["frames_with_a_figure"]["jitter"] == 1
+
+
+def test_jitter_goes_by_the_frames_numbers(tmp_path: Path, subject: Subject) -> None:
+    """Where the first frames of the video were left out, numbers and positions differ; a gap in them has no jitter."""
+
+    def jitter(name: str, numbers: list[int]) -> list[str]:
+        records = zip(subject.manifest.frames, numbers, strict=True)
+        frames = tuple(replace(record, tracking=number) for record, number in records)
+        numbered = replace(subject, manifest=replace(subject.manifest, frames=frames))
+        run = make_run(tmp_path / name, numbered)
+        evaluate(run, ["flashavatar"], say=lambda _: None)
+        rows = csv.DictReader((run.path / "eval" / "flashavatar" / "frames.csv").open())
+        return [row["jitter"] for row in rows]
+
+    plain = jitter("plain", [*range(10)])
+    assert plain[1] != "nan" and jitter("later", [*range(100, 110)]) == plain
+    assert jitter("gap", [*range(9), 20]) == ["nan"] * 3
 
 
 def test_an_avatar_without_error_has_no_worst_frame(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ import pytest
 import torch
 from heads import grid_head, random_params, rest_params
 
+from avatar.data.split import Split
 from avatar.evaluation.bootstrap import RESAMPLES, BlockBootstrap, block_length
-from avatar.evaluation.conditions import Conditions, expression_distances, yaw
+from avatar.evaluation.conditions import Conditions, conditions, expression_distances, yaw
 from avatar.evaluation.curves import line
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import Pair
@@ -94,6 +96,17 @@ def test_expression_distance_is_to_the_nearest_training_frame_and_leaves_out_the
     shapes = torch.stack([head.vertices(params) for params in at_rest]).double()
     expected = (shapes[:4] - shapes[4]).square().sum(dim=-1).mean(dim=-1).sqrt().min().item() * 1000
     assert found[2] == pytest.approx(expected, rel=1e-4) and expected > 1
+
+
+def test_conditions_compare_with_training_frames() -> None:
+    """The held-out frames are the same as others, and not as those of the training."""
+    head, motion = HeadModel(grid_head(), torch.zeros(3)), [random_params(seed) for seed in (0, 1, 2, 3, 3, 2)]
+    subject: Any = SimpleNamespace(
+        split=Split((0, 1), (2, 3)), params=motion.__getitem__, camera=lambda _: camera_at(20.0)
+    )
+    found = conditions(head, subject, [4, 5])
+    distances = expression_distances(head, motion[4:], motion[:2])
+    assert [found[index].expression_distance for index in (4, 5)] == pytest.approx(distances) and min(distances) > 1
 
 
 def test_blocks_are_a_second_long_where_there_are_frames_enough() -> None:

@@ -40,6 +40,14 @@ def test_a_direction_that_training_never_took_is_far() -> None:
     assert near < 0.5 and far > 5.0
 
 
+@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
+def test_still_directions_are_measured_by_the_liveliest(unit: float) -> None:
+    """Whatever a head model's coefficients are counted in."""
+    deviations = fit_expressions(faces(unit * training())).deviations
+    assert float(deviations[0]) == pytest.approx(unit, rel=0.1)
+    assert float(deviations[-1]) == pytest.approx(0.05 * float(deviations[0]))
+
+
 def test_the_nearest_expression_is_clamped_to_the_range_and_projected() -> None:
     points = training()
     space = fit_expressions(faces(points))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,9 @@ from heads import grid_head, rest_params
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.expression_space import fit_expressions
 from avatar.motion.repertoire import Repertoire, learn_repertoire
-from avatar.motion.rest import find_mean, find_neutral
-from avatar.motion.transfer import TRANSFERS, transfer_motion
+from avatar.motion.rest import RestPose, find_mean, find_neutral
+from avatar.motion.transfer import TRANSFERS, departed, transfer_motion
+from avatar.tracking.motion import rotation
 from avatar.types import HeadParams
 
 
@@ -79,6 +81,23 @@ def test_gaze_eyelids_and_the_number_of_frames_are_the_drivers(mode) -> None:
         assert torch.equal(before.eyelids, after.eyelids) and torch.equal(before.eyes, after.eyes)
         R = matrix_from_6d(after.jaw)
         torch.testing.assert_close(R @ R.T, torch.eye(3), rtol=0, atol=1e-5)
+
+
+def about(axis: tuple[float, float, float], degrees: float) -> torch.Tensor:
+    return rotation(torch.tensor(axis) * math.radians(degrees))
+
+
+def test_a_jaw_turns_from_the_targets_rest_by_the_drivers_departure() -> None:
+    """About other axes than that of the rest, where the order of the turns counts."""
+    source = RestPose(torch.zeros(5), about((1, 0, 0), 20.0), None)
+    goal = RestPose(torch.zeros(5), about((0, 1, 0), -15.0), None)
+    departure = about((0, 0, 1), 12.0)
+    driver = replace(rest_params(), jaw=(source.jaw @ departure)[:2].reshape(6))
+    (moved,) = departed([driver], source, goal, 1.0)
+    torch.testing.assert_close(matrix_from_6d(moved.jaw), goal.jaw @ departure, rtol=0, atol=1e-6)
+    (half,) = departed([driver], source, goal, 0.5)
+    expected = goal.jaw @ about((0, 0, 1), 6.0)
+    torch.testing.assert_close(matrix_from_6d(half.jaw), expected, rtol=0, atol=1e-6)
 
 
 def test_transferring_to_oneself_changes_nothing() -> None:

@@ -87,6 +87,23 @@ def test_what_all_training_frames_share_stays(
         torch.testing.assert_close(found.tracks[name], result.tracks[name], rtol=0, atol=2e-6)
 
 
+def test_what_held_out_frames_share_moves_no_training_frame(
+    avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = refine_module.smoothed
+
+    def shared(moves: torch.Tensor, *rest: Any) -> torch.Tensor:
+        """Held-out frames, of which there are 3, ask for a turn and a shift."""
+        return own(moves, *rest) + torch.where(torch.arange(moves.shape[1]) < 6, 0.045, 0.0) * (len(moves) == 3)
+
+    monkeypatch.setattr(refine_module, "smoothed", shared)
+    found = refined(avatar, wrong, tmp_path / "progress")
+    assert found is not None and not found.kept.any()
+    for name in ("R", "t"):
+        assert torch.equal(found.tracks[name][:7], result.tracks[name][:7])
+        assert not torch.equal(found.tracks[name][7:], result.tracks[name][7:])
+
+
 def test_the_avatar_is_left_as_it_was(avatar: Avatar, wrong: Clip, result: Refined) -> None:
     assert all(parameter.requires_grad for parameter in avatar.parameters())
     assert all(parameter.grad is None for parameter in avatar.parameters())

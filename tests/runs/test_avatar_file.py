@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,13 @@ from small_runs import open_small, train_small
 from torch import Tensor
 
 import avatar
+from avatar.data.split import Split
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
 from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
+from avatar.motion.expression_space import fit_expressions
+from avatar.motion.rest import find_mean
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.trained import TrainedAvatar
 
@@ -70,6 +74,28 @@ def test_the_rest_is_that_of_the_neutral_frame(trained: TrainedAvatar) -> None:
     assert trained.neutral.frame is not None
     frame = trained.recording.split.train[trained.neutral.frame]
     assert torch.equal(trained.rest_camera().R_cam_world, trained.recording.camera(frame).R_cam_world)
+
+
+def later(trained: TrainedAvatar) -> TrainedAvatar:
+    """The same of a longer video: its first frames are held out, and frame 0 of the training is another one."""
+    recording = trained.recording
+    split = Split(tuple(range(6, len(recording))), tuple(range(6)))
+    return replace(trained, recording=replace(recording, split=split), neutral=replace(trained.neutral, frame=2))
+
+
+def test_the_neutral_frame_is_counted_among_those_of_the_training(trained: TrainedAvatar) -> None:
+    one = later(trained)
+    for name in ("R_cam_world", "t_cam_world"):
+        assert torch.equal(getattr(one.rest_camera(), name), getattr(one.recording.camera(8), name))
+
+
+def test_a_repertoire_is_that_of_the_training_frames(trained: TrainedAvatar) -> None:
+    one = later(trained)
+    training = one.recording.motion(one.recording.split.train)
+    assert torch.equal(one.repertoire.mean.expression, find_mean(training).expression)
+    space = fit_expressions(training)
+    assert torch.equal(one.repertoire.expressions.lowest, space.lowest)
+    assert not torch.equal(one.repertoire.expressions.lowest, trained.repertoire.expressions.lowest)
 
 
 def test_a_file_with_its_head_needs_nothing_else(run: Path, trained: TrainedAvatar, tmp_path: Path) -> None:

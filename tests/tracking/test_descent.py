@@ -14,7 +14,7 @@ from avatar.model import Avatar
 from avatar.refine.refine import frozen
 from avatar.tracking.descent import Problem, curvature, descend
 from avatar.tracking.freedom import find_freedom
-from avatar.tracking.likeness import Likeness, targets
+from avatar.tracking.likeness import HUBER_DELTA, Likeness, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
 
 
@@ -70,6 +70,22 @@ def test_where_the_picture_fits_the_curvature_is_the_misfits_own(avatar: Avatar,
     one[3], other[7] = 0.3, 0.3
     mixed = (misfit(both) - misfit(one) - misfit(other) + base) / 0.3**2
     assert float(matrix[3, 7]) == pytest.approx(mixed, rel=0.3, abs=0.05 * float((matrix[3, 3] * matrix[7, 7]).sqrt()))
+
+
+def test_pixels_that_are_far_off_count_less_in_the_curvature(avatar: Avatar, clip: Clip) -> None:
+    """By as much as in the Huber loss, whose slope is a quarter of the error there; and by their weight."""
+    likeness = likeness_of(avatar)
+    made = problem(clip, likeness, 2)
+    (target,) = made.targets
+    still = torch.zeros(len(made.freedom.index))
+    picture = likeness.picture(made.freedom.values(2, still), made.given, target)
+    fits, off = (replace(made, targets=[target._replace(picture=picture + error)]) for error in (0.0, 4 * HUBER_DELTA))
+    whole = curvature(likeness, fits, 0)
+    torch.testing.assert_close(
+        curvature(likeness, off, 0), 0.25 * whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max())
+    )
+    weighted = curvature(likeness, fits, 0, weight=torch.full(target.mask.shape, 3.0))
+    torch.testing.assert_close(weighted, 3.0 * whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()))
 
 
 @pytest.mark.parametrize("levels", [1, 2])

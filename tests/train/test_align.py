@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -128,9 +130,9 @@ def test_at_the_end_frames_are_seen_where_they_were_moved_to(avatar: Avatar) -> 
 def test_head_poses_are_centred(avatar: Avatar) -> None:
     clip = wrongly_tracked(drawn_clip(avatar), common=True)
     alignment, _, _ = aligned(avatar, clip)
-    alignment._centre_moves()
-    moves = alignment.tensors()["align.moves"][list(clip.split.train)]
-    assert float(moves[:, :6].mean(dim=0).abs().max()) < 0.1 < float(moves[:, :6].abs().max())
+    moves = alignment.tensors()["align.moves"]
+    assert float(moves[list(clip.split.train), :6].mean(dim=0).abs().max()) < 1e-5
+    assert float(moves[:, :6].abs().max()) > 0.1 and not moves[list(clip.split.test)].any()
 
 
 def test_a_resumed_run_has_the_same_bits(tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,6 +176,76 @@ def test_a_checkpoint_of_another_kind(tracked_folder: Path, tmp_path: Path, monk
         made(whole | {"align.factor": torch.zeros(3, 3)})
     with pytest.raises(UserError, match="lacks a part"):
         made({name: value for name, value in whole.items() if name != "align.is_over"})
+
+
+def begun(avatar: Avatar, clip: Clip, *overrides: str) -> Alignment:
+    """After the first measurement of the curvature; the avatar stands still, and only the frame's Huber loss counts."""
+    given = f"data.size={SIZE}", "trainer.iterations=100", "trainer.align_rate=0.5", "trainer.perceptual=none"
+    config = small_config(*given, *overrides)
+    alignment = Alignment(avatar, clip, config)  # type: ignore[arg-type]
+    alignment.see(10, clip.pictures[0], Pictures(clip), print)  # type: ignore[arg-type]
+    return alignment
+
+
+def test_the_rate_of_moves_falls_from_its_first_value_to_a_tenth(avatar: Avatar) -> None:
+    clip = wrongly_tracked(drawn_clip(avatar))
+    rows = [begun(avatar, clip).row(step, clip.pictures[0]) for step in (10, 20, 30, 44)]
+    rates = [float(row.rate) for row in rows if row is not None]
+    assert len(rates) == 4 and rates[0] == 0.5
+    assert all(later < 0.7 * earlier for earlier, later in itertools.pairwise(rates))
+    assert rates[-1] == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_step_moves_a_frame_by_its_share_of_a_gauss_newton_step(avatar: Avatar) -> None:
+    """The loss is a mean over the frame, the curvature that of a head of any size."""
+    clip = wrongly_tracked(drawn_clip(avatar), degrees=0.05, mm=0.1, share=0.01)
+    with torch.no_grad():
+        avatar.sh_rest.zero_()  # colours that do not depend on the view: then the gradient is the whole
+    alignment, frame = begun(avatar, clip), clip.pictures[3]
+    trainer = small_config("trainer.iterations=100", "trainer.perceptual=none").trainer
+    objective = Objective(trainer, BACKGROUND, choose_perceptual(trainer, lambda _: None))
+    seen = alignment.see(10, frame, Pictures(clip), print)  # type: ignore[arg-type]
+    still = copy.deepcopy(avatar), make_optimizer(avatar, trainer)  # the avatar that is optimised gets no gradient
+    training_step(*still, objective, 2000, seen.frame, seen.vertices, None, seen.watched)
+    alignment.learn(seen)
+    found = alignment.tensors()["align.moves"][3]
+
+    tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
+    given, freedom = HeadPose(tracks["R"][3], tracks["t"][3]), find_freedom(tracks, clip.split.train, centre)
+    (target,) = targets(frame, BACKGROUND, 1) or ()
+    with frozen(avatar):
+        slope = Likeness(avatar, BACKGROUND, centre).fit(freedom.given[3], given, target).gradient
+    whole = torch.cholesky_solve((slope[freedom.index] * freedom.unit)[:, None], alignment.tensors()["align.factor"])
+    assert float((found + 0.5 * whole[:, 0]).norm()) < 0.02 * float(found.norm()) and float(found.norm()) > 1e-3
+
+
+def test_moves_stay_within_their_bounds(avatar: Avatar) -> None:
+    """A step of any size ends where training has been."""
+    clip = wrongly_tracked(drawn_clip(avatar))
+    alignment, frame = begun(avatar, clip), clip.pictures[3]
+    seen = alignment.see(10, frame, Pictures(clip), print)  # type: ignore[arg-type]
+    assert seen.placed is not None
+    freedom = find_freedom(clip.recording.tracks, clip.split.train, avatar.head.neutral_vertices().mean(dim=0))
+    slope = torch.where(torch.arange(freedom.given.shape[1]) % 2 == 0, 1e9, -1e9)
+    seen.placed.gradient = lambda: slope  # type: ignore[method-assign]
+    alignment.learn(seen)
+    moves, (low, high) = alignment.tensors()["align.moves"][3], freedom.bounds(3)
+    assert bool((moves >= low).all()) and bool((moves <= high).all()) and bool(((moves == low) | (moves == high)).all())
+
+
+def test_mouths_count_in_the_curvature_as_in_the_loss(avatar: Avatar) -> None:
+    clip = wrongly_tracked(drawn_clip(avatar))
+    mouth = torch.zeros(SIZE, SIZE)
+    mouth[40:52, 26:46] = 1.0
+    clip = replace(clip, pictures=tuple(replace(picture, mouth_mask=mouth) for picture in clip.pictures))
+
+    def curvature(weight: float) -> torch.Tensor:
+        factor = begun(avatar, clip, f"trainer.mouth_weight={weight}").tensors()["align.factor"]
+        return factor @ factor.T
+
+    none, one, forty = (curvature(weight) for weight in (0.0, 1.0, 40.0))
+    assert float((one - none).norm()) > 0.01 * float(none.norm())
+    torch.testing.assert_close(forty - none, 40.0 * (one - none), rtol=0, atol=2e-3 * float(forty.norm()))
 
 
 class Waiting(Exception):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from heads import grid_head, rest_params
+from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
 from avatar.model import Avatar
@@ -47,6 +48,17 @@ def test_coloured_gaussians_start_closer_to_the_frames(tracked_folder: Path) -> 
     assert after < 0.5 * before
     untouched = (avatar.sh_dc[:, 0] == 0).all(dim=-1)
     assert int((~untouched).sum()) <= count
+
+
+def test_first_colours_are_those_of_training_frames(tracked_folder: Path) -> None:
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    found = []
+    for one in (subject, poisoned(subject)):
+        avatar = new_avatar(assets, subject, config)
+        assert colour_from_frames(avatar, one, 24) > 0
+        found.append(avatar.sh_dc)
+    assert torch.equal(*found)
 
 
 def test_nothing_is_sampled_outside_the_image_or_in_the_cameras_plane() -> None:

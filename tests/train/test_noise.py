@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from poison import poisoned_recording
 from small_runs import open_small, small_config, train_small
 
 from avatar.data.subject import Subject
 from avatar.model import Avatar
-from avatar.train.noise import ConditionNoise
+from avatar.train.noise import ConditionNoise, make_noise
 
 SHARE = 0.3
 
@@ -36,6 +37,15 @@ def test_noise_spreads_as_the_conditions_do(subject: Subject) -> None:
     assert np.abs(found - expected).max() < 0.1 * scale.max()  # six deviations of chance
     still = scale.diagonal() < 1e-12
     assert still.any() and found.diagonal()[still].max() < 1e-10  # what never moves has none
+
+
+def test_noise_spreads_as_training_frames_do(subject: Subject) -> None:
+    trainer = small_config(f"trainer.condition_noise={SHARE}").trainer
+    clean, other = (make_noise(one, trainer) for one in (subject.recording, poisoned_recording(subject.recording)))
+    assert clean is not None and other is not None
+    assert all(torch.equal(clean.of(step), other.of(step)) for step in range(3))
+    training = ConditionNoise(conditions_of(subject), SHARE, trainer.seed)
+    assert torch.equal(clean.of(5), training.of(5)) and clean.of(5).any()
 
 
 def test_noise_is_a_function_of_seed_and_step_and_leaves_the_rest_of_the_frame(subject: Subject) -> None:

@@ -56,7 +56,9 @@ def test_only_what_covers_no_head_is_hidden(tracked_folder: Path) -> None:
     assert not cover(avatar, frame, 1)[expected].any()  # never drawn
 
 
-def test_training_removes_them_once(tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_frames_judge_strays_once(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls = []
     monkeypatch.setattr(trainer_module, "remove_strays", lambda *words: calls.append(words[2:]))
     train_small(tracked_folder, tmp_path / "off", ["trainer.stray_share=0"])
@@ -64,7 +66,8 @@ def test_training_removes_them_once(tracked_folder: Path, tmp_path: Path, monkey
     trainer = small_config("trainer.stray_share=0.2").trainer
     train_small(tracked_folder, tmp_path / "on", ["trainer.stray_share=0.2"])
     ((frames, share, step),) = calls
-    assert len(frames) > 1 and (share, step) == (0.2, strays_step(trainer)) and 0 < step < trainer.iterations
+    assert tuple(frames) == open_small(tracked_folder, small_config())[1].split.train
+    assert (share, step) == (0.2, strays_step(trainer)) and 0 < step < trainer.iterations
 
 
 def test_a_scene_that_cannot_be_drawn_is_named(tracked_folder: Path) -> None:

@@ -10,12 +10,12 @@ import pytest
 import torch
 from spoken_scene import FPS, SIZE, Scene, spoken_scene
 
-from data_prep.live.frame_fit import LOST_AFTER, FrameFit
+from data_prep.live.frame_fit import LOST_AFTER, FrameFit, _Fitted, _follows, _is_quick
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg import concatenated
-from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.motion import Motion, at_rest
 
 CALIBRATED, FRAMES = 24, 36  # the first ones are calibrated on, the others followed; the clip's fit knows all
 
@@ -130,6 +130,37 @@ def test_a_quick_head_is_not_lost(followed: Followed) -> None:
         observed=torch.from_numpy(points[None, followed.calibration.term.landmarks, :2].astype(np.float64)),
     )
     assert float(term.errors(followed.calibration.identity, moved).mean()) < 0.1 * followed.scene.eyes
+
+
+def test_a_head_is_expected_where_its_speed_takes_it() -> None:
+    """At a metre a second it is no cut where it goes on so, and one where it jumps back; by the times of the pictures."""
+
+    def at(x: float) -> Motion:
+        eye = torch.eye(3, dtype=torch.float64)[None]
+        return at_rest(eye, torch.tensor([[x, 0.0, 0.8]], dtype=torch.float64), 2)
+
+    before = [_Fitted(at(0.0), 1.0), _Fitted(at(0.04), 1.04)]
+    assert not _is_quick(before, at(0.08), 1.08) and not _is_quick(before, at(0.06), 1.06)
+    assert _is_quick(before, at(0.0), 1.08) and _is_quick(before, at(0.04), 1.08)
+    assert not _is_quick(before[1:], at(0.05), 1.08) and _is_quick(before[1:], at(0.08), 1.08)
+    assert not _is_quick([], at(5.0), 1.0)
+
+
+def test_smoothness_is_that_of_the_last_two_frames(followed: Followed) -> None:
+    """Scaled by their rate, but never beyond that of a quick camera."""
+    fit = followed.fitter()
+    followed.follow(fit, range(5))
+    assert [one.taken for one in fit._before] == pytest.approx([3 / FPS, 4 / FPS])
+    nominal, last = fit._smoothness, fit._before[-1]
+
+    def stiffness(wait: float) -> float:
+        return float(
+            _follows(nominal, [replace(last, taken=-wait), replace(last, taken=0.0)], wait).smoothness.second[0]
+        )
+
+    usual = float(nominal.second[0])
+    assert stiffness(1 / FPS) == pytest.approx(usual) and stiffness(2 / FPS) == pytest.approx(usual / 8)
+    assert stiffness(1e-4) == pytest.approx(stiffness(1 / 60)) and stiffness(9.0) == pytest.approx(stiffness(1 / 5))
 
 
 def test_landmarks_that_are_no_face_do_no_harm(followed: Followed) -> None:

@@ -9,9 +9,11 @@ import pytest
 
 from avatar.errors import UserError
 from data_prep.track.crop import choose_view, head_square, parse_crop
+from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.focal import choose_focal
 from data_prep.track.footage.cuts import CutFinder
 from data_prep.track.footage.source import Box, Span, check_span, stride, whole
+from data_prep.track.frames import in_view
 
 
 def textured(seed: int, size: int = 96) -> np.ndarray:
@@ -54,6 +56,7 @@ def test_the_square_around_the_head() -> None:
     assert box.width == box.height and box.x % 2 == box.y % 2 == 0
     assert box.y < 400 - 150 - 100 and box.y + box.height > 400 + 150 + 150  # hair and neck
     assert box.x + box.width / 2 == pytest.approx(1000, abs=2)
+    assert (box.y, box.y + box.height) == pytest.approx((250 - 0.55 * 300, 550 + 0.75 * 300), abs=3)
     moved = np.concatenate((face(900, 400, 300), face(1100, 400, 300)))
     assert head_square(1920, 1080, moved).width > box.width
 
@@ -81,6 +84,17 @@ def test_views() -> None:
     assert small.width == small.box.width  # nothing is enlarged
     x, y = auto.to_view(auto.box.x + auto.box.width / 2, auto.box.y)
     assert (x, y) == (256, 0)
+
+
+def test_landmarks_in_a_view() -> None:
+    """Where `to_view` has their places; those of pictures without a face are nowhere."""
+    points = face(1000, 400, 300, frames=3).astype(np.float32)
+    seen = Landmarks(points, np.zeros((3, 52), np.float32), np.array([True, False, True]), (1920, 1080), 25.0)
+    view = choose_view(Box(700, 100, 600, 400), 300, 1920, 1080, points)
+    found = in_view(seen, view)
+    assert found.size == (view.width, view.height) == (300, 200)
+    assert found.points[2, 7, :2] == pytest.approx(view.to_view(*points[2, 7, :2].tolist()), abs=1e-3)
+    assert not found.points[1].any() and (points[1] != 0).any()
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -132,6 +133,27 @@ def test_one_bad_point_does_not_decide_what_is_taken() -> None:
     assert (
         photometric_fit._psnr(texture + 0.02 * wave, weights, even) < photometric_fit._psnr(values, weights, even) - 5.0
     )
+
+
+def test_points_that_judge_the_fit_are_not_fitted_to(scene: Fitted, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[torch.Tensor] = []
+    own = photometric_fit._Skin.subset
+
+    def subset(self: object, which: torch.Tensor) -> object:
+        chosen.append(which)
+        return own(self, which)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(photometric_fit._Skin, "subset", subset)
+    monkeypatch.setattr(photometric_fit, "ROUNDS", 1)
+    monkeypatch.setattr(photometric_fit, "minimise", lambda terms, identity, motion, *_, **__: Fitting(motion))
+    fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene), silent)
+    held, *compared = chosen
+    assert held.any() and len(compared) == len(photometric_fit.BLURS)
+    assert all(part.any() and not (part & held).any() for part in compared)
+
+
+class Fitting(NamedTuple):
+    motion: Motion
 
 
 def test_what_the_held_out_points_gain_little_by_is_not_taken(scene: Fitted, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,23 @@ def test_a_camera_that_moves_has_no_background() -> None:
     assert learn_plate((image, matte) for image, matte, _ in clip(moves=3)) is None
 
 
+@pytest.mark.parametrize(
+    ("share", "away", "is_still"), [(0.0, 0.0, True), (0.1, 2.8, True), (0.03, 6.0, True), (0.08, 6.0, False)]
+)
+def test_a_camera_stands_still_where_little_changes(share: float, away: float, is_still: bool) -> None:
+    """A lamp flickers: such a share of the background is `away` times the noise brighter, each place in a third of the
+    pictures."""
+    learned = learn_plate((image, matte) for image, matte, _ in clip())
+    assert learned is not None
+    lit = np.random.default_rng(0).random((SIZE // 8, SIZE // 8)) < 3 * share
+    brighter = away * learned.noise * np.kron(lit, np.ones((8, 8)))[..., None]
+    pairs = []
+    for number, (image, matte, _) in enumerate(clip()):
+        shown = image + brighter if number % 3 == 0 else image
+        pairs.append((np.rint(shown).clip(0, 255).astype(np.uint8), matte))
+    assert (learn_plate(pairs) is not None) == is_still
+
+
 def test_too_few_pictures_or_nothing_behind() -> None:
     pairs = [(image, matte) for image, matte, _ in clip()]
     assert learn_plate(pairs[:2]) is None

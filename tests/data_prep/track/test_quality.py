@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
+from heads import grid_head
+from some_tracks import track
 
-from data_prep.track.quality import Figure, Quality
+from data_prep.track import quality
+from data_prep.track.faces.embedding import LandmarkEmbedding
+from data_prep.track.faces.landmark_groups import LEFT_IRIS, LIPS, NOSE
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.fit.result import Fit
+from data_prep.track.quality import Figure, Quality, landmark_figures
 
 
 @pytest.mark.parametrize(
@@ -31,8 +39,31 @@ def test_figures_without_bounds_are_told_only() -> None:
     assert figure.line().split() == ["texture", "31.500", "dB"]
 
 
+def test_errors_are_what_changes_from_frame_to_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In per cent of the irises' distance; where a landmark lies on this face in all frames is told apart."""
+    T, own = 40, (*NOSE, *LIPS)
+    rng = np.random.default_rng(0)
+    points = np.zeros((T, NUM_POINTS, 3), np.float32)
+    points[:, own, :2] = 30.0 * rng.random((len(own), 2)) + 0.2 * rng.standard_normal((T, len(own), 2))
+    points[:, LEFT_IRIS, 0] = 50.0
+    seen = Landmarks(points, np.zeros((T, len(BLENDSHAPES)), np.float32), np.ones(T, bool), (64, 64), 25.0)
+    still = points[:, own, :2].mean(0) + np.array([3.0, 4.0])  # 5 pixels away from where they are, in every frame
+    placed = np.repeat(still[None], T, axis=0)
+    placed[7, :, 0] += 2.5  # and 5 % of the irises' distance in this one
+    monkeypatch.setattr(quality, "_placed", lambda *_: placed)
+    tracks = {n: track() for n in range(T)}
+    embedding = LandmarkEmbedding(np.array(own), np.zeros((len(own), 3), int), np.zeros((len(own), 3)))
+    found = landmark_figures(grid_head(), Fit(tracks, {}), seen, embedding)
+    assert found["constant"] == pytest.approx(10.0, abs=0.5) and found["errors"]["all"] < 1.0
+    assert 7 in found["worst_frames"] and len(found["worst_frames"]) == 5
+    monkeypatch.setattr(quality, "_placed", lambda *_: points[:, own, :2])
+    assert landmark_figures(grid_head(), Fit(tracks, {}), seen, embedding)["jitter"] == pytest.approx(1.0)
+    monkeypatch.setattr(quality, "_placed", lambda *_: np.repeat(still[None], T, axis=0))
+    assert landmark_figures(grid_head(), Fit(tracks, {}), seen, embedding)["jitter"] == 0.0
+
+
 def test_the_terminals_lines() -> None:
-    quality = Quality((Figure("error", 1.5, "px", 1.0, 2.0, "track again"),), (3, 17), "given with --focal")
-    assert quality.lines()[0] == "quality of the tracking"
-    assert quality.lines()[-1] == "  frames that fit worst: 00003, 00017"
-    assert quality.to_json()["focal"] == "given with --focal"
+    told = Quality((Figure("error", 1.5, "px", 1.0, 2.0, "track again"),), (3, 17), "given with --focal")
+    assert told.lines()[0] == "quality of the tracking"
+    assert told.lines()[-1] == "  frames that fit worst: 00003, 00017"
+    assert told.to_json()["focal"] == "given with --focal"

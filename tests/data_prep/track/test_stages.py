@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from heads import grid_head
 
 from avatar.errors import UserError
+from avatar.head.assets import HeadAssets
+from data_prep.track import work
+from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.fit.result import Clip, Fit
+from data_prep.track.progress import silent
 from data_prep.track.stages import growing
+from data_prep.track.work import Work
+from data_prep.tracking import FrameTrack
 
 
 def test_a_stage_is_made_once_for_its_inputs(tmp_path: Path) -> None:
@@ -76,6 +87,39 @@ def test_nothing_is_left_where_nothing_was_done(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no face"), growing(tmp_path / "out") as stages:
         stages.run("one", {}, fails)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fit_is_made_again_for_another_lens_head_or_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lenses: list[float] = []
+
+    def fitted(clip: Clip, *_: object) -> Fit:
+        lenses.append(clip.intrinsics[0])
+        values = {"expression": 2, "jaw": 6, "eyes": 12, "eyelids": 2, "neck": 6, "t": 3, "shape": 2}
+        track = FrameTrack(
+            **{name: np.zeros(count) for name, count in values.items()},
+            R=np.eye(3), intrinsics=np.array(clip.intrinsics), size=(64, 64),
+        )  # fmt: skip
+        return Fit({0: track}, {})
+
+    monkeypatch.setattr(work, "fit_tracks", fitted)
+    points, scores = np.zeros((1, NUM_POINTS, 3), np.float32), np.zeros((1, len(BLENDSHAPES)), np.float32)
+    landmarks = Landmarks(points, scores, np.ones(1, bool), (64, 64), 25.0)
+    footage, head = SimpleNamespace(), grid_head()
+    with growing(tmp_path / "out") as stages:
+
+        def fit(lens: float = 500.0, which: HeadAssets = head, pictures: str = "key of the frames") -> None:
+            own = Work(stages, footage, work.Choices(), which, silent)  # type: ignore[arg-type]
+            assert own.fit(landmarks, (lens, lens, 32.0, 32.0), tmp_path, [pictures]).tracks[0].intrinsics[0] == lens
+
+        fit()
+        fit()
+        assert lenses == [500.0]
+        fit(lens=600.0)
+        assert lenses == [500.0, 600.0]
+        fit(lens=600.0, pictures="of others")
+        assert len(lenses) == 3
+        fit(lens=600.0, pictures="of others", which=replace(head, fingerprint="another"))
+        assert len(lenses) == 4
 
 
 def test_a_damaged_record_is_made_again(tmp_path: Path) -> None:

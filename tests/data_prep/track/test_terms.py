@@ -16,7 +16,7 @@ from data_prep.track.fit.columns import free_columns, spread
 from data_prep.track.fit.crops import BlurredCrops, cut_out
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import Term
-from data_prep.track.fit.motion import Motion, rotations
+from data_prep.track.fit.motion import Motion, at_rest, rotations
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
 from data_prep.track.fit.priors import make_priors
@@ -166,3 +166,30 @@ def test_frames_that_do_not_follow_each_other_are_not_compared() -> None:
     term, motion = smoothness(), some_motion()
     jumped = replace(motion, jaw=motion.jaw + torch.tensor([0, 0, 0, 1.0, 1.0], dtype=torch.float64)[:, None])
     assert term.cost(IDENTITY, jumped) == pytest.approx(term.cost(IDENTITY, motion), rel=1e-9)
+
+
+@pytest.mark.parametrize("part", ["jaw", "t"])
+def test_the_same_motion_costs_the_same_at_any_frame_rate(part: str) -> None:
+    """Twice as many frames a second differ half as much, and second differences a quarter as much."""
+
+    def cost(fps: float) -> float:
+        time = torch.arange(int(8 * fps), dtype=torch.float64) / fps
+        wave = torch.stack([torch.sin(9.0 * time + k) for k in range(3)], dim=1)
+        rest = at_rest(torch.eye(3, dtype=torch.float64).expand(len(time), 3, 3), 0.0 * wave, EXPRESSIONS)
+        term = make_smoothness(grid_head(), torch.arange(len(time)), fps, EXPRESSIONS, statistical=False)
+        return term.cost(IDENTITY, replace(rest, **{part: 0.1 * wave}))
+
+    slow, usual, fast = (cost(fps) for fps in (20.0, 25.0, 60.0))
+    assert slow == pytest.approx(usual, rel=0.05) and fast == pytest.approx(usual, rel=0.05) and usual > 0
+
+
+def test_crops_lie_where_they_were_cut_out() -> None:
+    """A ramp tells the place in the frame, at crops of half the frame's size and of its own."""
+    ramp = np.tile(2 * np.arange(128, dtype=np.uint8), (96, 1))  # of column i, whose centre is at i + 0.5
+    image, matte = np.repeat(ramp[..., None], 3, axis=2), np.full((96, 128), 255, np.uint8)
+    places = torch.tensor([[[50.5, 40.5], [60.25, 45.0], [70.0, 50.0]]], dtype=torch.float64)
+    for scale in (0.5, 1.0):
+        crops = cut_out(lambda _: image, lambda _: matte, range(1), np.array([[40.0, 30.0, 80.0, 60.0]]), scale)
+        found = 127.5 * BlurredCrops(crops, 0.5).values(places, slice(0, 1))
+        torch.testing.assert_close(found, places[..., 0] - 0.5, rtol=0, atol=0.1)
+        assert crops.matte.all()

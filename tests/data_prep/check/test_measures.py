@@ -1,0 +1,85 @@
+"""What the check measures: angles, jumps, lenses, and how far held-out frames lie outside of the training."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from some_tracks import track
+
+from avatar.data.split import SplitSizes
+from data_prep.check.check_tracking import _camera
+from data_prep.check.coverage import Coverage, measure_coverage
+from data_prep.check.motion import head_angles, suddenness
+from data_prep.tracking import FrameTrack
+
+TRAIN, TEST = 20, 5
+
+
+def clip(yaws: list[float], expressions: np.ndarray) -> dict[int, FrameTrack]:
+    return {
+        7 + n: track((0.0, yaw, 0.0), expression=row)
+        for n, (yaw, row) in enumerate(zip(yaws, expressions, strict=True))
+    }
+
+
+def covered(tracks: dict[int, FrameTrack]) -> Coverage:
+    read: Any = SimpleNamespace(source=SimpleNamespace(division={}), tracked=lambda: iter(tracks.items()))
+    found = measure_coverage(read, list(tracks), SplitSizes(test=TEST))
+    assert isinstance(found, Coverage) and len(found.split.train) == TRAIN
+    return found
+
+
+def test_held_out_frames_are_far_where_no_training_frame_is_near() -> None:
+    """In numbers of images; held-out frames that are like each other are as far."""
+    rng = np.random.default_rng(0)
+    expressions = 0.5 * rng.standard_normal((TRAIN + TEST, 4)) * (1.0, 0.5, 0.2, 0.1)
+    yaws = [*np.linspace(-20, 0, TRAIN), -10.0, 12.0, 12.0, -20.0, 4.0]
+    expressions[[20, 22]] = 0.0
+    expressions[[21, 23, 24]] = (9.0, 0.0, 0.0, 0.0)
+    found = covered(clip(yaws, expressions))
+    assert found.far_pose == (7 + 21, 7 + 22)
+    assert found.far_expression == (7 + 21, 7 + 23, 7 + 24)
+
+
+def test_held_out_frames_do_not_measure_themselves() -> None:
+    rng = np.random.default_rng(0)
+    expressions = rng.standard_normal((TRAIN + TEST, 4))
+    plain = covered(clip([0.0] * (TRAIN + TEST), expressions))
+    expressions[TRAIN:] += (50.0, -30.0, 0.0, 9.0)
+    other = covered(clip([0.0] * (TRAIN + TEST), expressions))
+    assert np.array_equal(plain.expressions[:TRAIN], other.expressions[:TRAIN])
+    assert other.far_expression == tuple(range(7 + TRAIN, 7 + TRAIN + TEST))
+
+
+@pytest.mark.parametrize(
+    ("turn", "angles"),
+    [((0, 0, 0), (0, 0, 0)), ((0, 20, 0), (20, 0, 0)), ((-10, 0, 0), (0, 10, 0)), ((0, 0, -15), (0, 0, 15))],
+)
+def test_angles_of_heads(turn: tuple[float, float, float], angles: tuple[float, float, float]) -> None:
+    """Degrees: turned to the image's right, looking up, tilted to the image's right."""
+    found = head_angles(track(turn).R[None])
+    assert (found.yaw[0], found.pitch[0], found.roll[0]) == pytest.approx(angles, abs=1e-6)
+
+
+def test_a_frame_is_compared_with_its_neighbours_in_time() -> None:
+    """A head that turns evenly is never sudden; nothing is said beside a frame that is missing."""
+    tracks = [track((0.0, 2.0 * n, 0.0), t=np.array([0.001 * n, 0.0, 0.8])) for n in range(6)]
+    tracks[3] = track((0.0, 11.0, 0.0), t=np.array([0.013, 0.0, 0.8]))
+    found = suddenness([0, 1, 2, 3, 4, 5], tracks)
+    np.testing.assert_allclose(found.rotation, [np.nan, 0.0, 2.5, 5.0, 2.5, np.nan], atol=1e-4)
+    np.testing.assert_allclose(found.translation, [np.nan, 0.0, 5.0, 10.0, 5.0, np.nan], atol=1e-4)
+    gap = suddenness([0, 1, 2, 4, 5, 6], tracks)
+    assert np.isnan(gap.rotation).tolist() == [True, False, True, True, False, True]
+
+
+def test_a_lens_is_judged_by_the_width() -> None:
+    def problems(size: tuple[int, int], fx: float) -> list[str]:
+        one = track(size=size, intrinsics=np.array([fx, fx, size[0] / 2, size[1] / 2]))
+        read: Any = SimpleNamespace(tracking=SimpleNamespace(frames={0: one}))
+        return [finding.check for finding in _camera(read)]
+
+    assert problems((1920, 400), 1000.0) == [] and problems((400, 1920), 1000.0) == []
+    assert problems((1920, 400), 900.0) == ["focal-length"]  # 94 degrees

@@ -1,0 +1,35 @@
+"""How a mesh lies on masks, in pixels of the frame whatever the size that is measured at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_prep.fit import Mesh, measure_fit
+
+SIZE = (40, 30)
+
+
+def square(left: float, top: float, right: float, bottom: float) -> np.ndarray:
+    return np.array([[left, top, 1], [right, top, 1], [right, bottom, 1], [left, bottom, 1]], float)
+
+
+def mask(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    found = np.zeros(SIZE[::-1], bool)
+    found[top:bottom, left:right] = True
+    return found
+
+
+def test_distances_are_in_pixels_of_the_frame() -> None:
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    screen = np.concatenate((square(10, 5, 30, 25), square(16, 18, 24, 22)))
+    mesh = Mesh(screen, np.concatenate((faces, faces + 4)), faces, faces + 4)
+    head, mouth = mask(10, 5, 26, 25), mask(19, 18, 27, 22)  # the mesh sticks out by 4, its lips are 3 away
+    one, four = (measure_fit(mesh, head, mouth, scale, SIZE) for scale in (1.0, 4.0))
+    assert (one.overlap, one.inside, one.mask_ratio) == pytest.approx((0.8, 0.8, 0.8))
+    assert (one.mouth, one.size) == pytest.approx((3.0, 20.0)) and one.lips == pytest.approx(5 / 11)
+    assert 2.0 < one.overhang <= 4.0
+    for name in ("overlap", "inside", "mask_ratio", "lips"):
+        assert getattr(four, name) == getattr(one, name)
+    for name in ("overhang", "mouth", "size"):
+        assert getattr(four, name) == pytest.approx(4 * getattr(one, name))

@@ -1,0 +1,46 @@
+"""Cameras in listings of NeRF's manner."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from data_prep.root_pose import rotation_matrix
+from data_prep.transforms import ListedFrame, camera_pose, pinhole, read_listings
+
+
+def test_validation_is_held_out_where_no_test_is(tmp_path: Path) -> None:
+    def divided(*splits: str) -> dict[str, str | None]:
+        for old in tmp_path.iterdir():
+            old.unlink()
+        for split in splits:
+            frames = {"frames": [{"file_path": f"{split}.png"}]}
+            (tmp_path / f"transforms_{split}.json").write_text(json.dumps(frames))
+        return {frame.values["file_path"]: frame.split for frame in read_listings(tmp_path)}
+
+    assert divided("train", "val") == {"train.png": "train", "val.png": "test"}
+    assert divided("train", "val", "test") == {"train.png": "train", "val.png": "val", "test.png": "test"}
+
+
+def listed(**values: Any) -> ListedFrame:
+    return ListedFrame(Path("transforms.json"), 0, values, {}, None, Path())
+
+
+def test_a_camera_in_the_world_becomes_the_way_from_the_world_to_it() -> None:
+    T_world_cam = np.eye(4)
+    T_world_cam[:3, :3], T_world_cam[:3, 3] = rotation_matrix(np.array([0.3, -0.5, 0.2])), (0.1, -0.2, 0.7)
+    R, t = camera_pose(listed(transform_matrix=T_world_cam.tolist()))
+    np.testing.assert_allclose(R @ T_world_cam[:3, 3] + t, 0.0, atol=1e-12)  # the camera is at its own origin
+    ahead = T_world_cam @ (0.0, 0.0, -1.0, 1.0)
+    np.testing.assert_allclose(R @ ahead[:3] + t, (0.0, 0.0, -1.0), atol=1e-12)
+
+
+def test_a_lens_by_its_angle_is_that_of_the_width() -> None:
+    intrinsics, size = pinhole(listed(camera_angle_x=np.pi / 2), (64, 48))
+    assert size == (64, 48) and intrinsics.tolist() == pytest.approx([32.0, 32.0, 32.0, 24.0])
+    intrinsics, size = pinhole(listed(fl_x=50.0, fl_y=60.0, cx=10.0, cy=20.0, w=128, h=96), (64, 48))
+    assert size == (128, 96) and intrinsics.tolist() == [50.0, 60.0, 10.0, 20.0]
