@@ -24,6 +24,10 @@ from avatar.losses.lpips_network import NETS, Lpips, Net
 class MissingWeights(UserError):
     """No weights are where they are looked for, as opposed to weights that are there and wrong."""
 
+    def __init__(self, net: Net, message: str) -> None:
+        super().__init__(message)
+        self.brief = f"no weights of LPIPS {net} on this machine; avatar models says how to get them"
+
 
 def lpips_folder() -> Path:
     """Where weights are looked for when the caller names no place."""
@@ -64,8 +68,9 @@ def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False)
     if download and weights is None:
         return download_lpips(net, lpips_folder())
     raise MissingWeights(
+        net,
         f"no LPIPS weights for {net!r} in {place}: put {backbone.name} ({backbone.url}) and {heads.name} ({heads.url}) "
-        f"there, or name their folder with AVATAR_LPIPS"
+        f"there, or name their folder with AVATAR_LPIPS",
     )
 
 
