@@ -26,7 +26,7 @@ class MissingWeights(UserError):
 
     def __init__(self, net: Net, message: str) -> None:
         super().__init__(message)
-        self.brief = f"no weights of LPIPS {net} on this machine; avatar models says how to get them"
+        self.brief = f"no weights of {net} on this machine; avatar models says how to get them"
 
 
 def lpips_folder() -> Path:
