@@ -52,6 +52,7 @@ def table(results: Mapping[str, Any]) -> str:
         "",
         *(f"{name}: {entry['choices']['summary']}" for name, entry in protocols.items()),
         *tracking,
+        f"Perceptual term in training: {results['perceptual']}",
         *(f"LPIPS: {note}" for note in dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())),
         *(f"Note: {note}" for note in results["notes"] if note not in tracking),
     ]

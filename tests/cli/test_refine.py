@@ -244,8 +244,7 @@ def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, m
     after.parent.mkdir()
     before.rename(after)
     assert "give the tracked video folder" in avatar("train", "--resume", "--out", run, status=1)
-    head = after / "head_model"
-    output = avatar("train", after, "--head", head, "--resume", "--out", run)
+    output = avatar("train", after, "--resume", "--out", run)
     assert "going on after 1 of 14 frames" in output and "10/10" in output
     assert (run / "rounds" / "1" / "someone" / "tracking.npz").is_file()
 
