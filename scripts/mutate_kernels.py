@@ -76,7 +76,9 @@ def main() -> int:
     arguments = options(__doc__).parse_args()
     if os.environ.get("TRITON_INTERPRET") != "1":
         raise SystemExit("the kernels are interpreted: set TRITON_INTERPRET=1")
-    chosen = [m for m in kernel_mutations.SPLATTER_MUTATIONS + AVATAR_MUTATIONS if arguments.only in f"{m.module}: {m.what}"]
+    chosen = [
+        m for m in kernel_mutations.SPLATTER_MUTATIONS + AVATAR_MUTATIONS if arguments.only in f"{m.module}: {m.what}"
+    ]
     areas = {id(tests_of(m.module)): m.module for m in reversed(chosen)}.values()  # the first module of each
     unchanged = [Task(f"{module}, as it is", tuple(tests_of(module)), None) for module in areas]
     tasks = [*([] if arguments.changed_only else unchanged), *map(task_of, chosen)]

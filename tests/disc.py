@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 from safetensors.torch import save_file
 
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, FrameRecord, Manifest
+from avatar.data.refinement import Refinement, Round
 from avatar.data.subject import Subject
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
@@ -75,6 +77,14 @@ def make_subject(folder: Path) -> Subject:
     return Subject.open(prepared)
 
 
+def refined(subject: Subject, trained_on: tuple[int, ...] = tuple(range(TEST[0]))) -> Subject:
+    """The subject as after a refinement through an avatar that was trained on the frames of these numbers."""
+    rounds = (Round("runs/first", 1000, "fe" * 32, trained_on),)
+    manifest = replace(subject.manifest, refinement=Refinement("insta", rounds))
+    given = {**subject.recording.tracks, "expression": subject.recording.tracks["expression"] * 0.9}
+    return replace(subject, manifest=manifest, given=replace(subject.recording, tracks=given))
+
+
 # the corners of two eyeballs: with a focal length of SIZE at 1 m, pixels 18 to 30 and 42 to 54 across, 24 to 32 down
 EYES = torch.tensor([[18.0, 24.0], [30.0, 32.0], [42.0, 24.0], [54.0, 32.0]]).sub(SIZE / 2).div(SIZE)
 EYES = torch.cat((EYES, torch.zeros(4, 1)), dim=1)
@@ -122,7 +132,9 @@ class BlobRenderer:
 def make_run(path: Path, subject: Subject) -> Any:
     data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0), cache_mb=16, workers=1)
     config = SimpleNamespace(data=data, to_dict=lambda: {"data": {"size": None}})
-    return SimpleNamespace(path=path, config=config, avatar=Blob(), subject=subject, step=1500)
+    return SimpleNamespace(
+        path=path, config=config, avatar=Blob(), subject=subject, step=1500, trained=SimpleNamespace(perceptual="dssim")
+    )
 
 
 def read_png(path: Path) -> np.ndarray:

@@ -111,9 +111,11 @@ def minutes_of(learner: Trainee, step: int, early: Time, late: Time) -> float:
 
 
 def held_out_frames(run: Run, count: int) -> list[Frame]:
-    test = run.subject.split.test
+    """As the tracker left them, where the tracking was refined: that was fitted to the frames' own pictures."""
+    subject = run.subject.as_tracked()
+    test = subject.split.test
     chosen = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, count).round().astype(int))]
-    with FrameLoader(run.subject, run.config.data.size) as loader:
+    with FrameLoader(subject, run.config.data.size) as loader:
         return list(loader.frames(chosen))
 
 

@@ -44,7 +44,8 @@ def table(curves: Sequence[Curve]) -> list[str]:
         )
     lines += [
         "",
-        f"{curves[0].frames} held-out frames, head mask alone. ms/step: before and after the perceptual term takes part.",
+        f"{curves[0].frames} held-out frames, head mask alone, driven by the tracker's tracking. ms/step: before and after "
+        "the perceptual term takes part.",
         f"Minutes of training at that rate, at the checkpoints that were kept: to the last and to the best PSNR of "
         f"{Path(yardstick.run).name}, and within {NEAR} dB of the run's own last.",
         f"No other run is as good in less time: {', '.join(Path(curve.run).name for curve in front)}",

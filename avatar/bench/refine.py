@@ -238,13 +238,13 @@ def recovered(rows: Sequence[Row]) -> float:
 def report(rows: Sequence[Row], config: Config) -> str:
     head = f"{'PSNR':>7}{'SSIM':>8}{'LPIPS':>8}{'mouth':>7}"
     lines = [
-        f"Held-out frames, head alone, {planned_steps(config.trainer)}. Driven by the tracking that was trained on "
-        "(own), by what that was before refining, and by the given one",
-        f"{'trained on':>20} {'own'.center(30)} {'before'.center(30)} {'given'.center(30)}   vertices, mm and px  outside",
+        f"Held-out frames, head alone, {planned_steps(config.trainer)}. Driven by what the tracking was before refining, "
+        "by the tracking that was trained on (own; where refined, fitted to these frames' pictures), and by the given one",
+        f"{'trained on':>20} {'before'.center(30)} {'own'.center(30)} {'given'.center(30)}   vertices, mm and px  outside",
         f"{'':>20} {head} {head} {head}",
     ]
     for row in rows:
-        cells = " ".join(_cells(figures) for figures in (row.own, row.before, row.given))
+        cells = " ".join(_cells(figures) for figures in (row.before, row.own, row.given))
         lines.append(f"{row.tracking:>20} {cells} {row.vertices_mm:12.3f} {row.vertices_px:7.3f} {row.outside:8d}")
     seconds = [row.refine_seconds for row in rows if row.refine_seconds is not None]
     lines += [

@@ -15,8 +15,8 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.motion.drive import Drive
 from avatar.motion.drive_file import read_drive
-from avatar.runs.run import Run, RunInfo, open_trained, read_run_info
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.run import Run, RunInfo, read_run_info
+from avatar.runs.trained import TrainedAvatar, load_avatar
 from data_prep.open import check_folder, find_head, open_subject
 
 DRIVE_SUFFIXES = (".npz", ".csv")
@@ -45,8 +45,8 @@ def open_run(
 ) -> Run:
     """A run with its video; `folder` is where the video is now, if it has moved. Raises UserError when it has changed."""
     info = read_run_info(path)
-    trained = open_trained(path, head)
     source = moved_source(path, info, head, folder)
+    trained = load_avatar(path, head, recorded_head=source.head)
     subject, _ = open_subject(source, split_sizes(trained.config), say, trained.assets)
     check_data(path, info, subject)
     return Run(path, trained, subject)
@@ -57,15 +57,26 @@ def moved_source(path: Path, info: RunInfo, head: Path | None, folder: Path | No
     source = info.source
     if folder is not None:
         check_folder(folder)
-        source = replace(source, folder=folder, tracking=_moved(source.tracking, source.folder, folder))
+        source = at_new_place(source, folder)
     elif not source.folder.is_dir():
         raise UserError(f"{source.folder}, on which {path} was trained, is gone: give its new place with --folder")
     return source if head is None else replace(source, head=head)
 
 
-def _moved(path: Path | None, old: Path, new: Path) -> Path | None:
+def at_new_place(source: Source, folder: Path) -> Source:
+    """A source whose folder is now at `folder`, with the tracking and the head model that lay inside."""
+    head = _moved(source.head, source.folder, folder)
+    return replace(
+        source,
+        folder=folder,
+        head=head if head.exists() else source.head,
+        tracking=None if source.tracking is None else _moved(source.tracking, source.folder, folder),
+    )
+
+
+def _moved(path: Path, old: Path, new: Path) -> Path:
     """A path inside the old folder, inside the new one."""
-    return new / path.relative_to(old) if path is not None and path.is_relative_to(old) else path
+    return new / path.relative_to(old) if path.is_relative_to(old) else path
 
 
 def check_data(path: Path, info: RunInfo, subject: Subject) -> None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from avatar.commands import OK, training
-from avatar.commands.opening import open_run
+from avatar.commands.opening import at_new_place, open_run
 from avatar.commands.outputs import check_run_folder
 from avatar.commands.plan import ROUNDS_FOLDER, Pace, Plan, plan_file, steps_in_time
 from avatar.commands.refining import refine_run
@@ -114,7 +114,7 @@ def moved_source(run: Path, source: Source, arguments: Namespace) -> Source:
     folder, head = arguments.folder, arguments.head
     if folder is not None and folder.resolve() != source.folder and source.folder.is_dir():
         raise UserError(f"{run} began on {source.folder}, not on {folder}: leave it out to resume")
-    source = source if folder is None else replace(source, folder=folder.resolve())
+    source = source if folder is None else at_new_place(source, folder.resolve())
     return source if head is None else replace(source, head=head)
 
 

@@ -33,6 +33,9 @@ from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
 from data_prep.open import open_subject
 
+# Adam's epsilon makes whole steps of gradients that are nothing but rounding.
+OTHER_ROUNDING = "pictures come out alike, not to the bit, and parameters that they hardly depend on may differ"
+
 
 def run_train(arguments: Namespace) -> int:
     run = arguments.out or default_run(arguments.folder)
@@ -114,7 +117,7 @@ def go_on(
     if checkpoint.meta.get("threads") != torch.get_num_threads():
         print(
             f"Note: the checkpoint was made with {checkpoint.meta.get('threads')} threads, this machine uses "
-            f"{torch.get_num_threads()}; the result is the same to rounding, not to the bit"
+            f"{torch.get_num_threads()}; {OTHER_ROUNDING}"
         )
     is_complete = checkpoint.step >= config.trainer.iterations
     chosen = CPU if is_complete else choose_device(device or config.device, print)
@@ -124,7 +127,7 @@ def go_on(
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
         return OK
     if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
-        print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; the result is the same to rounding")
+        print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; {OTHER_ROUNDING}")
     size = subject.image_size(config.data.size)
     perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, size=size, device=chosen)
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")

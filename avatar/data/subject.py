@@ -109,6 +109,10 @@ class Subject:
     def head_fingerprint(self) -> str:
         return self.recording.head_fingerprint
 
+    def as_tracked(self) -> Subject:
+        """With what the tracker left, where the tracking has been refined since."""
+        return self if self.given is None else replace(self, recording=self.given, given=None)
+
     def image_size(self, size: int | None = None) -> tuple[int, int]:
         """(width, height) of the frames when the width is resized to `size` pixels; None keeps the files' size."""
         return self.recording.image_size(size)

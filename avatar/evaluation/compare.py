@@ -22,9 +22,10 @@ from avatar.evaluation.bootstrap import BlockBootstrap, Interval
 from avatar.evaluation.earlier import MAX_TABLE_BYTES
 from avatar.evaluation.evaluate import RESULTS_FORMAT
 from avatar.evaluation.protocol import NAME
+from avatar.evaluation.tracked import Drive, Part, is_marked, legend, parts
 from avatar.files.opening import MissingFile, read_bytes, read_json
 
-NEEDED = {"data_hash", "head_fingerprint", "image_size", "protocols"}  # of results.json
+NEEDED = {"data_hash", "head_fingerprint", "image_size", "perceptual", "protocols", "tracking"}  # of results.json
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
 
 
@@ -36,18 +37,21 @@ class Evaluation:
     folder: Path  # RUN/eval
     results: Mapping[str, Any]
 
-    def figures(self, protocol: str) -> dict[str, dict[str, float]]:
-        """Name of the frame -> figures, in the order of the video, as frames.csv holds them."""
-        path = self.folder / protocol / "frames.csv"
+    def parts(self, protocol: str) -> dict[Drive, Part]:
+        return parts(self.results["protocols"][protocol])
+
+    def figures(self, protocol: str, drive: Drive) -> dict[str, dict[str, float]]:
+        """Name of the frame -> figures, in the order of the video, as the table of the frames holds them."""
+        part = self.parts(protocol)[drive]
+        path = self.folder / protocol / part.table
         try:
             data = read_bytes(path, MAX_TABLE_BYTES)
         except UserError as error:
             raise UserError(f"{error}; evaluate the run again") from None
-        entry = self.results["protocols"][protocol]
-        if hashlib.sha256(data).hexdigest() != entry["frames_sha256"]:
+        if hashlib.sha256(data).hexdigest() != part.figures["frames_sha256"]:
             raise UserError(f"{path} is not the file that results.json was written with; evaluate the run again")
         return {
-            row["name"]: {name: float(row[name]) for name in entry["means"]}
+            row["name"]: {name: float(row[name]) for name in part.figures["means"]}
             for row in csv.DictReader(io.StringIO(data.decode()))
         }
 
@@ -70,6 +74,7 @@ class ProtocolComparison:
     """All runs by one protocol."""
 
     protocol: str
+    drive: Drive  # by which tracking
     count: int  # of what the means are over, the same for all runs
     unit: str  # frames, for instance
     method: str  # of the intervals
@@ -79,7 +84,10 @@ class ProtocolComparison:
 @dataclass(frozen=True)
 class Comparison:
     labels: Sequence[str]  # of the runs
+    marked: Sequence[bool]  # whether measured frames were refined through an avatar that had been trained on them
+    perceptual: Sequence[str]  # the perceptual term that each was trained with
     protocols: Sequence[ProtocolComparison]
+    tracking: Sequence[str]  # for people: what the figures of each tracking are
     notes: Sequence[str]  # for people: what was left out, and why
 
 
@@ -99,14 +107,22 @@ def compare_runs(runs: Sequence[Path], protocols: Sequence[str] | None = None) -
     notes: list[str] = []
     comparisons = []
     for name in common_protocols(evaluations, protocols, notes):
-        comparison = compare_protocol(evaluations, name, notes)
-        if comparison is not None:
-            comparisons.append(comparison)
+        for drive in evaluations[0].parts(name):
+            comparison = compare_protocol(evaluations, name, drive, notes)
+            if comparison is not None:
+                comparisons.append(comparison)
     if not comparisons:
         raise UserError(
             f"{' and '.join(labels)} cannot be compared: {'; '.join(notes) or 'no protocol is in all of them'}"
         )
-    return Comparison(labels, comparisons, notes)
+    return Comparison(
+        labels,
+        [is_marked(each.results["tracking"]) for each in evaluations],
+        [each.results["perceptual"] for each in evaluations],
+        comparisons,
+        legend([each.results["tracking"] for each in evaluations]),
+        list(dict.fromkeys(notes)),
+    )
 
 
 def read_evaluation(label: str, run: Path) -> Evaluation:
@@ -164,9 +180,14 @@ def common_protocols(evaluations: Sequence[Evaluation], wanted: Sequence[str] | 
     return chosen
 
 
-def compare_protocol(evaluations: Sequence[Evaluation], name: str, notes: list[str]) -> ProtocolComparison | None:
+def compare_protocol(
+    evaluations: Sequence[Evaluation], name: str, drive: Drive, notes: list[str]
+) -> ProtocolComparison | None:
     """The comparison over the frames that all runs have; None, with a note, where there are none."""
-    tables = [evaluation.figures(name) for evaluation in evaluations]
+    if lacking := [evaluation.label for evaluation in evaluations if drive not in evaluation.parts(name)]:
+        notes.append(f"{name} was not measured by the {drive} tracking for {', '.join(lacking)}")
+        return None
+    tables = [evaluation.figures(name, drive) for evaluation in evaluations]
     frames = [frame for frame in tables[0] if all(frame in table for table in tables)]
     if not frames:
         notes.append(f"{name} was measured on frames of which none is in all runs")
@@ -183,7 +204,7 @@ def compare_protocol(evaluations: Sequence[Evaluation], name: str, notes: list[s
     bootstrap = BlockBootstrap(len(frames), block)
     rows: dict[str, list[Cell]] = {}
     empty = []
-    for figure in entries[0]["means"]:
+    for figure in evaluations[0].parts(name)[drive].figures["means"]:
         if figure.startswith("lpips") and len(networks) > 1:
             continue
         values = np.array([[table[frame][figure] for frame in frames] for table in tables])
@@ -195,7 +216,7 @@ def compare_protocol(evaluations: Sequence[Evaluation], name: str, notes: list[s
         rows[figure] = [Cell(_mean(first), None, None), *(_cell(own, first, bootstrap) for own in others)]
     if empty:
         notes.append(f"{name}: in no frame of all runs is there {', '.join(empty)}")
-    return ProtocolComparison(name, len(frames), "frames", f"blocks of {block} frames", rows)
+    return ProtocolComparison(name, drive, len(frames), "frames", f"blocks of {block} frames", rows)
 
 
 def _cell(values: np.ndarray, first: np.ndarray, bootstrap: BlockBootstrap) -> Cell:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from avatar.evaluation.bootstrap import LEVEL
 from avatar.evaluation.compare import Cell, Comparison, ProtocolComparison
+from avatar.evaluation.tracked import LABELS, MARK
 from avatar.files.atomic import write_atomically
 
 UNITS = {"psnr": "dB", "jitter": "levels"}
@@ -24,10 +25,10 @@ LATEX_SPECIAL = {
 
 def text(comparison: Comparison) -> str:
     """For each protocol a line per figure: the first run's mean, then each other run's with its difference to the first."""
-    blocks = []
+    blocks, heads = [], _heads(comparison)
     for each in comparison.protocols:
         cells = [[_title(figure), *(_plain(figure, cell) for cell in row)] for figure, row in each.rows.items()]
-        lines = [["", *comparison.labels], *cells]
+        lines = [[LABELS[each.drive], *heads], *cells]
         widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
         shown = (
             "   ".join(
@@ -35,16 +36,21 @@ def text(comparison: Comparison) -> str:
             )
             for line in lines
         )
-        blocks.append("\n".join([_caption(each, comparison.labels[0]), *(line.rstrip() for line in shown)]))
+        blocks.append("\n".join([_caption(each, heads[0]), *(line.rstrip() for line in shown)]))
     return "\n\n".join([*blocks, "\n".join(_remarks(comparison))]) + "\n"
 
 
 def markdown(comparison: Comparison) -> str:
     """One table a protocol."""
-    heads = [label.replace("\\", "\\\\").replace("|", "\\|") for label in comparison.labels]
+    heads = [label.replace("\\", "\\\\").replace("|", "\\|") for label in _heads(comparison)]
     blocks = []
     for each in comparison.protocols:
-        lines = [f"**{_caption(each, heads[0])}**", "", f"| | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
+        lines = [
+            f"**{_caption(each, heads[0])}**",
+            "",
+            f"| {LABELS[each.drive]} | {' | '.join(heads)} |",
+            "|---" * (len(heads) + 1) + "|",
+        ]
         for figure, row in each.rows.items():
             cells = (_plain(figure, cell).replace(CLEAR, f"\\{CLEAR}") for cell in row)
             lines.append(f"| {_title(figure)} | {' | '.join(cells)} |")
@@ -55,14 +61,14 @@ def markdown(comparison: Comparison) -> str:
 
 def latex(comparison: Comparison) -> str:
     """One tabular a protocol, for the package booktabs."""
-    heads = ["".join(LATEX_SPECIAL.get(character, character) for character in label) for label in comparison.labels]
+    heads = ["".join(LATEX_SPECIAL.get(character, character) for character in label) for label in _heads(comparison)]
     blocks = []
     for each in comparison.protocols:
         lines = [
             f"% {_caption(each, heads[0])}",
             f"\\begin{{tabular}}{{l{'r' * len(heads)}}}",
             "\\toprule",
-            f" & {' & '.join(heads)} \\\\",
+            f"{LABELS[each.drive]} & {' & '.join(heads)} \\\\",
             "\\midrule",
         ]
         for figure, row in each.rows.items():
@@ -77,13 +83,17 @@ def as_csv(comparison: Comparison) -> str:
     """A line for each protocol, figure and run."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(("protocol", "figure", "run", "count", "mean", "difference", "low", "high"))
+    writer.writerow(
+        ("protocol", "driven_by", "figure", "run", "count", "mean", "difference", "low", "high", "perceptual", "marked")
+    )
     for each in comparison.protocols:
         for figure, row in each.rows.items():
-            for label, cell in zip(comparison.labels, row, strict=True):
+            runs = zip(comparison.labels, row, comparison.perceptual, comparison.marked, strict=True)
+            for label, cell, perceptual, marked in runs:
                 numbers = (cell.mean, cell.difference, *(cell.interval or (None, None)))
                 shown = ("" if number is None else f"{number:.6f}" for number in numbers)
-                writer.writerow((each.protocol, figure, label, each.count, *shown))
+                mark = MARK if marked else ""
+                writer.writerow((each.protocol, each.drive, figure, label, each.count, *shown, perceptual, mark))
     return file.getvalue()
 
 
@@ -102,15 +112,29 @@ def write_tables(folder: Path, comparison: Comparison) -> None:
         write_atomically(folder / f"compare.{suffix}", table(comparison).encode(errors="backslashreplace"))
 
 
+def _heads(comparison: Comparison) -> list[str]:
+    """The labels of the runs, marked where their figures are."""
+    return [
+        f"{label} {MARK}" if marked else label
+        for label, marked in zip(comparison.labels, comparison.marked, strict=True)
+    ]
+
+
 def _caption(each: ProtocolComparison, first: str) -> str:
     return (
-        f"{each.protocol}: {each.count} {each.unit}, differences to {first} with {LEVEL:.0%} intervals ({each.method})"
+        f"{each.protocol} ({LABELS[each.drive]}): {each.count} {each.unit}, differences to {first} with {LEVEL:.0%} "
+        f"intervals ({each.method})"
     )
 
 
 def _remarks(comparison: Comparison) -> list[str]:
     legend = f"{CLEAR}: the interval leaves out 0. Higher is better for PSNR and SSIM, lower for LPIPS and jitter."
-    return [legend, *(f"Note: {note}" for note in comparison.notes)]
+    terms = dict.fromkeys(comparison.perceptual)
+    trained = f"Perceptual term in training: {next(iter(terms))}"
+    if len(terms) > 1:
+        each = zip(comparison.labels, comparison.perceptual, strict=True)
+        trained = f"Perceptual terms in training differ: {', '.join(f'{label} {term}' for label, term in each)}"
+    return [legend, *comparison.tracking, trained, *(f"Note: {note}" for note in comparison.notes)]
 
 
 def _title(figure: str) -> str:

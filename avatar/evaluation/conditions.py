@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.data.subject import Subject
+from avatar.data.recording import Recording
 from avatar.head.model import HeadModel
 from avatar.motion.orbit import seen_from
 from avatar.types import IDENTITY_6D, Camera, HeadParams
@@ -24,13 +24,13 @@ class Conditions(NamedTuple):
     expression_distance: float  # mm
 
 
-def conditions(head: HeadModel, subject: Subject, indices: Sequence[int]) -> dict[int, Conditions]:
-    """The conditions of these frames; distances are to the nearest of the subject's training frames."""
+def conditions(head: HeadModel, recording: Recording, indices: Sequence[int]) -> dict[int, Conditions]:
+    """The conditions of these frames; distances are to the nearest of the training frames."""
     distances = expression_distances(
-        head, [subject.params(i) for i in indices], [subject.params(i) for i in subject.split.train]
+        head, [recording.params(i) for i in indices], [recording.params(i) for i in recording.split.train]
     )
     return {
-        index: Conditions(yaw(subject.camera(index), subject.params(index)), distance)
+        index: Conditions(yaw(recording.camera(index), recording.params(index)), distance)
         for index, distance in zip(indices, distances, strict=True)
     }
 

@@ -10,15 +10,23 @@ import numpy as np
 from avatar.errors import check_installed
 from avatar.evaluation.protocol import REGIONS, Protocol, column
 from avatar.evaluation.results import FrameResult
+from avatar.evaluation.tracked import Drive
 
 
-def curves(protocols: Sequence[Protocol], results: Mapping[str, Sequence[FrameResult]], worst: Sequence[int]) -> bytes:
+def curves(
+    protocols: Sequence[Protocol],
+    by_drive: Mapping[Drive, Mapping[str, Sequence[FrameResult]]],
+    shown: str,
+    worst: Sequence[int],
+) -> bytes:
     """A PNG file: main PSNR and SSIM of each protocol, PSNR by region, jitter and conditions against the frame's index.
 
-    worst  indices of the first protocol's worst frames, marked on its PSNR.
+    All of the tracker's tracking, which is first in `by_drive`; beside it a dashed PSNR of the refined one.
+    worst  indices of the worst frames by the protocol `shown`, marked on its PSNR.
     Raises MissingPackage without matplotlib.
     """
     check_installed("curves.png", "plots", "matplotlib")
+    results, *refined = by_drive.values()
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
     from matplotlib.figure import Figure
 
@@ -29,15 +37,19 @@ def curves(protocols: Sequence[Protocol], results: Mapping[str, Sequence[FrameRe
         width = 1.0 + 0.6 * (len(protocols) - 1 - number)  # a line that lies on an earlier one leaves its rim
         for axes, name in ((by_psnr, "psnr"), (by_ssim, "ssim"), (by_jitter, "jitter")):
             axes.plot(*line(results[protocol.name], name), lw=width, label=protocol.name)
-    first, detailed = protocols[0], max(protocols, key=lambda protocol: len(protocol.regions))
-    marked = [result for result in results[first.name] if result.index in worst]
+    detailed = max(protocols, key=lambda protocol: len(protocol.regions))
+    marked = [result for result in results[shown] if result.index in worst]
     by_psnr.plot(
         [result.index for result in marked],
         [result.figures["psnr"] for result in marked],
         "kv",
         ms=5,
-        label=f"worst of {first.name}",
+        label=f"worst of {shown}",
     )
+    for fitted in refined:
+        label = f"{shown}, refined:\nfitted to these frames"
+        by_psnr.plot(*line(fitted[shown], "psnr"), "k--", lw=0.8, label=label)
+        by_psnr.set_title("driven by the tracker's tracking", fontsize=10)
     for region in (region for region in REGIONS if region in detailed.regions):
         by_region.plot(*line(results[detailed.name], column("psnr", region)), lw=1, label=region)
     longest = max((results[protocol.name] for protocol in protocols), key=len)

@@ -2,38 +2,71 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from avatar.errors import UserError
+from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.pictures import clear_pictures
-from avatar.evaluation.protocol import NAME, Protocol
-from avatar.files.opening import read_bytes, read_json
+from avatar.evaluation.protocol import NAME, Protocol, builtin_protocols
+from avatar.evaluation.results import FrameResult
+from avatar.evaluation.tracked import FRAMES_FILE, TRACKED_FILE, Drive, parts
+from avatar.files.opening import read_bytes, read_json, read_text
 
-FRAMES_FILE = "frames.csv"
-MAX_TABLE_BYTES = 2**28  # of it
+MAX_TABLE_BYTES = 2**28  # of a table of frames
 # Of results.json: where these agree, figures by different protocols may stand side by side.
-_IDENTITY = ("format", "data_hash", "image_size", "head_fingerprint", "step", "config", "shared_choices")
-_NO_MATTER = ("threads",)  # of the versions: the figures are the same to rounding
+_IDENTITY = ("format", "data_hash", "image_size", "head_fingerprint", "step", "perceptual", "config", "shared_choices")
+_NO_MATTER = ("threads",)  # of the versions: drawing a trained avatar differs by rounding alone
 
 
-def earlier_results(folder: Path, results: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries by other protocols that RUN/eval holds of what `results` are about, with their tables of frames in place."""
+class Earlier(NamedTuple):
+    """What is kept: entries of results.json by protocol, with their tables of frames in place."""
+
+    entries: dict[str, Any]
+    shown: str | None  # the protocol of worst.png and of the video, where it is among them
+
+
+def read_earlier(folder: Path, facts: Mapping[str, Any], asked: Collection[str]) -> Earlier:
+    """What RUN/eval holds by other protocols than those `asked` for, of the avatar and frames that `facts` describe."""
     try:
         earlier = read_json(folder / "results.json")
-        if _identity(earlier) != _identity(json.loads(json.dumps(results))):
-            return {}
-        asked = {*results["protocols"], *results["left_out"]}
+        if _identity(earlier) != _identity(json.loads(json.dumps(facts))):
+            return Earlier({}, None)
         others = {
             name: entry for name, entry in earlier["protocols"].items() if name not in asked and NAME.fullmatch(name)
         }
-        return {name: entry for name, entry in others.items() if _is_whole(folder / name, entry)}
+        whole = {name: entry for name, entry in others.items() if _is_whole(folder / name, entry)}
+        return Earlier(whole, earlier["shown"] if earlier["shown"] in whole else None)
     except (UserError, ValueError, KeyError, TypeError, AttributeError):  # none, or not of this program
-        return {}
+        return Earlier({}, None)
+
+
+def in_order(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """By protocol: those that come with the program as its table has them, then others."""
+    known = [name for name in builtin_protocols() if name in entries]
+    return {name: entries[name] for name in (*known, *(name for name in entries if name not in known))}
+
+
+def read_frames(place: Path, entry: dict[str, Any]) -> dict[Drive, list[FrameResult]]:
+    """The tables of frames in RUN/eval/PROTOCOL."""
+    found: dict[Drive, list[FrameResult]] = {}
+    for drive, part in parts(entry).items():
+        rows = csv.DictReader(read_text(place / part.table, MAX_TABLE_BYTES).splitlines())
+        found[drive] = [
+            FrameResult(
+                int(row["frame"]),
+                row["name"],
+                {name: float(row[name]) for name in part.figures["means"]},
+                Conditions(*(float(row[name]) for name in Conditions._fields)),
+            )
+            for row in rows
+        ]
+    return found
 
 
 def protocol_of(name: str, entry: Mapping[str, Any]) -> Protocol:
@@ -56,6 +89,7 @@ def remove_others(folder: Path, kept: Collection[str]) -> list[str]:
         clear_pictures(table.parent)
         try:
             table.unlink()
+            (table.parent / TRACKED_FILE).unlink(missing_ok=True)
         except OSError as error:
             raise UserError(f"{table} cannot be removed ({error.strerror}); it is of another evaluation") from None
         with suppress(OSError):  # somebody else's file is in there
@@ -68,7 +102,10 @@ def _identity(results: Mapping[str, Any]) -> dict[str, Any]:
     return {"versions": versions, **{key: results[key] for key in _IDENTITY}}
 
 
-def _is_whole(place: Path, entry: Mapping[str, Any]) -> bool:
-    """Whether an entry can be read, and its table of frames is the one that it was written with."""
-    table = read_bytes(place / FRAMES_FILE, MAX_TABLE_BYTES)
-    return bool(protocol_of(place.name, entry)) and hashlib.sha256(table).hexdigest() == entry["frames_sha256"]
+def _is_whole(place: Path, entry: dict[str, Any]) -> bool:
+    """Whether an entry can be read, and its tables of frames are those that it was written with."""
+    hashes = [
+        hashlib.sha256(read_bytes(place / part.table, MAX_TABLE_BYTES)).hexdigest() == part.figures["frames_sha256"]
+        for part in parts(entry).values()
+    ]
+    return bool(protocol_of(place.name, entry)) and all(hashes) and bool(read_frames(place, entry))

@@ -2,11 +2,14 @@
 
     RUN/eval/results.json                  every choice, what was evaluated, means, intervals; by the protocols of earlier
                                            evaluations too, where they are of the same avatar and frames
-    RUN/eval/curves.png                    the figures along the video, where matplotlib is installed
-    RUN/eval/worst.png                     truth, render and error of the first protocol's worst frames
-    RUN/eval/truth_render_error.mp4        frames and background of the first protocol
+    RUN/eval/curves.png                    the figures of all of these protocols along the video; needs matplotlib
+    RUN/eval/worst.png                     truth, render and error of the worst frames by one of the protocols
+    RUN/eval/truth_render_error.mp4        frames and background of the same protocol
     RUN/eval/<protocol>/frames.csv         the figures of each frame
     RUN/eval/<protocol>/{renders,gt,masks,...}/%05d.png    with --frames; numbers are those of frames.csv
+
+Where the subject's tracking was refined, frames.csv and renders/ are of the refined tracking, and tracked.csv and
+tracked_renders/ of the tracker's; curves, worst frames and video show the tracker's.
 
 Renders and truths are measured as the pictures that the PNG files hold, so that anyone can recompute a figure.
 """
@@ -16,9 +19,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -28,7 +34,7 @@ from avatar.errors import MissingPackage, UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
-from avatar.evaluation.earlier import FRAMES_FILE, earlier_results, protocol_of, remove_others
+from avatar.evaluation.earlier import in_order, protocol_of, read_earlier, read_frames, remove_others
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import FrameMeasurer
 from avatar.evaluation.networks import find_networks
@@ -37,14 +43,15 @@ from avatar.evaluation.protocol import HELD_OUT, SHARED_CHOICES, Protocol, choos
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
-from avatar.evaluation.tracked import describe_tracking, measure_tracked, tracking_notes
+from avatar.evaluation.tracked import Drive, describe_tracking, drives, parts, renders_of, tracking_notes
 from avatar.files.atomic import write_atomically
 from avatar.files.video import video_writer
 from avatar.losses.lpips_network import Lpips, Net
 from avatar.render import Renderer
 from avatar.runs.run import Run, versions
 
-RESULTS_FORMAT = 2
+RESULTS_FORMAT = 3
+Measured = dict[Drive, dict[str, list[FrameResult]]]  # by protocol, in the order of the video
 
 
 @torch.no_grad()
@@ -63,7 +70,7 @@ def evaluate(
     Raises UserError for an unknown protocol, where no protocol has a frame, for a frame that cannot be read, damaged LPIPS
     weights, or a disk that refuses.
     """
-    subject, data = run.subject, run.config.data
+    subject = run.subject
     asked = choose_protocols(protocols)
     indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in asked}
     left_out = without_frames(asked, indices, subject.name)
@@ -71,101 +78,134 @@ def evaluate(
         say(f"Note: {sentence}")
     chosen = [protocol for protocol in asked if protocol.name not in left_out]
     folder = run.path / "eval"
+    video, sheet = folder / "truth_render_error.mp4", folder / "worst.png"
+    facts = facts_of(run)
+    before = read_earlier(folder, facts, {protocol.name for protocol in asked})
+    shown = chosen[0].name if before.shown is None or not video.exists() else before.shown
     renderer = Renderer(run.avatar, torch.tensor(chosen[0].background))
     networks = find_networks((protocol.lpips_net for protocol in chosen), renderer.background.device)
     lpips: dict[Net, Lpips | None] = {net: found.network for net, found in networks.items()}
-    order = sorted(set().union(*indices.values()))
-    known = conditions(run.avatar.head, subject, order)
-    results: dict[str, list[FrameResult]] = {protocol.name: [] for protocol in chosen}
-    jitter = {protocol.look: JitterMeter() for protocol in chosen}
     for protocol in chosen:
         clear_pictures(folder / protocol.name)
+    is_shown = any(protocol.name == shown for protocol in chosen)
+    with video_writer(video, subject.fps) if is_shown else nullcontext() as add_to_video:
+        results = measure(run, renderer, chosen, indices, lpips, write_frames, {shown: add_to_video})
 
-    video = folder / "truth_render_error.mp4"
-    with (
-        FrameLoader(subject, data.size, data.cache_mb << 20, data.workers) as loader,
-        video_writer(video, subject.fps) as add_to_video,
-    ):
-        for frame in tqdm(loader.frames(order), total=len(order), desc="eval", unit="frame", disable=None):
-            wanted = [protocol for protocol in chosen if frame.index in indices[protocol.name]]
-            pairs = draw(renderer, frame, [protocol.look for protocol in wanted])
-            masks = region_masks(frame, run.avatar.head, {"head", *(r for p in wanted for r in p.regions)})
-            for look, pair in pairs.items():
-                jitter[look].add(subject.manifest.frames[frame.index].tracking, pair, masks["head"])
-            measurer = FrameMeasurer(pairs, masks, lpips)
-            for protocol in wanted:
-                figures, pair = measurer.measure(protocol), pairs[protocol.look]
-                results[protocol.name].append(FrameResult(frame.index, frame.name, figures, known[frame.index]))
-                if protocol is chosen[0]:
-                    add_to_video(panel(pair))
-                if write_frames:
-                    shown = {region: masks[region] for region in masks if region in ("head", *protocol.regions)}
-                    write_pictures(folder / protocol.name, frame.index, encode_pictures(pair, shown))
-
+    entries: dict[str, Any] = {}
     for protocol in chosen:
-        add_jitter(results[protocol.name], jitter[protocol.look], run)
-    tracking = describe_tracking(run, order)
+        by_drive: dict[Drive, list[FrameResult]] = {drive: found[protocol.name] for drive, found in results.items()}
+        entry = summarise(protocol, by_drive, networks[protocol.lpips_net], subject.fps)
+        for drive, part in parts(entry).items():
+            rows = frames_csv(protocol.columns, by_drive[drive]).encode()
+            write_atomically(folder / protocol.name / part.table, rows)
+            part.figures["frames_sha256"] = hashlib.sha256(rows).hexdigest()
+        entries[protocol.name] = entry
+    whole = in_order({**before.entries, **entries})
+    measured = [protocol_of(name, entry) for name, entry in whole.items()]
+    tracking = describe_tracking(run, sorted({i for p in measured for i in p.select(len(subject), subject.split)}))
+    notes = [*left_out.values(), *notes_of(measured, run), *tracking_notes(tracking)]
     summary: dict[str, Any] = {
+        **facts,
+        "tracking": tracking,
+        "notes": notes,
+        "left_out": left_out,
+        "shown": shown,
+        "rendering": speed(renderer, subject, sorted(set().union(*indices.values())), run.config.data.size),
+        "protocols": whole,
+    }
+    worst = next(iter(parts(whole[shown]).values())).figures["worst"]
+    if is_shown:
+        sheet.unlink(missing_ok=True)
+        if worst:  # none where every frame is drawn without an error
+            write_atomically(sheet, worst_sheet(run, renderer, protocol_of(shown, whole[shown]), worst))
+    kept = {name: read_frames(folder / name, entry) for name, entry in before.entries.items()}
+    plotted: Measured = {
+        drive: {**found, **{n: own[drive] for n, own in kept.items()}} for drive, found in results.items()
+    }
+    (folder / "curves.png").unlink(missing_ok=True)
+    try:
+        picture = curves(measured, plotted, shown, [entry["frame"] for entry in worst])
+        write_atomically(folder / "curves.png", picture)
+    except MissingPackage as missing:
+        say(f"Note: {missing}")
+    path = folder / "results.json"
+    write_atomically(path, json.dumps(summary, indent=2, allow_nan=False).encode())
+    removed = remove_others(folder, whole)
+    own = [*left_out.values(), *notes_of(chosen, run), *tracking_notes(tracking)]
+    say(table({**summary, "protocols": entries, "notes": own}))
+    of = "" if is_shown else f" ({shown})"
+    places = {"Results": path, "Curves": folder / "curves.png", f"Worst{of}": sheet, f"Video{of}": video}
+    said = [f"{name:8} {place}" for name, place in places.items() if place.exists()]
+    if before.entries:
+        said.append(f"Kept     {', '.join(before.entries)}: measured before, of the same avatar and frames")
+    if removed:
+        said.append(
+            f"Removed  {', '.join(removed)}: measured before, of another step, other data or by another program"
+        )
+    say("\n".join([*said, f"Next     avatar report {run.path}"]))
+    return path
+
+
+def facts_of(run: Run) -> dict[str, Any]:
+    """What is evaluated and how, for results.json: where these agree, figures may stand side by side."""
+    return {
         "format": RESULTS_FORMAT,
-        "subject": subject.name,
-        "data_hash": subject.data_hash,
-        "image_size": subject.image_size(data.size),
+        "subject": run.subject.name,
+        "data_hash": run.subject.data_hash,
+        "image_size": run.subject.image_size(run.config.data.size),
         "head_fingerprint": run.avatar.head.assets.fingerprint,
         "step": run.step,
+        "perceptual": run.trained.perceptual,
         "config": run.config.to_dict(),
         "versions": versions(),
         "shared_choices": SHARED_CHOICES,
-        "tracking": tracking,
-        "notes": [
-            *left_out.values(),
-            *background_notes(chosen, data.background),
-            *region_notes(chosen, run),
-            *tracking_notes(tracking),
-        ],
-        "left_out": left_out,
-        "rendering": speed(renderer, subject, order, data.size),
-        "protocols": {
-            protocol.name: summarise(protocol, results[protocol.name], networks[protocol.lpips_net], subject.fps)
-            for protocol in chosen
-        },
     }
-    if subject.given is not None:
-        for name, entry in measure_tracked(run, subject.given, renderer, indices, chosen, lpips).items():
-            summary["protocols"][name]["tracked"] = entry
-    for protocol in chosen:
-        rows = frames_csv(protocol.columns, results[protocol.name]).encode()
-        write_atomically(folder / protocol.name / FRAMES_FILE, rows)
-        summary["protocols"][protocol.name]["frames_sha256"] = hashlib.sha256(rows).hexdigest()
-    worst = summary["protocols"][chosen[0].name]["worst"]
-    for name in ("worst.png", "curves.png"):
-        (folder / name).unlink(missing_ok=True)
-    if worst:  # none where every frame is drawn without an error
-        write_atomically(folder / "worst.png", worst_sheet(run, renderer, chosen[0], worst))
-    try:
-        write_atomically(folder / "curves.png", curves(chosen, results, [entry["frame"] for entry in worst]))
-    except MissingPackage as missing:
-        say(f"Note: {missing}")
-    others = earlier_results(folder, summary)
-    measured = [*chosen, *(protocol_of(name, entry) for name, entry in others.items())]
-    whole = {
-        **summary,
-        "notes": [*left_out.values(), *background_notes(measured, data.background), *region_notes(measured, run)],
-        "protocols": {**summary["protocols"], **others},
-    }
-    path = folder / "results.json"
-    write_atomically(path, json.dumps(whole, indent=2, allow_nan=False).encode())
-    removed = remove_others(folder, whole["protocols"])
-    say(table(summary))
-    places = {"Results": path, "Curves": folder / "curves.png", "Worst": folder / "worst.png", "Video": video}
-    lines = [f"{name:8} {place}" for name, place in places.items() if place.exists()]
-    if others:
-        lines.append(f"Kept     {', '.join(others)}: measured before, of the same avatar and frames")
-    if removed:
-        lines.append(
-            f"Removed  {', '.join(removed)}: measured before, of another step, other data or by another program"
-        )
-    say("\n".join(lines))
-    return path
+
+
+def measure(
+    run: Run,
+    renderer: Renderer,
+    protocols: Sequence[Protocol],
+    indices: Mapping[str, Sequence[int]],
+    networks: Mapping[Net, Lpips | None],
+    write_frames: bool,
+    films: Mapping[str, Callable[[np.ndarray], None] | None],
+) -> Measured:
+    """The figures of every frame by every protocol, driven by each of the subject's trackings.
+
+    Truths, masks and regions are the same for all trackings. `films` takes, by protocol, the panels of the first tracking.
+    """
+    subject, data = run.subject, run.config.data
+    order = sorted(set().union(*indices.values()))
+    recordings = drives(subject)
+    first = next(iter(recordings))
+    known = {drive: conditions(run.avatar.head, recording, order) for drive, recording in recordings.items()}
+    results: Measured = {drive: {protocol.name: [] for protocol in protocols} for drive in recordings}
+    jitter = {(drive, protocol.look): JitterMeter() for drive in recordings for protocol in protocols}
+    with FrameLoader(subject, data.size, data.cache_mb << 20, data.workers) as loader:
+        for frame in tqdm(loader.frames(order), total=len(order), desc="eval", unit="frame", disable=None):
+            wanted = [protocol for protocol in protocols if frame.index in indices[protocol.name]]
+            masks = region_masks(frame, run.avatar.head, {"head", *(r for p in wanted for r in p.regions)})
+            for drive, recording in recordings.items():
+                camera, params = recording.camera(frame.index, data.size), recording.params(frame.index)
+                pairs = draw(renderer, replace(frame, camera=camera, params=params), [p.look for p in wanted])
+                for look, pair in pairs.items():
+                    jitter[drive, look].add(subject.manifest.frames[frame.index].tracking, pair, masks["head"])
+                measurer = FrameMeasurer(pairs, masks, networks)
+                for protocol in wanted:
+                    figures, pair = measurer.measure(protocol), pairs[protocol.look]
+                    row = FrameResult(frame.index, frame.name, figures, known[drive][frame.index])
+                    results[drive][protocol.name].append(row)
+                    if drive == first and (add_to_film := films.get(protocol.name)) is not None:
+                        add_to_film(panel(pair))
+                    if write_frames:
+                        regions = {region: masks[region] for region in masks if region in ("head", *protocol.regions)}
+                        pictures = encode_pictures(pair, regions, renders_of(drive, subject))
+                        write_pictures(run.path / "eval" / protocol.name, frame.index, pictures)
+    for drive, found in results.items():
+        for protocol in protocols:
+            add_jitter(found[protocol.name], jitter[drive, protocol.look], run)
+    return results
 
 
 def without_frames(protocols: Sequence[Protocol], indices: Mapping[str, Sequence[int]], subject: str) -> dict[str, str]:
@@ -197,13 +237,17 @@ def add_jitter(results: Sequence[FrameResult], meter: JitterMeter, run: Run) -> 
 
 
 def worst_sheet(run: Run, renderer: Renderer, protocol: Protocol, worst: Sequence[Mapping[str, Any]]) -> bytes:
-    """The contact sheet of a protocol's worst frames, drawn again."""
-    panels = []
+    """The contact sheet of a protocol's worst frames, drawn again by the tracker's tracking."""
+    subject, panels = run.subject.as_tracked(), []
     for entry in worst:
-        frame = run.subject.frame(entry["frame"], run.config.data.size)
+        frame = subject.frame(entry["frame"], run.config.data.size)
         pair = draw(renderer, frame, [protocol.look])[protocol.look]
         panels.append(panel(pair, (f"truth of {entry['name']}", f"render, {entry['psnr']:.2f} dB")))
     return contact_sheet(panels)
+
+
+def notes_of(protocols: Sequence[Protocol], run: Run) -> list[str]:
+    return [*background_notes(protocols, run.config.data.background), *region_notes(protocols, run)]
 
 
 def background_notes(protocols: Sequence[Protocol], trained: Sequence[float]) -> list[str]:

@@ -44,5 +44,5 @@ def find_lpips(net: Net) -> ChosenLpips:
             lpips = load_lpips(other)
         except MissingWeights:
             continue
-        return ChosenLpips(lpips, f"{other}, not to be compared with figures of {net}: {missing}")
-    return ChosenLpips(None, f"not measured ({missing})")
+        return ChosenLpips(lpips, f"{other}, not to be compared with figures of {net} ({missing.brief})")
+    return ChosenLpips(None, f"not measured: {missing.brief}")

@@ -15,7 +15,8 @@ from avatar.errors import UserError
 from avatar.evaluation.measure import Pair, to_8_bit
 from avatar.evaluation.protocol import Region
 
-FOLDERS = ("renders", "gt", "masks", "mouth_masks", "eyes_masks", "rest_masks")
+RENDERS, TRACKED_RENDERS = "renders", "tracked_renders"
+FOLDERS = (RENDERS, TRACKED_RENDERS, "gt", "masks", "mouth_masks", "eyes_masks", "rest_masks")
 MASK_FOLDERS: dict[Region, str] = {
     "head": "masks",
     "mouth": "mouth_masks",
@@ -24,9 +25,12 @@ MASK_FOLDERS: dict[Region, str] = {
 }
 
 
-def encode_pictures(pair: Pair, masks: Mapping[Region, UInt8[Tensor, "H W"]]) -> dict[str, bytes]:
-    """PNG files by the name of their folder. A pair of floats is rounded to 8 bits: for looking, not what was measured."""
-    images = {"renders": pair.render, "gt": pair.truth} | {MASK_FOLDERS[region]: mask for region, mask in masks.items()}
+def encode_pictures(
+    pair: Pair, masks: Mapping[Region, UInt8[Tensor, "H W"]], renders: str = RENDERS
+) -> dict[str, bytes]:
+    """PNG files by the name of their folder, `renders` for the render. A pair of floats is rounded to 8 bits: for looking,
+    not what was measured."""
+    images = {renders: pair.render, "gt": pair.truth} | {MASK_FOLDERS[region]: mask for region, mask in masks.items()}
     return {folder: _png(image) for folder, image in images.items()}
 
 

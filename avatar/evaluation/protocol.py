@@ -49,7 +49,9 @@ SHARED_CHOICES = {
     "yaw": "degrees about the head's vertical axis from which the camera sees it, positive from the head's own left",
     "expression_distance": "root mean square distance of the vertices, in mm, neck and head at rest, from the training "
     "frame where it is smallest",
-    "worst": "lowest main PSNR; of frames closer than a bootstrap block only the worst",
+    "worst": "lowest main PSNR",
+    "tracked": "the avatar driven by what the tracker left; refined: by the tracking that was then fitted to each frame's "
+    "own picture, measured frames too; masks and regions are the same for both",
     "means": "over frames, of the figures of each frame; a frame without a pixel in a region has no figure there",
 }
 

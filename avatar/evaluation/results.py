@@ -13,6 +13,7 @@ from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.measure import Figures
 from avatar.evaluation.networks import ChosenLpips
 from avatar.evaluation.protocol import Protocol
+from avatar.evaluation.tracked import Drive
 
 YAW_EDGES = (-30.0, -10.0, 10.0, 30.0)  # degrees
 DISTANCE_QUANTILES = (0.25, 0.5, 0.75)  # edges of the bins of expression distance: four bins with as many frames each
@@ -26,27 +27,40 @@ class FrameResult(NamedTuple):
     conditions: Conditions
 
 
-def summarise(protocol: Protocol, results: Sequence[FrameResult], lpips: ChosenLpips, fps: float) -> dict[str, Any]:
-    """One protocol's entry of results.json; means are over the frames that have a finite figure."""
+def summarise(
+    protocol: Protocol, results: Mapping[Drive, Sequence[FrameResult]], lpips: ChosenLpips, fps: float
+) -> dict[str, Any]:
+    """One protocol's entry of results.json, which `parts` reads; `results` are in the order of `drives`."""
+    *before, own = results
+    frames = [result.name for result in results[own]]
+    block = block_length(len(frames), fps)
+    return {
+        "choices": protocol.choices(),
+        "lpips": lpips.as_json(),
+        "bootstrap": describe(block),
+        "frames": frames,
+        **{drive: _figures(protocol, results[drive], block) for drive in before},
+        "driven_by": own,
+        **_figures(protocol, results[own], block),
+    }
+
+
+def _figures(protocol: Protocol, results: Sequence[FrameResult], block: int) -> dict[str, Any]:
+    """Means are over the frames that have a finite figure."""
     figures = {name: np.array([result.figures[name] for result in results]) for name in protocol.columns}
-    block = block_length(len(results), fps)
     bootstrap = BlockBootstrap(len(results), block)
     yaws = np.array([result.conditions.yaw for result in results])
     distances = np.array([result.conditions.expression_distance for result in results])
     return {
-        "choices": protocol.choices(),
-        "lpips": lpips.as_json(),
         "means": means(figures),
         "intervals": {name: bootstrap.interval(values) for name, values in figures.items()},
-        "bootstrap": describe(block),
         "frames_with_a_figure": {name: int(np.isfinite(values).sum()) for name, values in figures.items()},
         "by_yaw": binned(yaws, YAW_EDGES, figures),
         "by_expression_distance": binned(distances, np.quantile(distances, DISTANCE_QUANTILES), figures),
         "worst": [
             {"frame": result.index, "name": result.name, "psnr": result.figures["psnr"]}
-            for result in worst_frames(results, apart=block)
+            for result in worst_frames(results)
         ],
-        "frames": [result.name for result in results],
     }
 
 
@@ -75,12 +89,7 @@ def binned(
     ]
 
 
-def worst_frames(results: Sequence[FrameResult], apart: int) -> list[FrameResult]:
-    """Up to `WORST` frames of lowest main PSNR, worst first; of frames less than `apart` from each other only the worst."""
-    chosen: list[FrameResult] = []
-    for result in sorted(results, key=lambda result: result.figures["psnr"]):
-        if math.isfinite(result.figures["psnr"]) and all(abs(result.index - other.index) >= apart for other in chosen):
-            chosen.append(result)
-        if len(chosen) == WORST:
-            break
-    return chosen
+def worst_frames(results: Sequence[FrameResult]) -> list[FrameResult]:
+    """Up to `WORST` frames of lowest main PSNR, worst first."""
+    finite = [result for result in results if math.isfinite(result.figures["psnr"])]
+    return sorted(finite, key=lambda result: result.figures["psnr"])[:WORST]

@@ -1,32 +1,59 @@
-"""What the tracking of the measured frames has seen, and the figures by the tracker's own where it was refined.
+"""Which tracking drives the avatar in an evaluation, and which pictures that tracking was fitted to.
 
 A refined frame was fitted to its own picture through an avatar. Published methods differ in exactly this: some fit the
-held-out frames' tracking like any other, some take it as it comes. So both are measured: `refined`, the subject's own
-tracking, and `tracked`, the same avatar driven by what the tracker left.
+held-out frames' tracking like any other, some take it as it comes. So both are measured: `tracked`, the avatar driven by
+what the tracker left, and `refined`, the same avatar driven by the refined tracking. `tracked` comes first everywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
-from tqdm import tqdm
-
-from avatar.data.loader import FrameLoader
 from avatar.data.recording import Recording
-from avatar.evaluation.bootstrap import BlockBootstrap, block_length
-from avatar.evaluation.draw import draw
-from avatar.evaluation.measure import Figures, FrameMeasurer
-from avatar.evaluation.protocol import Protocol
-from avatar.evaluation.regions import region_masks
-from avatar.evaluation.results import means
-from avatar.losses.lpips_network import Lpips, Net
-from avatar.render import Renderer
+from avatar.data.subject import Subject
+from avatar.evaluation.pictures import RENDERS, TRACKED_RENDERS
 from avatar.runs.run import Run
 
+Drive = Literal["tracked", "refined"]
+FRAMES_FILE, TRACKED_FILE = "frames.csv", "tracked.csv"
 OF_TRACKERS = "trackers fit each frame to its own picture, held out or not"
+OF_REFINEMENT = "each frame, measured ones too, was then fitted to its own picture through the avatar of another run"
+LABELS: dict[Drive, str] = {"tracked": "tracked", "refined": "refined, fitted"}  # of the figures in tables
+MARK = "(!)"  # beside the figures of a run whose measured frames were refined through an avatar that had seen them
+OF_MARK = (
+    f"{MARK}: frames that are measured were refined through an avatar that had been trained on them; figures flatter"
+)
+
+
+class Part(NamedTuple):
+    """A protocol's figures as one tracking drives the avatar."""
+
+    figures: dict[str, Any]  # means, intervals, ... of results.json
+    table: str  # file of the frames' figures
+    renders: str  # folder of the pictures
+
+
+def drives(subject: Subject) -> dict[Drive, Recording]:
+    """What the avatar is driven by: the tracker's tracking, then the subject's own where that was refined."""
+    if subject.given is None:
+        return {"tracked": subject.recording}
+    return {"tracked": subject.given, "refined": subject.recording}
+
+
+def parts(entry: dict[str, Any]) -> dict[Drive, Part]:
+    """The figures in a protocol's entry of results.json, `tracked` first."""
+    own: Drive = entry["driven_by"]
+    found: dict[Drive, Part] = {}
+    if "tracked" in entry:
+        found["tracked"] = Part(entry["tracked"], TRACKED_FILE, TRACKED_RENDERS)
+    found[own] = Part(entry, FRAMES_FILE, RENDERS)
+    return found
+
+
+def renders_of(drive: Drive, subject: Subject) -> str:
+    """The folder of the pictures that a tracking drives."""
+    return TRACKED_RENDERS if drive == "tracked" and subject.given is not None else RENDERS
 
 
 def describe_tracking(run: Run, measured: Sequence[int]) -> dict[str, Any]:
@@ -40,7 +67,7 @@ def describe_tracking(run: Run, measured: Sequence[int]) -> dict[str, Any]:
         "tracking": "refined",
         "tracker": refinement.tracker,
         "tracked": OF_TRACKERS,
-        "refined": "each frame was then fitted to its own picture, held out or not, through the avatar of another run",
+        "refined": OF_REFINEMENT,
         "rounds": [
             {
                 "run": one.run,
@@ -54,48 +81,33 @@ def describe_tracking(run: Run, measured: Sequence[int]) -> dict[str, Any]:
     }
 
 
-def tracking_notes(tracking: Mapping[str, Any]) -> list[str]:
-    """A warning where a measured frame was refined through an avatar that had been trained on it."""
-    return [
-        f"{one['measured_frames_trained_on']} of the measured frames were refined through the avatar of {one['run']}, "
-        "which had been trained on them, as frames were divided otherwise there: their figures flatter"
-        for one in tracking["rounds"]
-        if one["measured_frames_trained_on"]
+def is_marked(tracking: Mapping[str, Any]) -> bool:
+    """Whether a measured frame was refined through an avatar that had been trained on it."""
+    return any(one["measured_frames_trained_on"] for one in tracking["rounds"])
+
+
+def tracking_lines(tracking: Mapping[str, Any]) -> list[str]:
+    """What the figures mean, for people: a line for each tracking, and a warning where the run is marked."""
+    lines = [f"tracked: as {tracking['tracker']} left it; {tracking['tracked']}"]
+    return [*lines, *tracking_notes(tracking)]
+
+
+def legend(trackings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The same for the figures of several runs, which name the avatars themselves."""
+    trackers = " and ".join(dict.fromkeys(str(one["tracker"]) for one in trackings))
+    refined = [
+        f"{LABELS['refined']}: {one['refined']}; no figures of unseen frames" for one in trackings if one["rounds"]
     ]
+    marked = [OF_MARK] if any(map(is_marked, trackings)) else []
+    return [f"tracked: as {trackers} left it; {OF_TRACKERS}", *refined[:1], *marked]
 
 
-def measure_tracked(
-    run: Run,
-    given: Recording,
-    renderer: Renderer,
-    indices: Mapping[str, Sequence[int]],
-    protocols: Sequence[Protocol],
-    networks: Mapping[Net, Lpips | None],
-) -> dict[str, dict[str, Any]]:
-    """By protocol: means and intervals of the figures, without jitter, with the avatar driven by the tracking `given`.
-
-    Truths, masks and regions are those of the figures beside them.
-    """
-    data, subject = run.config.data, run.subject
-    found: dict[str, list[Figures]] = {protocol.name: [] for protocol in protocols}
-    order = sorted(set().union(*indices.values()))
-    with FrameLoader(subject, data.size, data.cache_mb << 20, data.workers) as loader:
-        frames = tqdm(loader.frames(order), total=len(order), desc="eval, as tracked", unit="frame", disable=None)
-        for frame in frames:
-            wanted = [protocol for protocol in protocols if frame.index in indices[protocol.name]]
-            camera, params = given.camera(frame.index, data.size), given.params(frame.index)
-            pairs = draw(renderer, replace(frame, camera=camera, params=params), [p.look for p in wanted])
-            masks = region_masks(frame, run.avatar.head, {"head", *(r for p in wanted for r in p.regions)})
-            measurer = FrameMeasurer(pairs, masks, networks)
-            for protocol in wanted:
-                found[protocol.name].append(measurer.measure(protocol))
-    return {name: _summary(figures, subject.fps) for name, figures in found.items()}
-
-
-def _summary(frames: Sequence[Figures], fps: float) -> dict[str, Any]:
-    columns = {name: np.array([figures[name] for figures in frames]) for name in frames[0]}
-    bootstrap = BlockBootstrap(len(frames), block_length(len(frames), fps))
-    return {
-        "means": means(columns),
-        "intervals": {name: bootstrap.interval(values) for name, values in columns.items()},
-    }
+def tracking_notes(tracking: Mapping[str, Any]) -> list[str]:
+    """Those lines that a refined subject adds."""
+    lines = [
+        f"refined: each frame, measured ones too, was fitted to its own picture through the avatar of {one['run']} (step "
+        f"{one['step']}), which was trained on {one['frames_trained_on']} frames, "
+        f"{one['measured_frames_trained_on'] or 'none'} of them measured"
+        for one in tracking["rounds"]
+    ]
+    return [*lines, *([OF_MARK] if is_marked(tracking) else [])]

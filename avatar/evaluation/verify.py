@@ -25,8 +25,9 @@ from tqdm import tqdm
 from avatar.data.images import MAX_BYTES
 from avatar.errors import UserError
 from avatar.evaluation.earlier import MAX_TABLE_BYTES
-from avatar.evaluation.pictures import MASK_FOLDERS
+from avatar.evaluation.pictures import MASK_FOLDERS, RENDERS
 from avatar.evaluation.protocol import column
+from avatar.evaluation.tracked import Drive, Part, parts
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import read_bytes, read_json
 
@@ -45,11 +46,11 @@ class Difference(NamedTuple):
 
 
 def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[[str], None] = print) -> None:
-    """Check RUN/eval/results.json and every frames.csv against the pictures; note in results.json that they agree.
+    """Check RUN/eval/results.json and the tables of frames against the pictures; note in results.json that they agree.
 
     protocols  names; None: all that results.json has
-    Says one line for each protocol. Raises UserError naming the first frame and figure that differ by more than
-    `TOLERANCE`, a picture that is missing, or a table that results.json was not made from.
+    Says one line for each protocol and tracking. Raises UserError naming the first frame and figure that differ by more
+    than `TOLERANCE`, a picture that is missing, or a table that results.json was not made from.
     """
     summary = _again(lambda: read_json(results))
     for name, entry in summary["protocols"].items():
@@ -58,45 +59,53 @@ def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[
         if entry["choices"]["levels"] == "float":
             say(f"{name}: not verified, because it measures floats, which no PNG file holds (levels: float)")
             continue
-        worst, frames = verify_protocol(results.parent / name, entry)
-        entry["verified"] = {
-            "by": f"scikit-image {version('scikit-image')}",
-            "frames": frames,
-            "tolerance": TOLERANCE,
-            "largest_difference": worst.size,
-        }
-        say(
-            f"{name}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; largest "
-            f"difference {worst.size:.1e} ({worst.figure} of {worst.where})"
-        )
+        own = parts(entry)
+        for drive, part in own.items():
+            worst, frames = verify_part(results.parent / name, entry["choices"], part)
+            part.figures["verified"] = {
+                "by": f"scikit-image {version('scikit-image')}",
+                "frames": frames,
+                "tolerance": TOLERANCE,
+                "largest_difference": worst.size,
+            }
+            say(
+                f"{_title(name, drive, own)}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; "
+                f"largest difference {worst.size:.1e} ({worst.figure} of {worst.where})"
+            )
     write_atomically(results, json.dumps(summary, indent=2, allow_nan=False).encode())
 
 
-def verify_protocol(folder: Path, entry: Mapping[str, Any]) -> tuple[Difference, int]:
-    """The largest difference between a protocol's figures and its pictures, and the number of its frames.
+def verify_part(folder: Path, choices: Mapping[str, Any], part: Part) -> tuple[Difference, int]:
+    """The largest difference between a protocol's figures by one tracking and its pictures, and the number of frames.
 
-    `entry` is its part of results.json. Raises as `verify` does.
+    Raises as `verify` does.
     """
-    table = folder / "frames.csv"
+    table = folder / part.table
     content = _again(lambda: read_bytes(table, MAX_TABLE_BYTES))
-    if hashlib.sha256(content).hexdigest() != entry["frames_sha256"]:
+    if hashlib.sha256(content).hexdigest() != part.figures["frames_sha256"]:
         raise UserError(f"{table} is not the table that results.json was made from; evaluate again")
     rows = list(csv.DictReader(content.decode().splitlines()))
     seen: list[Figures] = []
     worst = Difference(0.0, "psnr", f"frame {rows[0]['name']}")
     for row in tqdm(rows, desc=f"verify {folder.name}", unit="frame", leave=False, disable=None):
-        figures = recompute(folder, int(row["frame"]), entry["choices"])
+        figures = recompute(folder, int(row["frame"]), choices, part.renders)
         # Which frames follow each other in time is not in the pictures, so the table says which have a jitter.
         has_jitter = not math.isnan(float(row["jitter"]))
-        figures["jitter"] = recompute_jitter(folder, int(row["frame"])) if has_jitter else math.nan
+        jitter = recompute_jitter(folder, int(row["frame"]), part.renders) if has_jitter else math.nan
+        figures["jitter"] = jitter
         seen.append(figures)
         for found in differences({name: float(row[name]) for name in figures}, figures, f"frame {row['name']}", table):
             worst = max(worst, found)
     means = {name: _mean([figures[name] for figures in seen]) for name in seen[0]}
-    recorded = {name: math.nan if entry["means"][name] is None else entry["means"][name] for name in means}
+    given = part.figures["means"]
+    recorded = {name: math.nan if given[name] is None else given[name] for name in means}
     for found in differences(recorded, means, "the mean", folder.parent / "results.json"):
         worst = max(worst, found)
     return worst, len(rows)
+
+
+def _title(protocol: str, drive: Drive, own: Mapping[Drive, Part]) -> str:
+    return protocol if len(own) == 1 else f"{protocol}, {drive}"
 
 
 def differences(recorded: Figures, seen: Figures, where: str, file: Path) -> Iterator[Difference]:
@@ -113,12 +122,13 @@ def differences(recorded: Figures, seen: Figures, where: str, file: Path) -> Ite
         yield Difference(size, name, where)
 
 
-def recompute(folder: Path, index: int, choices: Mapping[str, Any]) -> Figures:
+def recompute(folder: Path, index: int, choices: Mapping[str, Any], renders: str = RENDERS) -> Figures:
     """PSNR and SSIM of one frame, main and by region, by column of frames.csv; NaN for a region without a pixel.
 
     choices  of the protocol: `mask` and `regions`
+    renders  the folder of the renders
     """
-    render, truth, head = (_read(folder / kind / f"{index:05d}.png") for kind in ("renders", "gt", "masks"))
+    render, truth, head = (_read(folder / kind / f"{index:05d}.png") for kind in (renders, "gt", "masks"))
     regions: Sequence[str] = choices["regions"]
     masks = {region: _mask(folder, region, index, head.shape) for region in regions}
     if choices["mask"] == "multiply":
@@ -134,11 +144,11 @@ def recompute(folder: Path, index: int, choices: Mapping[str, Any]) -> Figures:
     return figures
 
 
-def recompute_jitter(folder: Path, index: int) -> float:
+def recompute_jitter(folder: Path, index: int, renders: str = RENDERS) -> float:
     """Jitter of a frame with pictures before and after it, levels of 8 bits; NaN where no pixel is in all three masks."""
     errors, masks = [], []
     for number in (index - 1, index, index + 1):
-        render, truth, head = (_read(folder / kind / f"{number:05d}.png") for kind in ("renders", "gt", "masks"))
+        render, truth, head = (_read(folder / kind / f"{number:05d}.png") for kind in (renders, "gt", "masks"))
         errors.append(render - truth)
         masks.append(head)
     return _weighted(np.abs(np.diff(errors, n=2, axis=0)[0]).mean(axis=2), np.min(masks, axis=0))

@@ -34,6 +34,10 @@ _MAX_BYTES = 2**30  # of a converted file; VGG16's has 59 MB
 class MissingWeights(UserError):
     """No weights are where they are looked for, as opposed to weights that are there and wrong."""
 
+    def __init__(self, net: Net, message: str) -> None:
+        super().__init__(message)
+        self.brief = f"no weights of {net} on this machine; avatar models says how to get them"
+
 
 def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False) -> Lpips:
     """LPIPS with the weights of `weights` (a .safetensors file or a folder), else of the folders named above.
@@ -55,8 +59,9 @@ def load_lpips(net: Net, weights: Path | None = None, *, download: bool = False)
     if download and weights is None:
         return download_lpips(net, lpips_folder())
     raise MissingWeights(
+        net,
         f"no LPIPS weights for {net!r} in {place}: put {backbone.name} ({backbone.url}) and {heads.name} ({heads.url}) "
-        f"there, or name their folder with AVATAR_LPIPS"
+        f"there, or name their folder with AVATAR_LPIPS",
     )
 
 

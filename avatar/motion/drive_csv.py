@@ -2,117 +2,124 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.opening import read_text
+from avatar.files.opening import read_bytes
 from avatar.head.expression_names import JAW_TARGETS, NAMES_FILE, ExpressionNames, plain
+from avatar.motion.csv_table import Table, parse_table
+from avatar.motion.drive_times import Rate, find_rate, is_time
 
 EYE_COLUMNS = tuple(f"{side}_eye_{axis}" for side in ("left", "right") for axis in "xyz")
 EYELID_COLUMNS = ("eyelid_left", "eyelid_right")
 MAX_BYTES = 2**27  # 50 minutes of ARKit at 60 frames a second
-ARKIT_FPS = 60.0  # of Live Link Face, where the timecodes do not tell
+DEFAULT_FPS = 25.0  # where nothing tells
+ARKIT_FPS = 60.0  # of Live Link Face, likewise
+LARGEST = 1e4  # of any coefficient or length: beyond it a file is damaged, and arithmetic would overflow
+LARGEST_SHAPE = 10.0  # of ARKit's blendshapes, which are 1 where a face does all it can: percent are no such values
 # Where the head model does not say otherwise: what ARKit's 1 stands for. Rough means of what people can do; ARKit
 # gives no angles with these blendshapes.
 JAW_OPEN_RADIANS, GAZE_RADIANS = 0.35, 0.6
 _POSE = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")
-_TIMECODE = re.compile(r"(\d+):(\d+):(\d+):[\d.]+")
+_SHAPE = re.compile(r"(eye|jaw|mouth|brow|cheek|nose|tongue).+")  # every blendshape of ARKit's begins so
+_NUMBERED = re.compile(r"expression_(\d{1,6})")
+_COUNTERS = ("frame", "frames", "framenumber", "index", "blendshapecount")
 
 
 def read_drive_csv(
     path: Path, num_expressions: int, names: ExpressionNames, say: Callable[[str], None]
 ) -> dict[str, np.ndarray]:
     """A CSV's columns as the arrays of an .npz drive file. Raises UserError with the file, the line and the column."""
-    header, rows = _read_rows(path)
-    if plain(header[0]) == "timecode" or "jawopen" in map(plain, header):
-        return _from_arkit(path, header, rows, num_expressions, names, say)
-    return _from_columns(path, header, rows, num_expressions, names, say)
+    table = parse_table(path, read_bytes(path, MAX_BYTES))
+    shapes = [_shape_name(name) for name in table.header]
+    is_arkit = "jawopen" in shapes or (shapes[0] == "timecode" and not any(map(_NUMBERED.fullmatch, table.header)))
+    read = _from_arkit if is_arkit else _from_columns
+    arrays, unread = read(table, num_expressions, names, say)
+    unread += ["a column without a name"] * min(table.unnamed, 1)
+    if unread:
+        say(f"Note: left unread in {path.name}: {_some(unread)}")
+    rate = find_rate(table, say)
+    if rate is None:
+        rate = Rate(ARKIT_FPS if is_arkit else DEFAULT_FPS, "assumed; a column time_s, in seconds, says otherwise")
+    say(f"{path.name}: {len(table)} frames, {rate.fps:g} a second ({rate.source})")
+    return arrays | {"fps": np.array(rate.fps)}
 
 
 def _from_columns(
-    path: Path,
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    num_expressions: int,
-    names: ExpressionNames,
-    say: Callable[[str], None],
-) -> dict[str, np.ndarray]:
-    coefficients: dict[int, int] = {}  # coefficient -> column
-    unread = []
-    special = {
-        name: header.index(name) for name in ("time", *JAW_TARGETS, *EYE_COLUMNS, *EYELID_COLUMNS) if name in header
-    }
-    for column, name in enumerate(header):
-        numbered = re.fullmatch(r"expression_(\d{1,6})", name)
-        index = int(numbered[1]) if numbered else names.index(name)
-        if name in special:
+    table: Table, num_expressions: int, names: ExpressionNames, say: Callable[[str], None]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The program's own columns, and the names of those that are none."""
+    path, coefficients, unread = table.path, dict[int, str](), []
+    special = {name for name in (*JAW_TARGETS, *EYE_COLUMNS, *EYELID_COLUMNS) if name in table.header}
+    for name in table.header:
+        if name in special or is_time(name):
             continue
+        numbered = _NUMBERED.fullmatch(name)
+        index = int(numbered[1]) if numbered else names.index(name)
         if index is None:
             unread.append(name)
         elif index >= num_expressions:
             raise UserError(f"{path}: the column {name} is beyond the head model's {num_expressions} coefficients")
         elif index in coefficients:
-            raise UserError(f"{path}: the columns {header[coefficients[index]]} and {name} are the same coefficient")
+            raise UserError(f"{path}: the columns {coefficients[index]} and {name} are the same coefficient")
         else:
-            coefficients[index] = column
+            coefficients[index] = name
     if not coefficients:
         raise UserError(
-            f"{path} has no column expression_0, expression_1, ... nor one of the head model's names; see docs/transfer.md"
+            f"{path} has no column expression_0, expression_1, ... nor one of the head model's names (its columns: "
+            f"{_some(table.header)}); see docs/transfer.md"
         )
-    if unread:
-        say(f"Note: left unread in {path.name}: {_some(unread)}")
-    expression = np.zeros((len(rows), max(coefficients) + 1))
-    for index, column in coefficients.items():
-        expression[:, index] = _column(path, header, rows, column)
+    expression = np.zeros((len(table), max(coefficients) + 1))
+    for index, name in coefficients.items():
+        expression[:, index] = table.column(name, LARGEST)
     arrays = {"expression": expression}
     for key, columns in (("jaw", JAW_TARGETS), ("eyes", EYE_COLUMNS), ("eyelids", EYELID_COLUMNS)):
         given = [name for name in columns if name in special]
         if given and len(given) < len(columns):
             raise UserError(f"{path} has {given[0]} but not all of {', '.join(columns)}")
         if given:
-            arrays[key] = np.stack([_column(path, header, rows, special[name]) for name in columns], axis=1)
-    if "time" in special and len(rows) > 1:
-        time = _column(path, header, rows, special["time"])
-        if not (np.diff(time) > 0).all():
-            raise UserError(f"{path}: the column time must rise from line to line (seconds)")
-        arrays["fps"] = np.array((len(rows) - 1) / (time[-1] - time[0]))
-    return arrays
+            arrays[key] = np.stack([table.column(name, LARGEST) for name in columns], axis=1)
+    return arrays, unread
 
 
 def _from_arkit(
-    path: Path,
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    num_expressions: int,
-    names: ExpressionNames,
-    say: Callable[[str], None],
-) -> dict[str, np.ndarray]:
+    table: Table, num_expressions: int, names: ExpressionNames, say: Callable[[str], None]
+) -> tuple[dict[str, np.ndarray], list[str]]:
     """ARKit's blendshapes: blinks become eyelids, the eyes' directions gaze, the rest coefficients of their names."""
+    path, own, unread = table.path, dict[str, str](), []
+    for name in table.header:
+        shape = _shape_name(name)
+        if is_time(name) or shape in _COUNTERS:
+            continue
+        if not (_SHAPE.fullmatch(shape) or _POSE.fullmatch(shape) or names.targets(shape)):
+            unread.append(name)
+        elif shape in own:
+            raise UserError(f"{path}: the columns {own[shape]} and {name} are the same blendshape")
+        else:
+            own[shape] = name
     values = {
-        plain(name): _column(path, header, rows, column)
-        for column, name in enumerate(header)
-        if plain(name) not in ("timecode", "blendshapecount")
+        shape: table.column(name, LARGEST if _POSE.fullmatch(shape) else LARGEST_SHAPE) for shape, name in own.items()
     }
-    pose = [name for name in values if _POSE.fullmatch(name)]
-    arrays, unread = from_blendshapes(values, len(rows), num_expressions, names)
-    unmapped = [next(own for own in header if plain(own) == name) for name in unread]
-    if not arrays["expression"].any() and len(unmapped) > 1:
+    arrays, unmapped = from_blendshapes(values, len(table), num_expressions, names)
+    lost = [shape for shape in unmapped if values[shape].any() and shape != "tongueout"]  # no head model has a tongue
+    if lost and not any(names.targets(shape) for shape in values):
+        known = (
+            "no name of the head model's expressions is one of them" if names.names else "the head model has no names"
+        )
         raise UserError(
-            f"{path} holds ARKit's blendshapes, and the head model does not say which of its expressions they are: put "
-            f"{NAMES_FILE} beside the model file, with the name of each coefficient or ARKit's weights (docs/transfer.md)"
+            f"{path} holds ARKit's blendshapes, and {known}: put {NAMES_FILE} beside the model file, with the name of each "
+            "coefficient or ARKit's weights (docs/transfer.md)"
         )
     if unmapped:
-        say(f"Note: {len(unmapped)} of ARKit's blendshapes move nothing on this head model: {_some(unmapped)}")
-    if any(name.startswith("head") for name in pose):
+        shown = _some([own[shape] for shape in unmapped])
+        say(f"Note: {len(unmapped)} of ARKit's blendshapes move nothing on this head model: {shown}")
+    if any(shape.startswith("head") for shape in values if _POSE.fullmatch(shape)):
         say(f"Note: the head's turns in {path.name} are not used; the avatar's own camera is shown")
-    return arrays | {"fps": np.array(_timecode_fps([row[0] for row in rows]))}
+    return arrays, unread
 
 
 def from_blendshapes(
@@ -153,40 +160,9 @@ def _gaze(values: Mapping[str, np.ndarray], frames: int) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _timecode_fps(timecodes: Sequence[str]) -> float:
-    """Frames of a whole second, HH:MM:SS:FF; the first and the last second are not whole."""
-    seconds = Counter(match.group(0).rpartition(":")[0] for code in timecodes if (match := _TIMECODE.match(code)))
-    whole = list(seconds.values())[1:-1]
-    return float(np.median(whole)) if whole else ARKIT_FPS
-
-
-def _read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
-    text = read_text(path, MAX_BYTES)
-    try:
-        lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), strict=True) if row]
-    except csv.Error as error:
-        raise UserError(f"{path} cannot be read as CSV ({error})") from None
-    if len(lines) < 2:
-        raise UserError(f"{path} needs a line of column names and at least one frame")
-    header, rows = lines[0], lines[1:]
-    if double := [name for name, count in Counter(map(plain, header)).items() if count > 1]:
-        raise UserError(f"{path} has two columns of the name {double[0] or 'nothing'}")
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(header):
-            raise UserError(f"{path}, line {number}: {len(row)} values for {len(header)} columns")
-    return header, rows
-
-
-def _column(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], column: int) -> np.ndarray:
-    values = np.empty(len(rows))
-    for i, row in enumerate(rows):
-        try:
-            values[i] = float(row[column])
-        except ValueError:
-            values[i] = math.nan
-        if not math.isfinite(values[i]):
-            raise UserError(f"{path}, line {i + 2}: {header[column]} is {row[column][:40]!r}, not a finite number")
-    return values
+def _shape_name(name: str) -> str:
+    """Plain, without what programs put before it: blendShapes.JawOpen."""
+    return plain(name.rpartition(".")[2])
 
 
 def _some(names: Sequence[str]) -> str:

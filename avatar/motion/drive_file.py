@@ -31,14 +31,13 @@ from avatar.files.atomic import write_atomically
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.motion.drive import Drive
-from avatar.motion.drive_csv import read_drive_csv
+from avatar.motion.drive_csv import DEFAULT_FPS, LARGEST, read_drive_csv
+from avatar.motion.drive_times import BOUNDS
 from avatar.types import IDENTITY_6D, Camera, HeadParams
 
-DEFAULT_FPS = 25.0
 MAX_FRAMES = 1_000_000
 CAMERA_KEYS = ("R", "t", "K", "size")
 KEYS = ("expression", "jaw", "eyes", "eyelids", "fps", *CAMERA_KEYS, "shape", "names", "head")
-LARGEST = 1e4  # of any coefficient or length: beyond it a file is damaged, and arithmetic would overflow
 
 
 def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[str], None] = print) -> Drive:
@@ -79,8 +78,8 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     eyes = _rotations(path, arrays, "eyes", T, 2)
     eyelids = _numbers(path, arrays, "eyelids", (T, 2)) if "eyelids" in arrays else torch.zeros(T, 2)
     fps = float(_numbers(path, arrays, "fps", ())) if "fps" in arrays else DEFAULT_FPS
-    if not 0 < fps <= 1000:
-        raise UserError(f"{path}: fps is {fps:g}; it must be above 0 and at most 1000")
+    if not BOUNDS[0] <= fps <= BOUNDS[1]:
+        raise UserError(f"{path}: fps is {fps:g}, frames a second; it must lie between {BOUNDS[0]:g} and {BOUNDS[1]:g}")
     shape = _numbers(path, arrays, "shape", (None,)) if "shape" in arrays else torch.zeros(0)
     if len(shape) > assets.shape_dirs.shape[2]:
         raise UserError(f"{path}: shape has {len(shape)} values, the head model {assets.shape_dirs.shape[2]}")

@@ -57,7 +57,10 @@ def summary(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> lis
     for part, title in (("train", "training frames"), ("test", "held-out frames")):
         chosen = list(getattr(subject.split, part))
         before, after = (_mean(values[chosen]) for values in (refined.before, refined.after))
-        lines.append(f"{title + ':':17} head-only PSNR {before:.2f} -> {after:.2f} dB with the avatar as it is")
+        lines.append(
+            f"{title + ':':17} head-only PSNR {before:.2f} -> {after:.2f} dB with the avatar as it is, each frame "
+            "fitted to its own picture"
+        )
     turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
     turn, shift = math.degrees(float(np.median(turns))), 1e3 * float(np.median(shifts))
     lines.append(f"{'moved:':17} {turn:.2f} degrees and {shift:.2f} mm, medians")

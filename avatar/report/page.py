@@ -10,6 +10,8 @@ from typing import Any
 from avatar.config import flatten
 from avatar.data.images import MAX_BYTES
 from avatar.errors import UserError, check_installed
+from avatar.evaluation.evaluate import RESULTS_FORMAT
+from avatar.evaluation.tracked import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there, read_bytes, read_json
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
@@ -45,6 +47,7 @@ def render_report(run: Run) -> str:
     facts = {
         "subject": run.subject.name,
         "method": run.config.model.name,
+        "perceptual term": run.trained.perceptual,
         "Gaussians": f"{len(run.avatar):,}",
         "step": f"{run.step:,}",
         "training frames": len(run.subject.split.train),
@@ -70,28 +73,26 @@ def read_results(path: Path) -> dict[str, Any] | None:
         results = read_json(path)
     except UserError as error:
         raise UserError(f"{error}; run avatar eval again") from None
-    if not isinstance(results, dict) or not isinstance(results.get("protocols"), dict):
-        raise UserError(f"{path} is not a results file of this program; run avatar eval again")
+    if not isinstance(results, dict) or results.get("format") != RESULTS_FORMAT:
+        raise UserError(f"{path} is not a results file of this version of the program; run avatar eval again")
     return results
 
 
-def means_table(protocols: Mapping[str, Any]) -> Markup:
-    """One line per protocol, one column per figure that any of them has."""
-    columns = list(dict.fromkeys(name for entry in protocols.values() for name in entry.get("means", {})))
-    rows = [
-        [name, len(entry.get("frames", ())), *(_figure(c, entry.get("means", {}).get(c)) for c in columns)]
-        for name, entry in protocols.items()
-    ]
+def means_table(protocols: Mapping[str, Any], mark: str = "") -> Markup:
+    """One line per protocol and tracking, the tracker's first; one column per figure that any of them has."""
+    lines = _by_drive(protocols, mark)
+    columns = list(dict.fromkeys(c for _, _, means, _ in lines for c, mean in means.items() if mean is not None))
+    rows = [[name, frames, *(_figure(c, means.get(c)) for c in columns)] for name, frames, means, _ in lines]
     return data_table(["protocol", "frames", *(column.replace("_", " ") for column in columns)], rows)
 
 
-def bins_tables(protocols: Mapping[str, Any]) -> list[Markup]:
+def bins_tables(protocols: Mapping[str, Any], mark: str = "") -> list[Markup]:
     """Means over the frames in each bin of the conditions that a protocol was binned by, one table for each pair."""
     tables = []
-    for name, entry in protocols.items():
-        columns = [column for column, value in entry.get("means", {}).items() if value is not None]
+    for name, _, means, figures in _by_drive(protocols, mark):
+        columns = [column for column, value in means.items() if value is not None]
         for key, title, decimals, column_name in BINNINGS:
-            bins = entry.get(key, ())
+            bins = figures.get(key, ())
             if not bins:
                 continue
             rows = [
@@ -101,6 +102,19 @@ def bins_tables(protocols: Mapping[str, Any]) -> list[Markup]:
             heading = [column_name, "frames", *(column.replace("_", " ") for column in columns)]
             tables.append(element("div", element("p", f"{name}, by {title}", class_="soft"), data_table(heading, rows)))
     return tables
+
+
+def _by_drive(
+    protocols: Mapping[str, Any], mark: str
+) -> list[tuple[str, int, Mapping[str, float | None], Mapping[str, Any]]]:
+    """Name, number of frames, means and all figures of each protocol, by the tracker's tracking and the refined one."""
+    lines = []
+    for name, entry in protocols.items():
+        own, frames = parts(entry), len(entry.get("frames", ()))
+        for drive, part in own.items():
+            label = name if len(own) == 1 else f"{name}, {LABELS[drive]}"
+            lines.append((label + mark, frames, part.figures.get("means", {}), part.figures))
+    return lines
 
 
 def _interval(one: Mapping[str, Any], decimals: int) -> str:
@@ -115,21 +129,32 @@ def _figure(column: str, value: float | None) -> str:
 def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
     if results is None:
         return [element("p", f"Not measured yet: avatar eval {run.path}", class_="soft")]
-    parts = []
+    shown = []
     if results.get("step") != run.step:
         text = f"Measured at step {results.get('step')}, while the newest checkpoint is of step {run.step}."
-        parts.append(element("p", text, class_="finding warning"))
-    parts.append(means_table(results["protocols"]))
-    parts.append(fold("By head pose and by distance from the training expressions", *bins_tables(results["protocols"])))
-    for name, caption in (("curves.png", "The figures along the video"), ("worst.png", "The worst frames")):
+        shown.append(element("p", text, class_="finding warning"))
+    tracking, protocols = results["tracking"], results["protocols"]
+    mark = f" {MARK}" if is_marked(tracking) else ""
+    shown.append(means_table(protocols, mark))
+    kind = "finding warning" if tracking["rounds"] else "soft"
+    shown += [element("p", line, class_=kind) for line in tracking_lines(tracking)]
+    networks = dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())
+    shown += [element("p", f"LPIPS: {note}", class_="soft") for note in networks]
+    shown.append(fold("By head pose and by distance from the training expressions", *bins_tables(protocols, mark)))
+    by_tracker = ", driven by the tracker's tracking" if tracking["rounds"] else ""
+    captions = (
+        ("curves.png", f"The figures along the video{by_tracker}"),
+        ("worst.png", f"The worst frames{by_tracker}"),
+    )
+    for name, caption in captions:
         file = run.path / "eval" / name
         if is_there(file):
             source = f"data:image/png;base64,{base64.b64encode(read_bytes(file, MAX_BYTES)).decode()}"
             image = element("figure", element("img", src=source, alt=caption), element("figcaption", caption))
-            parts.append(fold(caption, image))
-    choices = {n: e.get("choices", {}).get("summary") for n, e in results["protocols"].items()}
+            shown.append(fold(caption, image))
+    choices = {n: e.get("choices", {}).get("summary") for n, e in protocols.items()}
     rows = [[name, summary] for name, summary in choices.items()]
-    return [*parts, fold("What each protocol measures", data_table([], rows))]
+    return [*shown, fold("What each protocol measures", data_table([], rows))]
 
 
 def _frames(run: Run) -> list[Markup]:
@@ -143,8 +168,9 @@ def _frames(run: Run) -> list[Markup]:
         )
         for position, (name, image) in enumerate(panels)
     ]
+    by_tracker = [] if run.subject.given is None else [element("p", "Driven by the tracker's tracking.", class_="soft")]
     slider = element("input", type="range", id="frame", min=0, max=len(panels) - 1, value=0, aria_label="frame")
-    return [element("div", slider, join(figures), id="frames")]
+    return [*by_tracker, element("div", slider, join(figures), id="frames")]
 
 
 def _curves(folder: Path) -> list[Markup]:
@@ -197,6 +223,7 @@ def _origin(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
         "head model": run.avatar.head.assets.fingerprint,
         **{f"version of {name}": value for name, value in versions().items()},
     }
-    notes = [element("p", note) for note in (results or {}).get("notes", ())]
+    told = tracking_lines(results["tracking"]) if results else []
+    notes = [element("p", note) for note in (results or {}).get("notes", ()) if note not in told]
     config = [[key, str(value)] for key, value in flatten(run.config.to_dict()).items()]
     return [*notes, data_table([], [list(row) for row in known.items()]), fold("Configuration", data_table([], config))]

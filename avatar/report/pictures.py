@@ -19,13 +19,17 @@ UNCERTAINTY_GAIN = 2.5  # of the paper's figures: sigmoid(2.5 u)
 
 
 def frame_panels(run: Run) -> list[tuple[str, np.ndarray]]:
-    """(name, truth | render | error as uint8 [h, w, 3]) of at most `MAX_FRAMES` held-out frames, spread over them."""
-    test = run.subject.split.test
+    """(name, truth | render | error as uint8 [h, w, 3]) of at most `MAX_FRAMES` held-out frames, spread over them.
+
+    Driven by what the tracker left, where the tracking was refined.
+    """
+    subject = run.subject.as_tracked()
+    test = subject.split.test
     chosen = [test[i * len(test) // min(MAX_FRAMES, len(test))] for i in range(min(MAX_FRAMES, len(test)))]
     background = torch.tensor(run.config.data.background)
     renderer = Renderer(run.avatar, background)
     panels = []
-    with FrameLoader(run.subject, run.config.data.size, workers=run.config.data.workers) as loader:
+    with FrameLoader(subject, run.config.data.size, workers=run.config.data.workers) as loader:
         for frame in loader.frames(chosen):
             render = renderer.render(frame.params, frame.camera).image.clamp(0, 1).cpu()
             image = panel(Pair(render, frame.composite(background)))

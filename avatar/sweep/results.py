@@ -12,6 +12,7 @@ from scipy import stats
 from avatar.errors import UserError
 from avatar.evaluation.bootstrap import LEVEL, Interval
 from avatar.evaluation.compare import Cell, Comparison, Evaluation, ProtocolComparison, read_evaluation
+from avatar.evaluation.tracked import Drive, is_marked, legend
 from avatar.sweep.spec import Job, Spec
 
 Figures = Mapping[tuple[str, int], float]  # (subject, seed) -> a figure
@@ -28,13 +29,25 @@ def fold_results(folder: Path, spec: Spec) -> Comparison:
     variants = list(dict.fromkeys(job.variant for job, _ in evaluations))
     protocols = list(dict.fromkeys(name for _, each in evaluations for name in each.results["protocols"]))
     comparisons = []
+    drives: tuple[Drive, ...] = ("tracked", "refined")
     for protocol in protocols:
-        compared = compare_variants(evaluations, variants, protocol)
-        if compared is not None:
-            comparisons.append(compared)
+        for drive in drives:
+            compared = compare_variants(evaluations, variants, protocol, drive)
+            if compared is not None:
+                comparisons.append(compared)
     if not comparisons:
         raise UserError(f"no subject and seed in {folder} is measured for all {len(variants)} variants yet")
-    return Comparison(variants, comparisons, notes)
+    by_variant = {
+        variant: [each.results for job, each in evaluations if job.variant == variant] for variant in variants
+    }
+    return Comparison(
+        variants,
+        [any(is_marked(results["tracking"]) for results in own) for own in by_variant.values()],
+        [" and ".join(sorted({results["perceptual"] for results in own})) for own in by_variant.values()],
+        comparisons,
+        legend([each.results["tracking"] for _, each in evaluations]),
+        notes,
+    )
 
 
 def read_evaluations(folder: Path, jobs: Sequence[Job], notes: list[str]) -> list[tuple[Job, Evaluation]]:
@@ -49,13 +62,13 @@ def read_evaluations(folder: Path, jobs: Sequence[Job], notes: list[str]) -> lis
 
 
 def compare_variants(
-    evaluations: Sequence[tuple[Job, Evaluation]], variants: Sequence[str], protocol: str
+    evaluations: Sequence[tuple[Job, Evaluation]], variants: Sequence[str], protocol: str, drive: Drive
 ) -> ProtocolComparison | None:
-    """None where no (subject, seed) pair is there for all variants."""
+    """None where no (subject, seed) pair is there for all variants, driven so."""
     means: dict[str, dict[tuple[str, int], Mapping[str, float]]] = {variant: {} for variant in variants}
     for job, evaluation in evaluations:
-        if entry := evaluation.results["protocols"].get(protocol):
-            means[job.variant][job.subject, job.seed] = entry["means"]
+        if protocol in evaluation.results["protocols"] and (part := evaluation.parts(protocol).get(drive)):
+            means[job.variant][job.subject, job.seed] = part.figures["means"]
     pairs = sorted(set.intersection(*(set(found) for found in means.values()))) if means else []
     if not pairs:
         return None
@@ -72,7 +85,7 @@ def compare_variants(
             ]
     subjects, seeds = len({subject for subject, _ in pairs}), len({seed for _, seed in pairs})
     unit = f"trainings each ({subjects} subjects, {seeds} seeds)"
-    return ProtocolComparison(protocol, len(pairs), unit, "Student's t over trainings", rows)
+    return ProtocolComparison(protocol, drive, len(pairs), unit, "Student's t over trainings", rows)
 
 
 def interval(differences: np.ndarray) -> Interval | None:

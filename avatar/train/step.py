@@ -15,7 +15,7 @@ from torch import Tensor
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.losses.lpips import load_lpips
+from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import MIN_SIZE, Net
 from avatar.losses.metrics import SSIM_WINDOW
 from avatar.losses.photometric import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
@@ -185,8 +185,12 @@ def choose_perceptual(
             if recorded is not None:
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
             if config.perceptual == "lpips":
-                raise
-            say(f"Training with D-SSIM in place of LPIPS: {error}")
+                raise UserError(
+                    f"{error}. This configuration trains with LPIPS (trainer.perceptual=lpips); trainer.perceptual=dssim "
+                    "trains without, and its figures do not compare"
+                ) from None
+            said = error.brief if isinstance(error, MissingWeights) else error
+            say(f"Training with D-SSIM in place of LPIPS: {said}")
     return PerceptualTerm("dssim", in_its_place, before=before)
 
 

@@ -154,9 +154,10 @@ def marks(seconds: Sequence[float], between: int = BETWEEN) -> list[float]:
 
 
 def held_out(subject: Subject, config: Config, count: int) -> list[Frame]:
+    """As the tracker left them, where the tracking was refined."""
     test = subject.split.test
     chosen = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, count).round().astype(int))]
-    with FrameLoader(subject, config.data.size) as loader:
+    with FrameLoader(subject.as_tracked(), config.data.size) as loader:
         return list(loader.frames(chosen))
 
 

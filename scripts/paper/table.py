@@ -87,8 +87,9 @@ def chosen(rows: Rows, names: Sequence[str] | None) -> list[Mapping[str, Any]]:
 def read_rows(folder: Path, spec: Spec, rows: Rows) -> tuple[list[Row], list[str]]:
     """What the sweep has found for the table's systems, and remarks. Raises UserError where there is nothing yet."""
     comparison = fold_results(folder, spec)
-    (measured,) = comparison.protocols
-    notes = [f"Means of {measured.count} {measured.unit}.", *comparison.notes]
+    measured = comparison.protocols[0]  # driven by the tracker's tracking
+    terms = f"Perceptual term in training: {', '.join(dict.fromkeys(comparison.perceptual))}."
+    notes = [f"Means of {measured.count} {measured.unit}.", *comparison.tracking[:1], terms, *comparison.notes]
     found = []
     for row in rows:
         name = row["name"]

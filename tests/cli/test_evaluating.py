@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from command_line import avatar
 from small_runs import SMALL
 
+from avatar.evaluation import evaluate as evaluate_module
 from avatar.files.lock import locked
 
 
@@ -43,21 +45,50 @@ def test_a_protocol_more_keeps_the_others_results(run: Path) -> None:
     before = read_results(run)["protocols"]
     output = avatar("eval", run, "--protocol", "rgbavatar")
     after = read_results(run)
-    assert list(after["protocols"]) == ["rgbavatar", "strict", "flashavatar"]
+    assert list(after["protocols"]) == ["flashavatar", "rgbavatar", "strict"]
     assert {name: after["protocols"][name] for name in before} == before
     assert tables(run) == {"rgbavatar", "strict", "flashavatar"}
     assert len(list((run / "eval" / "strict" / "renders").glob("*.png"))) == 6
-    assert "Kept     strict, flashavatar: measured before" in output and "Removed" not in output
-    assert [note.split(":")[0] for note in after["notes"]] == ["rgbavatar", "flashavatar"], "every background is noted"
+    assert "Kept     flashavatar, strict: measured before" in output and "Removed" not in output
+    assert [note.split(":")[0] for note in after["notes"]] == ["flashavatar", "rgbavatar"], "every background is noted"
     printed = output.partition("Results")[0]
     assert "rgbavatar" in printed and "strict" not in printed, "the table shows what was asked for"
     compared = avatar("compare", run, run)
     assert all(name in compared for name in ("rgbavatar", "strict", "flashavatar"))
 
 
+def test_a_protocol_more_replaces_nobodys_curves_sheet_or_video(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plotted: list[tuple[list[str], set[str], str]] = []
+    real = evaluate_module.curves
+
+    def watched(protocols: Any, by_drive: Any, shown: str, worst: Any) -> bytes:
+        plotted.append(([protocol.name for protocol in protocols], set(by_drive["tracked"]), shown))
+        return real(protocols, by_drive, shown, worst)
+
+    monkeypatch.setattr(evaluate_module, "curves", watched)
+    pictures = {name: (run / "eval" / name).read_bytes() for name in ("worst.png", "truth_render_error.mp4")}
+    output = avatar("eval", run, "--protocol", "rgbavatar")
+    every = ["flashavatar", "rgbavatar", "strict"]
+    assert plotted == [(every, set(every), "strict")]
+    assert {name: (run / "eval" / name).read_bytes() for name in pictures} == pictures
+    assert f"Worst (strict) {run / 'eval' / 'worst.png'}" in output and "Video (strict)" in output
+    avatar("eval", run, "--protocol", "strict", "--protocol", "flashavatar")
+    assert read_results(run)["shown"] == "strict" and len(plotted[1][0]) == 3
+
+
+def test_the_table_fits_a_terminal_and_has_no_column_that_nobody_measured(run: Path) -> None:
+    output = avatar("eval", run)
+    figures = [line for line in output.splitlines() if re.search(r"\d\.\d", line) and "/" not in line]
+    assert len(figures) > 15 and max(map(len, figures)) <= 80
+    assert output.count("LPIPS") == 1, "there are no weights: one line says so, and no column is empty"
+    (said,) = [line for line in output.splitlines() if "LPIPS" in line]
+    assert len(said) < 100 and "avatar models" in said
+    assert output.splitlines()[-1] == f"Next     avatar report {run}"
+
+
 def test_measuring_again_replaces_the_own_result(run: Path) -> None:
     avatar("eval", run, "--protocol", "strict")
-    assert list(read_results(run)["protocols"]) == ["strict", "flashavatar"]
+    assert list(read_results(run)["protocols"]) == ["flashavatar", "strict"]
     assert not (run / "eval" / "strict" / "renders").exists(), "pictures of the evaluation before"
 
 

@@ -76,13 +76,11 @@ def test_it_is_trained_on_and_measured_by_both_trackings(refined: Path, folder: 
     again = tmp_path / "again"
     avatar("train", refined, "--out", again, *QUICK)
     output = avatar("eval", again, "--protocol", "hypergaussians", "--protocol", "strict")
-    assert "the same avatar and frames by both trackings" in output
-    lines = [line.split() for line in output.splitlines() if line.startswith("strict")]
-    both = {words[1]: words for words in lines if words[1] in ("tracked", "refined")}
     results = json.loads((again / "eval" / "results.json").read_text())
     entry = results["protocols"]["strict"]
-    assert both["refined"][2] == f"{entry['means']['psnr']:.2f}"
-    assert both["tracked"][2] == f"{entry['tracked']['means']['psnr']:.2f}"
+    lines = output.partition("strict")[2].splitlines()
+    for line, title, figures in ((lines[1], "tracked", entry["tracked"]), (lines[2], "refined, fitted", entry)):
+        assert line.split(title)[1].split()[0] == f"{figures['means']['psnr']:.2f}"
     assert entry["tracked"]["means"]["psnr"] != entry["means"]["psnr"]
     assert len(entry["tracked"]["intervals"]["psnr_head"]) == 2
     tracking = results["tracking"]
@@ -98,7 +96,7 @@ def test_it_is_trained_on_and_measured_by_both_trackings(refined: Path, folder: 
 def test_the_tracked_figures_are_those_of_the_tracker(refined: Path, run: Path, tmp_path: Path) -> None:
     """The avatar that the tracking was refined through, measured on the refined folder: `tracked` is its own evaluation."""
     first = avatar("eval", run, "--protocol", "strict")
-    assert "by both trackings" not in first and "tracked: as metrical-tracker left it" in first
+    assert "refined" not in first and "tracked: as metrical-tracker left it" in first
     own = json.loads((run / "eval" / "results.json").read_text())
     assert own["tracking"]["tracking"] == "tracked" and "tracked" not in own["protocols"]["strict"]
     again = tmp_path / "again"
@@ -117,7 +115,7 @@ def test_frames_that_the_avatar_had_seen_are_called_so(refined: Path, tmp_path: 
     again = tmp_path / "again"
     avatar("train", refined, "--out", again, *QUICK, "data.test_frames=5")
     output = avatar("eval", again, "--protocol", "strict")
-    assert "Note: 2 of the measured frames were refined through the avatar of" in output
+    assert "2 of them measured" in output and "refined, fitted (!)" in output
     results = json.loads((again / "eval" / "results.json").read_text())
     assert results["tracking"]["rounds"][0]["measured_frames_trained_on"] == 2
 
@@ -156,7 +154,7 @@ def test_training_in_rounds(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert info["source"]["folder"] == str((run / "rounds" / "2" / "someone").resolve())
     raw = json.loads((run / "rounds" / "2" / "someone" / "refinement.json").read_text())["refinement"]
     assert [Path(one["run"]).parts[-2:] for one in raw["rounds"]] == [("1", "run"), ("2", "run")]
-    assert "by both trackings" in avatar("eval", run, "--protocol", "strict")
+    assert "refined, fitted" in avatar("eval", run, "--protocol", "strict")
     assert "is complete" in avatar("train", "--resume", "--out", run)
     assert "holds a run already" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
 
@@ -246,8 +244,7 @@ def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, m
     after.parent.mkdir()
     before.rename(after)
     assert "give the tracked video folder" in avatar("train", "--resume", "--out", run, status=1)
-    head = after / "head_model"
-    output = avatar("train", after, "--head", head, "--resume", "--out", run)
+    output = avatar("train", after, "--resume", "--out", run)
     assert "going on after 1 of 14 frames" in output and "10/10" in output
     assert (run / "rounds" / "1" / "someone" / "tracking.npz").is_file()
 

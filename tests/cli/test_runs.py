@@ -129,10 +129,12 @@ def test_a_run_of_few_frames_ends_with_its_passes_and_is_resumed_by_the_same_com
 def test_a_run_may_go_on_on_another_device_and_says_so(way: tuple[str, ...], begun: Path, own_folder: Path) -> None:
     newest = newest_checkpoint(begun)
     assert newest.meta["device"] == "cpu"
-    elsewhere = Checkpoint(newest.step, newest.tensors, {**newest.meta, "device": "cuda"})
+    elsewhere = Checkpoint(newest.step, newest.tensors, {**newest.meta, "device": "cuda", "threads": 77})
     save_checkpoint(begun / "checkpoints", elsewhere, keep=3)
     output = avatar("train", own_folder, "--out", begun, "--resume", *way)
-    assert "Note: the checkpoint was made on cuda, this is cpu; the result is the same to rounding" in output
+    notes = [line for line in output.splitlines() if line.startswith("Note: the checkpoint was made")]
+    assert "on cuda, this is cpu" in notes[1] and "with 77 threads" in notes[0]
+    assert all("pictures" in note and "parameters" in note for note in notes), "those differ by more than rounding"
     assert newest_checkpoint(begun).step == 12
 
 
@@ -233,8 +235,13 @@ def test_an_avatar_needs_neither_its_video_nor_its_run(tracked_folder: Path, tmp
 
 def test_a_moved_video_is_resumed_from_its_new_place(begun: Path, own_folder: Path, tmp_path: Path) -> None:
     moved = own_folder.rename(tmp_path / "moved")
-    assert "is gone: give its new place" in avatar(
-        "train", "--out", begun, "--resume", "--head", moved / "head_model", status=1
-    )
-    output = avatar("train", "--out", begun, "--resume", "--folder", moved, "--head", moved / "head_model")
-    assert "at step 8 of 12" in output
+    assert "is gone: give its new place" in avatar("train", "--out", begun, "--resume", status=1)
+    output = avatar("train", "--out", begun, "--resume", "--folder", moved)
+    assert "at step 8 of 12" in output, "its head model lies inside it"
+    assert "Results" in avatar("eval", begun, "--folder", moved, "--protocol", "strict")
+
+
+def test_a_head_model_that_stayed_behind_is_still_found(begun: Path, own_folder: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(own_folder, moved, ignore=shutil.ignore_patterns("head_model"))
+    assert "at step 8 of 12" in avatar("train", "--out", begun, "--resume", "--folder", moved)

@@ -37,8 +37,10 @@ def write_run(
         "means": dict.fromkeys(figures, 1.0),
         "bootstrap": {"block_frames": 10},
         "frames_sha256": hashlib.sha256(data).hexdigest(),
+        "driven_by": "tracked",
     }
-    results = {"format": 2, "data_hash": "ab" * 32, "head_fingerprint": "cd" * 32, "image_size": [64, 64]}
+    results = {"format": 3, "data_hash": "ab" * 32, "head_fingerprint": "cd" * 32, "image_size": [64, 64]}
+    results |= {"perceptual": "dssim", "tracking": {"tracker": "insta", "rounds": []}}
     results |= {"protocols": {protocol: entry}} | changes
     (run / "eval" / "results.json").write_text(json.dumps(results))
     return run
@@ -107,7 +109,7 @@ def test_frames_without_a_figure_in_one_run_count_in_none(tmp_path: Path) -> Non
         ({"image_size": [128, 64]}, "b was evaluated on another image size than a (128x64, not 64x64)"),
         ({"levels": "truncate"}, "a and b cannot be compared: strict differs between the runs in levels"),
         ({"protocol": "mine"}, "a and b cannot be compared: strict was not measured for b"),
-        ({"format": 1}, "results.json was written by another version of this program; evaluate the run again"),
+        ({"format": 2}, "results.json was written by another version of this program; evaluate the run again"),
         ({"format": True}, "results.json was written by another version"),
     ],
 )
@@ -133,9 +135,9 @@ def test_damaged_and_missing_results_are_named(tmp_path: Path) -> None:
         file.write("0,00000,99.0,0.0\n")
     with pytest.raises(UserError, match=r"frames\.csv is not the file that results\.json was written with"):
         compare_runs([a, b])
-    (b / "eval" / "results.json").write_text('{"format": 2}')
+    (b / "eval" / "results.json").write_text('{"format": 3}')
     with pytest.raises(
-        UserError, match=r"results\.json is damaged \(data_hash, head_fingerprint, image_size, protocols"
+        UserError, match=r"results\.json is damaged \(data_hash, head_fingerprint, image_size, perceptual, "
     ):
         compare_runs([a, b])
     results = json.loads((a / "eval" / "results.json").read_text())
@@ -165,31 +167,34 @@ def test_tables(tmp_path: Path) -> None:
         tmp_path / "b|2", {"psnr": np.full(40, 31.5), "ssim_head": np.full(40, 0.9), "jitter": np.full(40, 1.5)}
     )
     comparison = compare_runs([a, b])
-    caption = "strict: 40 frames, differences to {} with 95% intervals (blocks of 10 frames)"
+    caption = "strict (tracked): 40 frames, differences to {} with 95% intervals (blocks of 10 frames)"
     legend = "*: the interval leaves out 0. Higher is better for PSNR and SSIM, lower for LPIPS and jitter."
     lines = text(comparison).splitlines()
     assert [line.split("   ")[0] for line in lines[2:5]] == ["PSNR, dB", "SSIM head", "jitter, levels"]
     assert len({line.index(mean) + 5 for line, mean in zip(lines[2:5], ("30.00", ".9000", " 2.00"), strict=True)}) == 1
     assert [" ".join(line.split()) for line in lines] == [
         caption.format("a_1"),
-        "a_1 b|2",
+        "tracked a_1 b|2",
         "PSNR, dB 30.00 31.50 +1.50 [+1.50, +1.50]*",
         "SSIM head 0.9000 0.9000 +0.0000 [+0.0000, +0.0000]",
         "jitter, levels 2.00 1.50 -0.50 [-0.50, -0.50]*",
         "",
         legend,
+        "tracked: as insta left it; trackers fit each frame to its own picture, held out or not",
+        "Perceptual term in training: dssim",
     ]
     assert markdown(comparison).splitlines()[2:5] == [
-        "| | a_1 | b\\|2 |",
+        "| tracked | a_1 | b\\|2 |",
         "|---|---|---|",
         "| PSNR, dB | 30.00 | 31.50 +1.50 [+1.50, +1.50]\\* |",
     ]
     lines = latex(comparison).splitlines()
-    assert "\\begin{tabular}{lrr}" in lines and " & a\\_1 & b|2 \\\\" in lines
+    assert "\\begin{tabular}{lrr}" in lines and "tracked & a\\_1 & b|2 \\\\" in lines
     assert "PSNR, dB $\\uparrow$ & $30.00$ & $31.50$ ($+1.50$ $[+1.50, +1.50]$)* \\\\" in lines
     assert "jitter, levels $\\downarrow$ & $2.00$ & $1.50$ ($-0.50$ $[-0.50, -0.50]$)* \\\\" in lines
     rows = list(csv.DictReader(io.StringIO(as_csv(comparison))))
-    assert list(rows[1].values()) == ["strict", "psnr", "b|2", "40", "31.500000", "1.500000", "1.500000", "1.500000"]
+    line = ["strict", "tracked", "psnr", "b|2", "40", "31.500000", "1.500000", "1.500000", "1.500000", "dssim", ""]
+    assert list(rows[1].values()) == line
     assert rows[0]["difference"] == "" and len(rows) == 6
     write_tables(tmp_path / "out", comparison)
     assert (tmp_path / "out" / "compare.md").read_text() == markdown(comparison)

@@ -135,7 +135,7 @@ def test_lpips_of_another_network_is_labelled(tmp_path: Path, subject: Subject) 
     results = json.loads(evaluate(run, ["hypergaussians"], write_frames=True, say=lambda _: None).read_text())
     entry = results["protocols"]["hypergaussians"]
     assert entry["lpips"]["network"] == "squeeze" and entry["lpips"]["weights_sha256"] == lpips.fingerprint()
-    assert entry["lpips"]["note"].startswith("squeeze, not to be compared with figures of vgg: no LPIPS weights for")
+    assert entry["lpips"]["note"].startswith("squeeze, not to be compared with figures of vgg (no weights")
     figures = []
     for index in TEST:
         kinds = ("renders", "gt", "masks")

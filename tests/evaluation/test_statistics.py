@@ -169,11 +169,10 @@ def result(index: int, psnr: float) -> Any:
     return FrameResult(index, f"{index:05d}", {"psnr": psnr}, Conditions(0.0, 0.0))
 
 
-def test_worst_frames_are_apart_from_each_other() -> None:
+def test_worst_frames_are_the_worst_ones_neighbours_or_not() -> None:
     results = [result(i, psnr) for i, psnr in enumerate([5.0, 1.0, 1.5, 9.0, math.inf, 2.0, 3.0])]
-    assert [worst.index for worst in worst_frames(results, apart=3)] == [1, 5]
-    assert [worst.index for worst in worst_frames(results, apart=1)] == [1, 2, 5, 6, 0, 3]
-    assert len(worst_frames([result(i, float(i)) for i in range(30)], apart=2)) == 8
+    assert [worst.index for worst in worst_frames(results)] == [1, 2, 5, 6, 0, 3]
+    assert [worst.index for worst in worst_frames([result(i, float(i)) for i in range(30)])] == [*range(8)]
 
 
 def test_curves_do_not_cross_gaps() -> None:

@@ -87,7 +87,7 @@ BAD = {
         "jaw has 4 values a frame; 3 (rotation vectors) or 6",
     ),
     "no rotation": ({"expression": FINE, "jaw": np.zeros((2, 6))}, "jaw of frame 0 is not a rotation"),
-    "no time": ({"expression": FINE, "fps": 0.0}, "fps is 0; it must be above 0"),
+    "no time": ({"expression": FINE, "fps": 0.0}, "fps is 0, frames a second; it must lie between 1"),
     "other head": ({"expression": FINE, "head": "f00d"}, "was made for another head model"),
     "half a camera": ({"expression": FINE, "R": CAMERA["R"]}, "has a camera without t, K, size"),
     "mirror": ({"expression": FINE, **CAMERA, "R": -CAMERA["R"]}, "R of frame 0 is not a rotation"),
@@ -156,8 +156,8 @@ def test_a_bad_csv_gets_one_sentence(mistake: str, tmp_path: Path) -> None:
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "bad.csv").write_bytes(b"\xff\xfe\x00\x81" * 40)
-    with pytest.raises(UserError, match="bad.csv is not UTF-8 text"):
+    (tmp_path / "bad.csv").write_bytes(b"\x80\xfe\x00\x81" * 40)
+    with pytest.raises(UserError, match="cannot be read as CSV"):
         read(tmp_path / "bad.csv")
 
 

@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words_of(folder: Path, out: Path) -> list[str]:
     head = ["--head", str(folder / "head_model"), "--frame-offset", "1", "--out", str(out)]
-    return [str(folder), *head, *SMALL, "data.size=32"]
+    return [str(folder), *head, *SMALL, "data.size=32", "trainer.perceptual=dssim"]
 
 
 def test_the_mean_moves_and_the_deviation_stays(tmp_path: Path) -> None:

@@ -57,7 +57,8 @@ def test_a_table_holds_what_was_measured_and_is_not_made_twice(tmp_path: Path) -
     write_tracked_folder(tmp_path / "someone", frames=12, size=32)
     out = tmp_path / "out"
     words = ["table1", str(tmp_path / "someone"), "--head", str(tmp_path / "someone" / "head_model"), "--out", str(out)]
-    words += [*SMALL, "data.size=32", "--frame-offset", "1", "--side-by-side", "--systems", "NDGS n=8"]
+    words += [*SMALL, "data.size=32", "trainer.perceptual=dssim"]
+    words += ["--frame-offset", "1", "--side-by-side", "--systems", "NDGS n=8"]
     assert table.main(words) == 0
     (job,) = (path for path in (out / "jobs").iterdir() if "NDGS" in path.name)
     means = json.loads((job / "run" / "eval" / "results.json").read_text())["protocols"]["hypergaussians"]["means"]

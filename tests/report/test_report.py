@@ -86,9 +86,9 @@ def test_uncertainty_of_a_detailed_avatar_has_the_finer_raster(tracked_folder: P
 
 def test_protocols_without_a_figure_have_a_dash() -> None:
     protocols = {"a": {"means": {"psnr": 30.126, "lpips": None}, "frames": [1, 2]}, "b": {"means": {"ssim_head": 0.91}}}
-    table = means_table(protocols)
-    assert "<td>30.13</td><td>-</td><td>-</td>" in table and "<td>-</td><td>-</td><td>0.9100</td>" in table
-    assert "<th>ssim head</th>" in table
+    table = means_table({name: {**entry, "driven_by": "tracked"} for name, entry in protocols.items()})
+    assert "<td>30.13</td><td>-</td>" in table and "<td>-</td><td>0.9100</td>" in table
+    assert "<th>ssim head</th>" in table and "lpips" not in table, "nobody measured it"
 
 
 def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
@@ -98,7 +98,14 @@ def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
         {"from": 10.0, "to": None, "frames": 1, "means": {"psnr": 27.5}},
     ]
     by_yaw, by_distance = bins_tables(
-        {"a": {"means": {"psnr": 28.0, "lpips": None}, "by_yaw": bins, "by_expression_distance": bins[:1]}}
+        {
+            "a": {
+                "driven_by": "tracked",
+                "means": {"psnr": 28.0, "lpips": None},
+                "by_yaw": bins,
+                "by_expression_distance": bins[:1],
+            }
+        }
     )
     rows = re.findall(r"<tr>(.*?)</tr>", by_yaw)
     assert [re.sub("<[^>]*>", "|", row).split("||") for row in rows] == [
@@ -119,7 +126,7 @@ def test_a_run_that_was_not_evaluated_says_so(run: Path, tmp_path: Path) -> None
     assert "Not measured yet: avatar eval" in (copy / "report.html").read_text(encoding="utf-8")
     (copy / "eval").mkdir()
     (copy / "eval" / "results.json").write_text("[]")
-    with pytest.raises(UserError, match="is not a results file of this program; run avatar eval again"):
+    with pytest.raises(UserError, match="is not a results file of this version"):
         read_results(copy / "eval" / "results.json")
 
 

@@ -128,8 +128,10 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
         "true",
         "true, video's pictures",
         "automatic",
-        "automatic, refined",
-        "refined twice",
+        "refined once, as tracked",
+        "refined once, fitted",
+        "refined twice, as tracked",
+        "refined twice, fitted",
     }
     assert f"{subject['avatars']['automatic']['psnr']:.2f}" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bench_track.json", "bench_track.md"]

@@ -1,0 +1,59 @@
+"""Tables of a sweep over subjects of which some were refined, on results that are written here."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avatar.evaluation.compare_tables import FORMATS
+from avatar.sweep.results import fold_results
+from avatar.sweep.spec import Job, Resources, Spec
+
+PLAIN, REFINED = "plain", "refined"
+
+
+def write_job(folder: Path, subject: str, variant: str, psnr: float, perceptual: str = "dssim", seen: int = 0) -> Job:
+    job = Job(f"{subject}-{variant}", subject, variant, 0, {"folder": subject}, (), ("strict",))
+    entry: dict[str, Any] = {"driven_by": "tracked", "means": {"psnr": psnr}}
+    tracking: dict[str, Any] = {"tracker": "insta", "rounds": []}
+    if subject == REFINED:
+        entry = {"driven_by": "refined", "means": {"psnr": psnr + 2}, "tracked": {"means": {"psnr": psnr}}}
+        tracking |= {"refined": "fitted to its own picture", "rounds": [{"measured_frames_trained_on": seen}]}
+    results = {"format": 3, "data_hash": "a", "head_fingerprint": "b", "image_size": [64, 64]}
+    results |= {"perceptual": perceptual, "tracking": tracking, "protocols": {"strict": entry}}
+    path = folder / "jobs" / job.name / "run" / "eval" / "results.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(results))
+    return job
+
+
+def test_fitted_figures_are_a_table_of_their_own_below_the_others(tmp_path: Path) -> None:
+    jobs = [
+        write_job(tmp_path, subject, variant, p)
+        for subject in (PLAIN, REFINED)
+        for variant, p in (("a", 20), ("b", 21))
+    ]
+    comparison = fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
+    tracked, refined = comparison.protocols
+    assert (tracked.drive, tracked.count, refined.drive, refined.count) == ("tracked", 2, "refined", 1)
+    assert [cell.mean for cell in tracked.rows["psnr"]] == [20, 21], "nothing fitted is mixed in"
+    assert [cell.mean for cell in refined.rows["psnr"]] == pytest.approx([22, 23])
+    assert comparison.marked == [False, False] and comparison.perceptual == ["dssim", "dssim"]
+    for name in ("text", "markdown", "latex"):
+        shown = FORMATS[name][1](comparison)
+        assert shown.index("strict (tracked)") < shown.index("strict (refined, fitted)")
+        assert "no figures of unseen frames" in shown and "(!)" not in shown
+
+
+def test_a_variant_with_a_job_that_saw_measured_frames_is_marked_and_mixed_terms_are_said(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, PLAIN, "a", 20), write_job(tmp_path, REFINED, "a", 20, "lpips-vgg")]
+    jobs += [write_job(tmp_path, PLAIN, "b", 21), write_job(tmp_path, REFINED, "b", 21, seen=3)]
+    comparison = fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
+    assert comparison.marked == [False, True] and comparison.perceptual == ["dssim and lpips-vgg", "dssim"]
+    for name in ("text", "markdown", "latex"):
+        shown = FORMATS[name][1](comparison)
+        assert "b (!)" in shown and "a (!)" not in shown and "(!): " in shown
+        assert "a dssim and lpips-vgg, b dssim" in shown
