@@ -12,8 +12,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, decode_mask, decode_transparency, has_transparency, read_bytes
+from avatar.data.images import (
+    IMAGE_SUFFIXES,
+    decode_image,
+    decode_mask,
+    decode_transparency,
+    has_transparency,
+    read_bytes,
+)
 from avatar.errors import UserError, refuse
+
+# Kinds of file, by the names that a person knows them by.
+IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
+PARSING, TRACKING = "face parsing", "checkpoint"
 
 
 class KindNames(NamedTuple):
@@ -44,6 +55,7 @@ class FrameFiles:
     decode_parsing: Callable[[bytes, Path], np.ndarray] = decode_mask  # to the classes of `face_parsing`
     listings: tuple[Path, ...] = ()  # files that say which image and which tracking belong together
     names: KindNames = _NUMBERED_NAMES
+    labels: Mapping[str, int] = field(default_factory=dict)  # kinds of label images, and the value that stands for 255
 
     @cached_property
     def is_transparent(self) -> bool:
@@ -52,25 +64,45 @@ class FrameFiles:
 
     def decode_alpha(self, data: bytes, path: Path) -> np.ndarray:
         """A file of `alphas` as its matte, uint8 [H, W]. Raises UserError naming the file."""
-        return decode_transparency(data, path) if self.is_transparent else decode_mask(data, path)
+        if self.is_transparent:
+            return decode_transparency(data, path)
+        return decode_mask(data, path, self.labels.get(ALPHA))
+
+    def decode_head(self, data: bytes, path: Path) -> np.ndarray:
+        """The same for a file of `head_masks`."""
+        return decode_mask(data, path, self.labels.get(HEAD))
+
+    def decode_mouth(self, data: bytes, path: Path) -> np.ndarray:
+        """The same for a file of `mouth_masks`."""
+        return decode_mask(data, path, self.labels.get(MOUTH))
+
+    def decoders(self) -> dict[str, Callable[[bytes, Path], np.ndarray]]:
+        """How the files of each kind of `of_kind` are decoded, but for the tracking."""
+        return {
+            IMAGE: decode_image,
+            ALPHA: self.decode_alpha,
+            HEAD: self.decode_head,
+            MOUTH: self.decode_mouth,
+            PARSING: self.decode_parsing,
+        }
 
     def of_kind(self) -> dict[str, dict[int, Path]]:
         """By the name that a person knows each kind by."""
         return {
-            "imgs": self.images,
-            "alpha": self.alphas,
-            "parsing *_neckhead": self.head_masks,
-            "parsing *_mouth": self.mouth_masks,
-            "checkpoint": self.tracking,
-        } | ({"face parsing": self.parsing} if self.parsing else {})
+            IMAGE: self.images,
+            ALPHA: self.alphas,
+            HEAD: self.head_masks,
+            MOUTH: self.mouth_masks,
+            TRACKING: self.tracking,
+        } | ({PARSING: self.parsing} if self.parsing else {})
 
     def title(self, kind: str) -> str:
         """What the layout itself calls a kind of `of_kind`."""
         own = {
-            "imgs": self.names.images,
-            "alpha": self.names.alphas,
-            "checkpoint": self.names.tracking,
-            "face parsing": self.names.head_masks,
+            IMAGE: self.names.images,
+            ALPHA: self.names.alphas,
+            TRACKING: self.names.tracking,
+            PARSING: self.names.head_masks,
         }
         return own.get(kind, kind).rstrip("/")
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from data_prep.check.clip import Clip
-from data_prep.check.findings import Finding
+from data_prep.check.findings import Finding, from_sentence
+from data_prep.mask_polarity import polarity_problems
 from data_prep.misfit import ADVICE
 
 # Of the size of the projected head. On clips whose tracking error is known (0.15 degrees, 0.4 mm, 2%) lips are off by less
@@ -18,6 +19,18 @@ IGNORED = "nothing, if you are sure: --ignore-misfit lets training start; compar
 
 
 def check_fit(clip: Clip) -> list[Finding]:
+    return _polarity(clip) or _residuals(clip)  # no mesh lies on inverted masks
+
+
+def _polarity(clip: Clip) -> list[Finding]:
+    if clip.head is None:
+        return []
+    unread = [number for number in clip.files.images if not clip.is_whole(number)]
+    problems = polarity_problems(clip.head, clip.tracking.frames, clip.files, clip.max_left_out, unread)
+    return [from_sentence("inverted-mask", problem) for problem in problems]
+
+
+def _residuals(clip: Clip) -> list[Finding]:
     if not clip.fits or clip.judgement is None:
         return []
     if clip.judgement.problem is not None:

@@ -21,7 +21,7 @@ from data_prep.check.check_tracking import behind_camera, check_behind_camera, c
 from data_prep.check.clip import Clip, Progress, read_clip, silent
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
-from data_prep.check.view import HEAD, TRACKING
+from data_prep.frame_files import ALPHA, HEAD, TRACKING
 from data_prep.pairing import describe_reasons
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
@@ -126,6 +126,8 @@ def left_out(clip: Clip) -> dict[int, str]:
             reasons[image] = f"it has no file in {', '.join(absent)}"
         elif view.brightest.get(HEAD) == 0:
             reasons[image] = "its head mask is empty"
+        elif view.brightest.get(ALPHA) == 0:
+            reasons[image] = "its matte is empty"
         elif image in behind:
             reasons[image] = "the tracked head is behind the camera"
         elif image in repeated:
