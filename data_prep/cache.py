@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from avatar.data.manifest import MANIFEST_VERSION
+from avatar.files.names import safe_name
 from data_prep.frame_files import FrameFiles
 
 
@@ -20,7 +21,7 @@ def cache_folder() -> Path:
 def default_location(files: FrameFiles, options: dict[str, object]) -> Path:
     tracking = next(iter(files.tracking.values())).parent
     key = hashlib.sha256(json.dumps([str(files.folder), str(tracking), options]).encode()).hexdigest()[:12]
-    return cache_folder() / "subjects" / f"{files.folder.name}-{key}"
+    return cache_folder() / "subjects" / f"{safe_name(files.folder.name)}-{key}"
 
 
 def input_hash(files: FrameFiles, options: dict[str, object]) -> str:

@@ -14,6 +14,7 @@ from avatar.data.manifest import GIVEN, MASKS, FrameRecord, Manifest
 from avatar.data.source import DEFAULT_FPS, MAX_FPS, Source
 from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError, refuse
+from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.cache import default_location, input_hash
@@ -67,7 +68,7 @@ def prepare(
     }
     inputs = input_hash(files, options)
     target = Path(out).resolve() if out is not None else default_location(files, options)
-    if is_current(target, inputs, is_chosen=out is not None):
+    if is_current(target, inputs, is_chosen=out is not None, say=say):
         say(f"using the prepared subject {target}")
         return target
 
@@ -128,7 +129,7 @@ def prepare(
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
     mouth_kind = "source" if files.mouth_masks else "derived" if files.parsing or has_lips else "none"
     manifest = Manifest(
-        name=folder.name,
+        name=safe_name(folder.name),
         format=tracked.format,
         source=str(folder),
         tracking=str(next(iter(files.tracking.values())).parent),

@@ -27,6 +27,7 @@ from avatar.data.recording import Recording
 from avatar.data.refinement import Refinement
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.names import safe_name
 from data_prep import avatar_track
 from data_prep.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
 from data_prep.tracked_folder import TrackedFolder
@@ -93,7 +94,7 @@ def write_folder(
     check_target(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        building = Path(tempfile.mkdtemp(prefix=f".{safe_name(target.name)}-", dir=target.parent))
     except OSError as error:
         raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another --out") from None
     try:

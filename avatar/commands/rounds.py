@@ -22,6 +22,7 @@ from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.lock import locked
+from avatar.files.names import safe_name
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.run import RUN_FILE, refuse_trained
 
@@ -103,7 +104,7 @@ def moved_source(run: Path, source: Source, arguments: Namespace) -> Source:
 
 def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
     """Train, refine, and so on, and at last train the run itself; what is done already is not done again."""
-    name = plan.source.folder.resolve().name
+    name = safe_name(plan.source.folder.resolve().name)
     for number in range(1, plan.rounds + 1):
         stage = run / ROUNDS_FOLDER / str(number)
         if not (stage / name).is_dir():
@@ -129,7 +130,7 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
     if status != OK:
         return status, replace(plan, spent=trained - begin)
     run = open_run(stage / "run", source.head, source.folder)
-    status = refine_run(run, stage / plan.source.folder.resolve().name)
+    status = refine_run(run, stage / safe_name(plan.source.folder.resolve().name))
     refined = time.monotonic()
     plan = replace(plan, spent=refined - begin)
     if status == OK and at_once and plan.minutes is not None:

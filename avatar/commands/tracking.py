@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from argparse import Namespace
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -12,10 +13,12 @@ from tqdm import tqdm
 from avatar.commands import OK
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
+from avatar.files.names import safe_name
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
-from data_prep.avatar_track import read_info, recognise
+from data_prep.avatar_track import recognise
 from data_prep.cache import cache_folder
+from data_prep.contents import find_damage, write_contents
 from data_prep.open import HEAD_VARIABLE
 from data_prep.track.crop import parse_crop
 from data_prep.track.faces.detect import load_mediapipe
@@ -62,14 +65,18 @@ def is_video(path: Path) -> bool:
 
 
 def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> Path:
-    """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing."""
+    """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing or
+    damaged."""
     assets = assets or load_head_assets(head)
     key = hash_of([STAGES_VERSION, open_footage(video).content_hash(), assets.fingerprint])[:12]
-    folder = cache_folder() / "tracked" / f"{video.resolve().stem}-{key}"
-    if recognise(folder) and read_info(folder).head_fingerprint == assets.fingerprint:
-        print(f"using the tracking {folder}")
-        return folder
-    track(video, folder, head, assets, progress=bar)
+    folder = cache_folder() / "tracked" / f"{safe_name(video.resolve().stem)}-{key}"
+    if folder.is_dir():
+        if (damage := find_damage(folder)) is None:
+            print(f"using the tracking {folder}")
+            return folder
+        print(f"the tracking {folder} is damaged: {damage}; it is made again")
+        shutil.rmtree(folder)
+    track(video, folder, head, assets, progress=bar, seal=write_contents)
     return folder
 
 

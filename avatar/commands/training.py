@@ -22,6 +22,7 @@ from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.lock import locked
+from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.runs.avatar_file import check_head
@@ -69,7 +70,7 @@ def asked_device(overrides: list[str]) -> str | None:
 def default_run(folder: Path | None) -> Path:
     if folder is None:
         raise UserError("say which run to go on with: avatar train --resume --out RUN")
-    return Path("runs") / (folder.resolve().stem if folder.is_file() else folder.resolve().name)
+    return Path("runs") / safe_name(folder.resolve().stem if folder.is_file() else folder.resolve().name)
 
 
 def train_new(source: Source, overrides: list[str], run: Path, device: str | None = None) -> int:

@@ -7,6 +7,7 @@ prepared folder. `MANIFEST_VERSION` grows with every change of meaning; other ve
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -198,7 +199,7 @@ def _relative_or_none(value: Any) -> str | None:
 def _relative(value: str) -> str:
     """Frame files must stay inside the folder that the manifest names."""
     escapes = any(p.is_absolute() or p.drive or ".." in p.parts for p in (PurePosixPath(value), PureWindowsPath(value)))
-    value.encode()  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
+    os.fsencode(value)  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
     if not value or escapes or "\0" in value:
         raise ValueError(f"the path {value!r} leaves the subject's folder")
     return value

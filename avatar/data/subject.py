@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load
 from torch import Tensor
 
 from avatar.data.images import read_image, read_mask, read_matte
@@ -185,7 +185,7 @@ class Subject:
 def _read_tracks(file: Path, manifest: Manifest) -> tuple[dict[str, Tensor], dict[str, Tensor] | None]:
     """The tracks, and what they were before their refinement."""
     try:
-        tracks = load_file(file)
+        tracks = load(file.read_bytes())  # its own reader takes no path that is not UTF-8
     except FileNotFoundError:
         raise UserError(f"{file} is missing; prepare the subject again") from None
     except (SafetensorError, OSError, ValueError) as error:

@@ -28,7 +28,7 @@ def write_page(check: Check, cost: Mapping[str, str] | None, out: Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
         page = out / PAGE
-        page.write_text(render_page(check, cost), encoding="utf-8")
+        page.write_text(render_page(check, cost), encoding="utf-8", errors="replace")  # names may be none of UTF-8
         if check.clip is not None:
             write_frames(check.clip, out / TABLE)
     except OSError as error:
@@ -61,7 +61,7 @@ def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
 
 def write_frames(clip: Clip, path: Path) -> None:
     """One line per image: what was measured of it; empty where it could not be."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="replace") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("image", "change", "covered", "haze", "holes", "specks", *_FIT_COLUMNS))
         for number, view in clip.views.items():

@@ -56,12 +56,14 @@ def track(
     choices: Choices | None = None,
     say: Callable[[str], object] = print,
     progress: Progress = silent,
+    seal: Callable[[Path], object] = lambda _: None,
 ) -> TrackingInfo:
     """Track one person's face through `video` (a file or a folder of pictures) and write the tracked folder `out`.
 
     The folder appears under its name when it is complete; until then its stages lie beside it, and the same call goes on
     from them. Nothing is done where `out` holds just this already. Raises UserError, with what to do, where the video or
-    the choices are of no use, and where `out` is something else.
+    the choices are of no use, and where `out` is something else. `seal` is called with the complete folder before it gets
+    its name.
     """
     choices = choices or Choices()
     footage = open_footage(video)
@@ -117,9 +119,9 @@ def track(
         )
         write_tracking(stages.folder, info, fit.tracks)
         if spill:
-            stages.finish(out, ("look", "fit"), better={DESPILLED: FRAMES})
+            stages.finish(out, ("look", "fit"), {DESPILLED: FRAMES}, seal)
         else:
-            stages.finish(out, ("look", "fit", DESPILLED))
+            stages.finish(out, ("look", "fit", DESPILLED), seal=seal)
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
 
