@@ -66,7 +66,8 @@ def prepare(
         "ignore_misfit": source.ignore_misfit,
         "head": head.fingerprint,
     }
-    inputs = input_hash(files, options)
+    head_path = str(Path(source.head).resolve())
+    inputs = input_hash(files, options | {"head_path": head_path})
     target = Path(out).resolve() if out is not None else default_location(files, options)
     if is_current(target, inputs, is_chosen=out is not None, say=say):
         say(f"using the prepared subject {target}")
@@ -146,7 +147,7 @@ def prepare(
         notes=tuple(notes),
         head_masks=head_kind,
         mouth_masks=mouth_kind,
-        head_path=str(Path(source.head).resolve()),
+        head_path=head_path,
         head_fingerprint=head.fingerprint,
         input_hash=inputs,
         data_hash=_data_hash(inspection, pairing, arrays, first.intrinsics),

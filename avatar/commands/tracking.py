@@ -24,9 +24,9 @@ from data_prep.track.crop import parse_crop
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.footage.source import Span
+from data_prep.track.inputs import tracking_key
 from data_prep.track.progress import Item
-from data_prep.track.stages import hash_of
-from data_prep.track.track import STAGES_VERSION, Choices, track
+from data_prep.track.track import Choices, track
 
 
 def run_track(arguments: Namespace) -> int:
@@ -68,7 +68,7 @@ def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> P
     """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing or
     damaged."""
     assets = assets or load_head_assets(head)
-    key = hash_of([STAGES_VERSION, open_footage(video).content_hash(), assets.fingerprint])[:12]
+    key = tracking_key(open_footage(video), Choices().to_json(), head, assets)[:12]
     folder = cache_folder() / "tracked" / f"{safe_name(video.resolve().stem)}-{key}"
     if folder.is_dir():
         if (damage := find_damage(folder)) is None:

@@ -54,6 +54,15 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     assert sorted(p.name for p in (tmp_path / "cache" / "subjects").iterdir()) == sorted([first.name, other.name])
 
 
+def test_prepared_again_when_the_head_model_has_moved(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=6)
+    head = load_head_assets(folder / "head_model")
+    shutil.copytree(folder / "head_model", tmp_path / "moved")
+    for place in (folder / "head_model", tmp_path / "moved"):
+        prepare(Source(folder, place, frame_offset=1), head, out=tmp_path / "out", say=lambda _: None)
+        assert read_manifest(tmp_path / "out").head_path == str(place)
+
+
 def test_a_failed_preparation_keeps_the_old_one(tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "subject", frames=12)
     subject, _ = prepare_folder(folder, tmp_path / "out")

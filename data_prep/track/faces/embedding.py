@@ -42,12 +42,17 @@ class LandmarkEmbedding:
         )
 
 
+def official_file(head: Path) -> Path:
+    """Where the embedding of a head model (file or folder) would lie."""
+    return find_model_file(head).parent / OFFICIAL_FILE
+
+
 def official_embedding(head: Path, assets: HeadAssets) -> LandmarkEmbedding | None:
     """The embedding that lies beside a head model (file or folder); None where there is none.
 
     Its 105 points are contours of eyes, brows, nose and lips. Raises UserError for a file that does not fit the model.
     """
-    path = find_model_file(head).parent / OFFICIAL_FILE
+    path = official_file(head)
     if not path.is_file():
         return None
     arrays = load_npz(path)
