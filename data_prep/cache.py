@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from avatar.data.manifest import MANIFEST_VERSION
@@ -24,8 +25,8 @@ def default_location(files: FrameFiles, options: dict[str, object]) -> Path:
     return cache_folder() / "subjects" / f"{safe_name(files.folder.name)}-{key}"
 
 
-def input_hash(files: FrameFiles, options: dict[str, object]) -> str:
-    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), options]).encode())
+def input_hash(files: FrameFiles, options: Mapping[str, object]) -> str:
+    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), dict(options)]).encode())
     for kind, found in files.of_kind().items():
         for number, path in found.items():
             digest.update(f"{kind} {number} {path} {_stamp(path)}\n".encode(errors="surrogateescape"))

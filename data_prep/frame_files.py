@@ -14,6 +14,7 @@ import numpy as np
 
 from avatar.data.images import (
     IMAGE_SUFFIXES,
+    OTHER_PICTURES,
     decode_image,
     decode_mask,
     decode_transparency,
@@ -128,7 +129,7 @@ def find_frame_files(
     if not folder.is_dir():
         raise UserError(f"the folder {folder} does not exist")
     images = _numbered(folder / "imgs", IMAGE_SUFFIXES, complain)
-    if not images:
+    if not images and not _others(folder / "imgs"):
         complain(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
     return FrameFiles(
         folder=folder,
@@ -197,7 +198,19 @@ def _numbered(
                 complain(f"{found[number]} and {entry.path} are both frame {number}; remove one of them")
                 continue
             found[number] = Path(entry.path)
+    if not found and suffixes == IMAGE_SUFFIXES and (others := _others(folder, tag)):
+        complain(
+            f"{folder} holds {len(others)} {others[0].suffix} files, and pictures are read as {', '.join(IMAGE_SUFFIXES)}; "
+            f"convert them to PNG under the same numbers (ffmpeg -i {others[0].name} {others[0].stem}.png)"
+        )
     return dict(sorted(found.items()))
+
+
+def _others(folder: Path, tag: str = "") -> list[Path]:
+    """Pictures of formats that are not read."""
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in OTHER_PICTURES and p.stem.lower().endswith(tag))
 
 
 def describe_numbers(numbers: list[int], limit: int = 12, name: Callable[[int], str] = "{:05d}".format) -> str:

@@ -10,7 +10,7 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets, load_head_assets
+from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep import avatar_track
 from data_prep.prepare import prepare
 
@@ -63,6 +63,6 @@ def open_subject(
     check_folder(source.folder)
     if assets is None:
         assets = load_head_assets(source.head)
-        if assets.layout_is_made:
-            say(LAYOUT_IS_MADE)
+        for note in assets.notes:
+            say(f"note: {note}")
     return Subject.open(prepare(source, assets, split=sizes, say=say)), assets

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
 from pathlib import Path
 
 
@@ -62,3 +64,9 @@ def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
         metavar="auto|cpu|cuda[:N]",
         help=f"what computes; auto takes a GPU that passes its test (default: {default})",
     )
+
+
+def is_override(word: str) -> bool:
+    """Whether a word is key=value, and not a path: of something that is there, or with a folder before the `=`."""
+    is_key = re.fullmatch(r"[A-Za-z_][\w.]*", word.partition("=")[0]) is not None
+    return "=" in word and is_key and not os.path.exists(word)  # noqa: PTH110 (Path.exists raises for long names)

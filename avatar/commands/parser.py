@@ -17,6 +17,7 @@ from avatar.commands.options import (
     add_run,
     add_source,
     add_tracking,
+    is_override,
 )
 
 
@@ -27,22 +28,22 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """
     parser = build_parser()
     arguments, rest = parser.parse_known_args(argv)
-    unknown = [word for word in rest if word.startswith("-") or "=" not in word]
+    unknown = [word for word in rest if word.startswith("-")]
     if arguments.command not in ("train", "bench"):
         unknown = rest
     if unknown:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if arguments.command == "train":
         words = [*arguments.words, *rest]
-        arguments.overrides = [word for word in words if "=" in word]
-        folders = [Path(word) for word in words if "=" not in word]
+        arguments.overrides = [word for word in words if is_override(word)]
+        folders = [Path(word) for word in words if not is_override(word)]
         if len(folders) > 1 or not (folders or arguments.resume):
             parser.error(f"train takes one FOLDER, {len(folders)} given")
         arguments.folder = arguments.folder or (folders[0] if folders else None)
     if arguments.command == "bench":
         words = [*arguments.inputs, *rest]
-        arguments.overrides = [word for word in words if "=" in word]
-        arguments.inputs = [Path(word) for word in words if "=" not in word]
+        arguments.overrides = [word for word in words if is_override(word)]
+        arguments.inputs = [Path(word) for word in words if not is_override(word)]
         check_bench(parser, arguments.part, len(arguments.inputs))
     return arguments
 

@@ -14,11 +14,16 @@ import numpy as np
 from avatar.errors import UserError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+OTHER_PICTURES = (".webp", ".bmp", ".tif", ".tiff", ".gif", ".heic", ".avif", ".jp2", ".ppm", ".exr", ".tga", ".jxl")
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 _PALETTE = 3  # the colour type of a PNG that holds indices into a palette
 MAX_PIXELS = 2**26  # 8192x8192; a decoder allocates what the header says before it looks how much there is
+_STARTS = {  # of pictures that are not read: where, what, the format
+    "WebP": (8, b"WEBP"), "BMP": (0, b"BM"), "TIFF": (0, b"II*\0"), "big-endian TIFF": (0, b"MM\0*"), "GIF": (0, b"GIF8"),
+    "HEIC": (4, b"ftyphei"), "AVIF": (4, b"ftypavi"),
+}  # fmt: skip
 _TAIL = 4096  # some writers pad after the end marker
 
 
@@ -131,6 +136,9 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     elif data.startswith(_PNG_START):
         complete = _PNG_END in data[-_TAIL:]
     else:
+        known = (name for name, (at, start) in _STARTS.items() if data[at : at + len(start)] == start)
+        if (name := next(known, None)) is not None:
+            raise UserError(f"{path} is a {name} picture, and JPEG and PNG are read; convert it to PNG")
         raise UserError(f"{path} is neither a JPEG nor a PNG file, whatever its name says")
     if not complete:
         raise UserError(f"{path} is cut short; write or copy it again")

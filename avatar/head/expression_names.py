@@ -78,7 +78,7 @@ def load_expression_names(folder: Path, num_expressions: int) -> ExpressionNames
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise UserError(f"{path} is larger than {_MAX_BYTES} bytes; such files are not read")
-        raw = json.loads(path.read_text(encoding="utf-8"))
+        raw = json.loads(path.read_bytes())  # of bytes, it tells UTF-8 from UTF-16, with and without a BOM
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read as JSON ({error})") from None
     return parse_expression_names(raw, num_expressions, path)

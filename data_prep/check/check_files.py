@@ -36,6 +36,7 @@ def _unreadable(clip: Clip) -> list[Finding]:
         if not reasons:
             continue
         shown = [reason.partition("; ")[0] for reason in list(reasons.values())[:_SHOWN]]
+        advice = next(iter(reasons.values())).partition("; ")[2] or "write or copy it again"
         rest = f" and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
         findings.append(
             Finding(
@@ -43,7 +44,7 @@ def _unreadable(clip: Clip) -> list[Finding]:
                 "unreadable",
                 f"{len(reasons)} of {len(clip.views)} files of {clip.files.title(kind)} cannot be read: "
                 f"{', '.join(shown)}{rest}",
-                "write or copy them again; frames without them are left out of training",
+                f"{advice}; frames without them are left out of training",
                 clip.names(reasons),
             )
         )

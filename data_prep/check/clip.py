@@ -30,7 +30,7 @@ from data_prep.tracked_folder import TrackedFolder
 from data_prep.tracking import FrameTrack, Tracking, fit_coefficients
 
 MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
-GIVEN = "given with --frame-offset"
+GIVEN, NOT_SOUGHT = "given with --frame-offset", "not looked for: images, tracking or head model are missing"
 T = TypeVar("T")
 
 
@@ -150,7 +150,7 @@ def read_clip(
             head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
         except UserError as error:
             complaints.append(("head-model", str(error)))
-    offset, evidence = frame_offset, GIVEN
+    offset, evidence = frame_offset, NOT_SOUGHT if frame_offset is None else GIVEN
     if source.is_paired:
         offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
     clip = Clip(

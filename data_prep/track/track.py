@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets
+from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import (
     FRAMES,
     LANDMARKS_FILE,
@@ -69,8 +69,8 @@ def track(
     say(f"{video}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
     for note in footage.notes:
         say(f"note: {note}")
-    if head.layout_is_made:
-        say(LAYOUT_IS_MADE)
+    for note in head.notes:
+        say(f"note: {note}")
     mattes = None if choices.matte is None else open_footage(choices.matte)
     network, options, seen = matte_network(), choices.to_json(), look_inputs(footage)
     key = tracking_key(footage, options, head_path, head)

@@ -14,7 +14,8 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.pickles import load_npz
-from avatar.head.assets import HeadAssets, find_model_file
+from avatar.head.assets import HeadAssets
+from avatar.head.find import find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces.landmark_groups import LEFT_IRIS, NUM_MESH, RIGHT_IRIS
 
