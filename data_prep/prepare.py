@@ -28,6 +28,7 @@ from data_prep.masks import derive_masks
 from data_prep.misfit import judge_sample
 from data_prep.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from data_prep.projection import region_faces
+from data_prep.still_parts import still_parts
 from data_prep.tracked_folder import TrackedFolder, divide
 from data_prep.tracking import Tracking, fit_coefficients
 from data_prep.write_prepared import is_current, write_prepared
@@ -106,6 +107,8 @@ def prepare(
     has_lips = len(region_faces(model, "lips")) > 0
     frames_split, split_notes = divide(tracked.division, [number for _, number in pairing.pairs], split)
     ignored = [f"{judgement.problem}: taken regardless, as --ignore-misfit says"] if judgement.problem else []
+    parts = still_parts([tracks.frames[n] for _, n in pairing.pairs], head)
+    still = [part.sentence for part in parts if not part.is_absent]
     assumed = _assumptions(files, inspection, has_lips)
     notes = [
         *ignored,
@@ -113,7 +116,10 @@ def prepare(
         *label_notes,
         *inspection.notes,
         *tracks.notes,
+        *tracks.flaws,
         *pairing.notes,
+        *still,
+        *judgement.notes,
         *assumed,
         *split_notes,
     ]

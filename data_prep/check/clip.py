@@ -146,7 +146,7 @@ def read_clip(
     head = None
     if assets is not None and tracks.frames:
         try:
-            tracks = fit_coefficients(tracks, assets)
+            tracks = fit_coefficients(tracks, assets, lambda message: complaints.append(("identity", message)))
             head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
         except UserError as error:
             complaints.append(("head-model", str(error)))

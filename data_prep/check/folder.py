@@ -17,6 +17,7 @@ from data_prep.check.check_files import check_files, lost_frames
 from data_prep.check.check_fit import check_fit
 from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
+from data_prep.check.check_motion import check_motion
 from data_prep.check.check_tracking import behind_camera, check_behind_camera, check_tracking, repeated_tracking
 from data_prep.check.clip import Clip, Progress, read_clip, silent
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
@@ -91,7 +92,7 @@ def check_tracked_folder(
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     findings += [] if assets is None else check_head(assets)
-    findings += check_files(clip) + check_tracking(clip) + check_fit(clip)
+    findings += check_files(clip) + check_tracking(clip) + check_motion(clip) + check_fit(clip)
     findings += check_behind_camera(clip) + check_images(clip)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     lost = left_out(clip)
@@ -151,6 +152,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
         fov = np.degrees(2 * np.arctan(0.5 * first.size[0] / first.intrinsics[0]))
         found["field of view"] = f"{fov:.1f} degrees"
     if clip.fits:
+        found["head outside the picture, median"] = f"{np.median([fit.outside for fit in clip.fits.values()]):.1%}"
         for name, title in (
             ("overlap", "overlap of mesh and head mask (IoU), median"),
             ("overhang", "mesh sticks out of the head mask, median, pixels"),

@@ -47,6 +47,7 @@ class View:
     head_colour: np.ndarray | None = None  # float [3], mean over the head mask
     background_colour: np.ndarray | None = None  # float [3], mean over what the matte calls background
     matte: Matte | None = None
+    cut: float = 0.0  # share of the picture's upper edge that the head mask covers
 
 
 def look_at(paths: Mapping[str, Path], decoders: Mapping[str, Decode]) -> View:
@@ -100,6 +101,7 @@ def look_at(paths: Mapping[str, Path], decoders: Mapping[str, Decode]) -> View:
         head_colour=None if head is None else _mean_colour(image, head > _ON),
         background_colour=None if alpha is None else _mean_colour(image, alpha <= 2),
         matte=matte,
+        cut=0.0 if head is None else float((head[0] > _ON).mean()),
     )
 
 
