@@ -12,6 +12,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep import avatar_track
+from data_prep.not_subjects import check_folder
 from data_prep.prepare import prepare
 
 HEAD_VARIABLE = "AVATAR_HEAD"
@@ -41,13 +42,6 @@ def recorded_head(folder: Path) -> Path | None:
         return None
     path = Path(avatar_track.read_info(folder).head_path)
     return path if path.exists() else None
-
-
-def check_folder(folder: Path) -> None:
-    if folder.is_file():
-        raise UserError(f"{folder} is a file; if it is a video, avatar track makes a tracked folder of it")
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder; give the tracked video folder (docs/data.md)")
 
 
 def open_subject(

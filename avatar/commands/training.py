@@ -32,6 +32,7 @@ from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.order import within_passes
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
+from data_prep.not_subjects import check_folder
 from data_prep.open import open_subject
 
 
@@ -43,6 +44,8 @@ def run_train(arguments: Namespace) -> int:
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
     load_config(overrides)  # a mistake in it before one in the folder
+    if not is_video(arguments.folder):
+        check_folder(arguments.folder)
     check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
     return train_new(tracked_source(arguments), overrides, run, arguments.device)
 

@@ -23,6 +23,7 @@ from data_prep.check.clip import Clip, Progress, read_clip, silent
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
 from data_prep.frame_files import ALPHA, HEAD, TRACKING
+from data_prep.not_subjects import check_folder
 from data_prep.pairing import describe_reasons
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
@@ -73,6 +74,10 @@ def check_tracked_folder(
     """
     findings: list[Finding] = []
     assets = None
+    try:
+        check_folder(folder)
+    except UserError as error:
+        return Check(folder, (from_sentence("layout", str(error)),), None, None)
     try:
         assets = load_head()
     except UserError as error:
