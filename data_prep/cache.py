@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 from avatar.data.manifest import MANIFEST_VERSION
+from avatar.files.names import safe_name
 from avatar.files.places import cache_folder
 from data_prep.frame_files import FrameFiles
 
@@ -14,11 +16,11 @@ from data_prep.frame_files import FrameFiles
 def default_location(files: FrameFiles, options: dict[str, object]) -> Path:
     tracking = next(iter(files.tracking.values())).parent
     key = hashlib.sha256(json.dumps([str(files.folder), str(tracking), options]).encode()).hexdigest()[:12]
-    return cache_folder() / "subjects" / f"{files.folder.name}-{key}"
+    return cache_folder() / "subjects" / f"{safe_name(files.folder.name)}-{key}"
 
 
-def input_hash(files: FrameFiles, options: dict[str, object]) -> str:
-    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), options]).encode())
+def input_hash(files: FrameFiles, options: Mapping[str, object]) -> str:
+    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), dict(options)]).encode())
     for kind, found in files.of_kind().items():
         for number, path in found.items():
             digest.update(f"{kind} {number} {path} {_stamp(path)}\n".encode(errors="surrogateescape"))

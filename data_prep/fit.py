@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distanc
 _ON = 127
 _STICKING_SHARE = 0.05  # whose mean is the overhang: one stray triangle must not decide
 _NECK = ("neck", "boundary")
+_OF_THE_NECK = 0.01  # weight of the root joint, which holds the lower neck in FLAME and nothing above the chin
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Mesh:
     faces: np.ndarray  # [F, 3], the whole head
     skin_faces: np.ndarray  # [F', 3], without the neck, which may reach under a collar
     lip_faces: np.ndarray  # [F'', 3], empty where the head model has no lips
+    head_vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # [V'], without the neck
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Fit:
     mouth: float  # between the centres of projected lips and mouth mask
     mask_ratio: float  # area of the head mask / area of the mesh without neck
     size: float  # of the projected head without neck, square root of its area
+    outside: float = 0.0  # share of the vertices (without neck) that are not in the picture
 
 
 class MeshProjector:
@@ -50,10 +53,13 @@ class MeshProjector:
         self._faces = head.faces.numpy()
         self._skin = self._faces[~np.isin(self._faces, neck).any(axis=1)]
         self._lips = region_faces(head, "lips")
+        on_neck = head.assets.weights[:, 0].numpy() > _OF_THE_NECK
+        on_neck[neck] = True
+        self._vertices = np.flatnonzero(~on_neck)
 
     def __call__(self, track: FrameTrack, width: int, height: int) -> Mesh:
         screen = project_head(self._head, track, self._intrinsics, width, height)
-        return Mesh(screen, self._faces, self._skin, self._lips)
+        return Mesh(screen, self._faces, self._skin, self._lips, self._vertices)
 
 
 def measured_size(width: int, height: int) -> tuple[int, int]:
@@ -99,7 +105,15 @@ def measure_fit(
         lips = _iou(projected, mouth)
         if projected.any():
             distance = float(np.hypot(*(_centre(projected) - _centre(mouth)))) * scale
-    return Fit(overlap, inside, overhang, lips, distance, ratio, float(np.sqrt(area)) * scale if area else np.nan)
+    outside = share_outside(mesh.screen[mesh.head_vertices], width, height)
+    size_of_head = float(np.sqrt(area)) * scale if area else np.nan
+    return Fit(overlap, inside, overhang, lips, distance, ratio, size_of_head, outside)
+
+
+def share_outside(screen: np.ndarray, width: int, height: int) -> float:
+    """Of points [N, 3] in pixels, those that are not in the picture."""
+    x, y = screen[:, 0], screen[:, 1]
+    return float(1 - ((x >= 0) & (x < width) & (y >= 0) & (y < height)).mean()) if len(screen) else 0.0
 
 
 def _iou(a: np.ndarray, b: np.ndarray) -> float:

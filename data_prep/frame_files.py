@@ -12,8 +12,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, decode_mask, decode_transparency, has_transparency, read_bytes
+from avatar.data.images import (
+    IMAGE_SUFFIXES,
+    OTHER_PICTURES,
+    decode_image,
+    decode_mask,
+    decode_transparency,
+    has_transparency,
+    read_bytes,
+)
 from avatar.errors import UserError, refuse
+
+# Kinds of file, by the names that a person knows them by.
+IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
+PARSING, TRACKING = "face parsing", "checkpoint"
 
 
 class KindNames(NamedTuple):
@@ -44,6 +56,7 @@ class FrameFiles:
     decode_parsing: Callable[[bytes, Path], np.ndarray] = decode_mask  # to the classes of `face_parsing`
     listings: tuple[Path, ...] = ()  # files that say which image and which tracking belong together
     names: KindNames = _NUMBERED_NAMES
+    labels: Mapping[str, int] = field(default_factory=dict)  # kinds of label images, and the value that stands for 255
 
     @cached_property
     def is_transparent(self) -> bool:
@@ -52,25 +65,45 @@ class FrameFiles:
 
     def decode_alpha(self, data: bytes, path: Path) -> np.ndarray:
         """A file of `alphas` as its matte, uint8 [H, W]. Raises UserError naming the file."""
-        return decode_transparency(data, path) if self.is_transparent else decode_mask(data, path)
+        if self.is_transparent:
+            return decode_transparency(data, path)
+        return decode_mask(data, path, self.labels.get(ALPHA))
+
+    def decode_head(self, data: bytes, path: Path) -> np.ndarray:
+        """The same for a file of `head_masks`."""
+        return decode_mask(data, path, self.labels.get(HEAD))
+
+    def decode_mouth(self, data: bytes, path: Path) -> np.ndarray:
+        """The same for a file of `mouth_masks`."""
+        return decode_mask(data, path, self.labels.get(MOUTH))
+
+    def decoders(self) -> dict[str, Callable[[bytes, Path], np.ndarray]]:
+        """How the files of each kind of `of_kind` are decoded, but for the tracking."""
+        return {
+            IMAGE: decode_image,
+            ALPHA: self.decode_alpha,
+            HEAD: self.decode_head,
+            MOUTH: self.decode_mouth,
+            PARSING: self.decode_parsing,
+        }
 
     def of_kind(self) -> dict[str, dict[int, Path]]:
         """By the name that a person knows each kind by."""
         return {
-            "imgs": self.images,
-            "alpha": self.alphas,
-            "parsing *_neckhead": self.head_masks,
-            "parsing *_mouth": self.mouth_masks,
-            "checkpoint": self.tracking,
-        } | ({"face parsing": self.parsing} if self.parsing else {})
+            IMAGE: self.images,
+            ALPHA: self.alphas,
+            HEAD: self.head_masks,
+            MOUTH: self.mouth_masks,
+            TRACKING: self.tracking,
+        } | ({PARSING: self.parsing} if self.parsing else {})
 
     def title(self, kind: str) -> str:
         """What the layout itself calls a kind of `of_kind`."""
         own = {
-            "imgs": self.names.images,
-            "alpha": self.names.alphas,
-            "checkpoint": self.names.tracking,
-            "face parsing": self.names.head_masks,
+            IMAGE: self.names.images,
+            ALPHA: self.names.alphas,
+            TRACKING: self.names.tracking,
+            PARSING: self.names.head_masks,
         }
         return own.get(kind, kind).rstrip("/")
 
@@ -96,7 +129,7 @@ def find_frame_files(
     if not folder.is_dir():
         raise UserError(f"the folder {folder} does not exist")
     images = _numbered(folder / "imgs", IMAGE_SUFFIXES, complain)
-    if not images:
+    if not images and not _others(folder / "imgs"):
         complain(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
     return FrameFiles(
         folder=folder,
@@ -165,7 +198,19 @@ def _numbered(
                 complain(f"{found[number]} and {entry.path} are both frame {number}; remove one of them")
                 continue
             found[number] = Path(entry.path)
+    if not found and suffixes == IMAGE_SUFFIXES and (others := _others(folder, tag)):
+        complain(
+            f"{folder} holds {len(others)} {others[0].suffix} files, and pictures are read as {', '.join(IMAGE_SUFFIXES)}; "
+            f"convert them to PNG under the same numbers (ffmpeg -i {others[0].name} {others[0].stem}.png)"
+        )
     return dict(sorted(found.items()))
+
+
+def _others(folder: Path, tag: str = "") -> list[Path]:
+    """Pictures of formats that are not read."""
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in OTHER_PICTURES and p.stem.lower().endswith(tag))
 
 
 def describe_numbers(numbers: list[int], limit: int = 12, name: Callable[[int], str] = "{:05d}".format) -> str:

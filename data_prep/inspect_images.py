@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.images import decode_image, decode_mask, read_bytes, read_image
+from avatar.data.images import decode_image, read_bytes, read_image
 from avatar.errors import UserError
-from data_prep.frame_files import FrameFiles
+from data_prep.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
+from data_prep.mask_values import judge_values, mask_kinds, refuse_colours
 
 _SAMPLES = 16
+_ONE = {ALPHA: "alpha", HEAD: "head mask", MOUTH: "mouth mask", PARSING: "face parsing"}
 _BACKGROUNDS = {"white": (255, 255, 255), "black": (0, 0, 0), "green": (0, 255, 0)}
 _BACKGROUND_TOLERANCE = 3.0  # of 255, mean; JPEG noise on a flat colour is below 1
 _MIN_BACKGROUND = 0.02  # of the image; with less there is nothing to judge by
@@ -27,18 +29,21 @@ class Inspection:
     digests: dict[int, bytes]  # image number -> hash of the contents of image and masks
     image_digests: dict[int, bytes]
     bad: dict[int, str]  # image number -> why it cannot be used
+    notes: tuple[str, ...]  # what should be known of the masks
 
 
 @dataclass(frozen=True)
 class _Seen:
     digest: bytes
     size: tuple[int, int]  # width, height; (0, 0) where undecodable
-    maximum: int
+    darkest: int
+    brightest: int
     problem: str | None
 
 
 def inspect_images(files: FrameFiles) -> Inspection:
     """Decode everything once. Raises UserError when sizes differ or masks are not 0 to 255, naming both sides."""
+    refuse_colours(files)
     images = _look_at(files.images, decode_image)
     bad = {n: seen.problem for n, seen in images.items() if seen.problem is not None}
     sizes = {n: seen.size for n, seen in images.items() if seen.problem is None}
@@ -55,16 +60,12 @@ def inspect_images(files: FrameFiles) -> Inspection:
                 "all frames must have one size"
             )
     digests = {n: [seen.digest] for n, seen in images.items()}
-    kinds = {
-        "alpha": (files.alphas, files.decode_alpha),
-        "head mask": (files.head_masks, decode_mask),
-        "mouth mask": (files.mouth_masks, decode_mask),
-        "face parsing": (files.parsing, files.decode_parsing),
-    }
-    for kind, (paths, decode) in kinds.items():
-        if not paths:
+    notes: list[str] = []
+    own_masks, decoders = mask_kinds(files), files.decoders()
+    for kind, paths in files.of_kind().items():
+        if not paths or kind in (IMAGE, TRACKING):
             continue
-        masks = _look_at({n: p for n, p in paths.items() if n in files.images}, decode)
+        masks = _look_at({n: p for n, p in paths.items() if n in files.images}, decoders[kind])
         for number, seen in masks.items():
             digests[number].append(seen.digest)
             if seen.problem is not None:
@@ -74,15 +75,17 @@ def inspect_images(files: FrameFiles) -> Inspection:
                     f"{paths[number]} is {_x(seen.size)} pixels but the images are {_x(sizes[first])}; "
                     "make the masks at the size of the images"
                 )
-            elif kind in ("head mask", "face parsing") and seen.maximum == 0:
+            elif kind != MOUTH and seen.brightest == 0:
                 bad.setdefault(number, f"{paths[number].name} is empty: no head was found")
-        brightest = max((seen.maximum for seen in masks.values()), default=255)
-        if brightest == 1 and kind != "face parsing":
-            raise UserError(
-                f"the {kind} files in {next(iter(paths.values())).parent} hold 0 and 1; multiply them by 255"
-            )
+        whole = [seen for seen in masks.values() if seen.problem is None]
+        if kind in own_masks and whole:
+            values = min(seen.darkest for seen in whole), max(seen.brightest for seen in whole)
+            problem, note = judge_values(kind, paths, *values)
+            if problem is not None:
+                raise UserError(problem)
+            notes += [note] if note else []
         for number in files.images.keys() - masks.keys():
-            bad.setdefault(number, f"it has no {kind}")
+            bad.setdefault(number, f"it has no {_ONE[kind]}")
     width, height = sizes[first]
     return Inspection(
         width=width,
@@ -90,6 +93,7 @@ def inspect_images(files: FrameFiles) -> Inspection:
         digests={n: hashlib.blake2b(b"".join(parts), digest_size=16).digest() for n, parts in digests.items()},
         image_digests={n: seen.digest for n, seen in images.items()},
         bad=dict(sorted(bad.items())),
+        notes=tuple(notes),
     )
 
 
@@ -121,9 +125,10 @@ def _look_at(paths: Mapping[int, Path], decode: Callable[[bytes, Path], np.ndarr
             data = read_bytes(path)
             pixels = decode(data, path)
         except UserError as error:
-            return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (0, 0), 0, str(error))
+            return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (0, 0), 0, 0, str(error))
         height, width = pixels.shape[:2]
-        return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (width, height), int(pixels.max()), None)
+        values = int(pixels.min()), int(pixels.max())
+        return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (width, height), *values, None)
 
     with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
         return dict(zip(paths, pool.map(look, paths.values()), strict=True))

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avatar.data.images import read_bytes, read_mask, read_matte
+from avatar.data.images import read_bytes
 from avatar.data.manifest import Manifest
 from avatar.head.model import HeadModel
 from data_prep.face_parsing import HEAD, MOUTH, mask_of
@@ -26,12 +26,10 @@ def read_masks(files: FrameFiles, number: int) -> tuple[np.ndarray | None, np.nd
         path = files.parsing[number]
         classes = files.decode_parsing(read_bytes(path), path)
         return mask_of(classes, HEAD), mask_of(classes, MOUTH)
-    head = None
-    if files.head_masks:
-        head = read_mask(files.head_masks[number]) if number in files.head_masks else None
-    elif number in files.alphas:
-        head = read_matte(files.alphas[number], files.images[number])
-    return head, read_mask(files.mouth_masks[number]) if number in files.mouth_masks else None
+    paths, decode = (files.head_masks, files.decode_head) if files.head_masks else (files.alphas, files.decode_alpha)
+    head = decode(read_bytes(paths[number]), paths[number]) if number in paths else None
+    mouth = files.mouth_masks.get(number)
+    return head, None if mouth is None else files.decode_mouth(read_bytes(mouth), mouth)
 
 
 def derive_masks(

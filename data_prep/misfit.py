@@ -34,6 +34,8 @@ MIN_ON_MATTE = 0.5  # of the head; a matte holds clothes too, so that there is n
 MIN_LIPS = 0.6  # IoU with the mouth mask ...
 MAX_LIPS_AWAY = 0.025  # ... and between their centres, of the size of the projected head without neck
 MIN_PIXELS_AWAY = 1.5  # masks of tiny pictures are no better than that
+MAX_OUTSIDE = 0.01  # of the head's vertices
+CUT_OFF = "what is cut off cannot be learned"
 SAMPLED_FRAMES = 24
 NO_MASKS = "there are no masks to confirm it with"
 ADVICE = (
@@ -48,6 +50,7 @@ class Judgement:
 
     evidence: str  # `head overlap 0.940, lips overlap 0.820, 0.4% of the head's size away`, or that there are no masks
     problem: str | None  # which of the two does not lie where, None where both do
+    notes: tuple[str, ...] = ()  # what else should be known
 
     def refuse(self) -> None:
         """Raises UserError where there is a problem."""
@@ -93,7 +96,11 @@ def judge(fits: Sequence[Fit], files: FrameFiles) -> Judgement:
     elif lips_are_off:
         but = f", although the head lies on its masks ({seen['head']})" if "head" in seen else ""
         problem = f"the tracked lips do not lie on the mouth masks ({seen['lips']}){but}"
-    return Judgement(", ".join(f"{what} {how}" for what, how in seen.items()) or NO_MASKS, problem)
+    outside = _median([fit.outside for fit in fits])
+    notes = (
+        (f"{outside:.0%} of the tracked head lies outside the pictures: {CUT_OFF}",) if outside > MAX_OUTSIDE else ()
+    )
+    return Judgement(", ".join(f"{what} {how}" for what, how in seen.items()) or NO_MASKS, problem, notes)
 
 
 def _median(values: Sequence[float]) -> float:

@@ -11,8 +11,9 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
-from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets, load_head_assets
+from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep import avatar_track
+from data_prep.not_subjects import check_folder
 from data_prep.prepare import prepare
 
 
@@ -42,15 +43,6 @@ def recorded_head(folder: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def check_folder(folder: Path) -> None:
-    if folder.is_file():
-        raise UserError(f"{folder} is a file; if it is a video, avatar track makes a tracked folder of it")
-    if not folder.exists():
-        raise UserError(f"{folder}: there is no such file or folder")
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder; give the tracked video folder (docs/data.md)")
-
-
 def open_subject(
     source: Source,
     sizes: SplitSizes | None = None,
@@ -64,6 +56,6 @@ def open_subject(
     check_folder(source.folder)
     if assets is None:
         assets = load_head_assets(source.head)
-        if assets.layout_is_made:
-            say(LAYOUT_IS_MADE)
+        for note in assets.notes:
+            say(f"note: {note}")
     return Subject.open(prepare(source, assets, split=sizes, say=say)), assets

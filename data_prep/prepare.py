@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from avatar.data.manifest import GIVEN, FrameRecord, Manifest
+from avatar.data.manifest import GIVEN, MASKS, FrameRecord, Manifest
 from avatar.data.source import DEFAULT_FPS, MAX_FPS, Source
 from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError, refuse
+from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.cache import default_location, input_hash
 from data_prep.formats import open_tracked_folder
-from data_prep.frame_files import FrameFiles
+from data_prep.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 from data_prep.frame_offset import detect_offset
 from data_prep.inspect_images import Inspection, composited_background, inspect_images
+from data_prep.mask_polarity import polarity_problems
+from data_prep.mask_values import with_labels
 from data_prep.masks import derive_masks
 from data_prep.misfit import judge_sample
 from data_prep.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from data_prep.projection import region_faces
+from data_prep.still_parts import still_parts
 from data_prep.tracked_folder import TrackedFolder, divide
 from data_prep.tracking import Tracking, fit_coefficients
 from data_prep.write_prepared import is_current, write_prepared
@@ -62,13 +67,15 @@ def prepare(
         "ignore_misfit": source.ignore_misfit,
         "head": head.fingerprint,
     }
-    inputs = input_hash(files, options)
+    head_path = str(Path(source.head).resolve())
+    inputs = input_hash(files, options | {"head_path": head_path})
     target = Path(out).resolve() if out is not None else default_location(files, options)
-    if is_current(target, inputs, is_chosen=out is not None):
+    if is_current(target, inputs, is_chosen=out is not None, say=say):
         say(f"using the prepared subject {target}")
         return target
 
     say(f"format: {tracked.format}")
+    files, label_notes = with_labels(files)
     inspection = inspect_images(files)
     refuse_if_many(inspection.bad, len(files.images), "images", source.max_left_out)
     tracks = tracked.read(head, (inspection.width, inspection.height), refuse)
@@ -86,7 +93,10 @@ def prepare(
             "or track them again"
         )
     model = HeadModel(head, torch.from_numpy(first.shape))
-    offset, evidence = _find_offset(tracked, model, tracks, inspection, source)
+    if not source.ignore_misfit:
+        for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, inspection.bad):
+            refuse(problem)
+    offset, evidence = _find_offset(replace(tracked, files=files), model, tracks, inspection, source)
     centre = model.neutral_vertices().mean(0).numpy()
     pairing = pair_frames(files, inspection, tracks, offset, centre, source.max_left_out)
     judgement = judge_sample(model, tracks.frames, files, pairing.pairs)
@@ -97,8 +107,22 @@ def prepare(
     has_lips = len(region_faces(model, "lips")) > 0
     frames_split, split_notes = divide(tracked.division, [number for _, number in pairing.pairs], split)
     ignored = [f"{judgement.problem}: taken regardless, as --ignore-misfit says"] if judgement.problem else []
+    parts = still_parts([tracks.frames[n] for _, n in pairing.pairs], head)
+    still = [part.sentence for part in parts if not part.is_absent]
     assumed = _assumptions(files, inspection, has_lips)
-    notes = [*ignored, *tracked.notes, *tracks.notes, *pairing.notes, *assumed, *split_notes]
+    notes = [
+        *ignored,
+        *tracked.notes,
+        *label_notes,
+        *inspection.notes,
+        *tracks.notes,
+        *tracks.flaws,
+        *pairing.notes,
+        *still,
+        *judgement.notes,
+        *assumed,
+        *split_notes,
+    ]
     for note in notes:
         say(f"note: {note}")
     if pairing.left_out:
@@ -112,7 +136,7 @@ def prepare(
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
     mouth_kind = "source" if files.mouth_masks else "derived" if files.parsing or has_lips else "none"
     manifest = Manifest(
-        name=folder.name,
+        name=safe_name(folder.name),
         format=tracked.format,
         source=str(folder),
         tracking=str(next(iter(files.tracking.values())).parent),
@@ -129,11 +153,16 @@ def prepare(
         notes=tuple(notes),
         head_masks=head_kind,
         mouth_masks=mouth_kind,
-        head_path=str(Path(source.head).resolve()),
+        head_path=head_path,
         head_fingerprint=head.fingerprint,
         input_hash=inputs,
         data_hash=_data_hash(inspection, pairing, arrays, first.intrinsics),
         refinement=tracked.refinement,
+        labels={
+            mask: files.labels[kind]
+            for mask, kind in zip(MASKS, (ALPHA, HEAD, MOUTH), strict=True)
+            if kind in files.labels
+        },
     )
     write_prepared(
         target, manifest, arrays, lambda building: derive_masks(building, manifest, files, model, tracks, pairing.pairs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from avatar.errors import UserError, refuse
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
+from data_prep.identity import MAX_CHANGE, compare_identities
 
 ROTATION_TOLERANCE = 1e-2  # float16 and rounding; larger errors are not a rotation
 INTRINSICS_NOTE, INTRINSICS_ERROR = 1e-3, 5e-2  # relative change of fx, fy, cx, cy within a clip
@@ -43,6 +44,7 @@ class Tracking:
     bad: dict[int, str]  # why the others are not
     notes: list[str]  # what the user should know
     paths: dict[int, Path]
+    flaws: list[str] = field(default_factory=list)  # what was evened out, and should not have been there
 
 
 class BadFrame(Exception):
@@ -56,7 +58,7 @@ def checked_tracking(
     complain: Callable[[str], object] = refuse,
 ) -> Tracking:
     """Move frames with another number of coefficients to `bad`; `complain` of a camera that changes."""
-    frames, bad, notes = dict(frames), dict(bad), []
+    frames, bad, flaws = dict(frames), dict(bad), []
     if frames:
         first = next(iter(frames))
         for number, frame in list(frames.items()):
@@ -65,24 +67,35 @@ def checked_tracking(
                 if here != there:
                     bad[number] = f"{here} {field} coefficients where {paths[first].name} has {there}"
                     frames.pop(number, None)
-        _check_camera(frames, paths, notes, complain)
-    return Tracking(frames, dict(sorted(bad.items())), notes, paths)
+        _check_camera(frames, paths, flaws, complain)
+    return Tracking(frames, dict(sorted(bad.items())), [], paths, flaws)
 
 
-def fit_coefficients(tracking: Tracking, head: HeadAssets) -> Tracking:
-    """The same tracking with as many coefficients as the head model has directions, and one identity, the first's.
+def fit_coefficients(tracking: Tracking, head: HeadAssets, complain: Callable[[str], object] = refuse) -> Tracking:
+    """The same tracking with as many coefficients as the head model has directions, and one identity, the frames' median.
 
-    Missing coefficients are zero, further ones are cut where they are zero. Raises UserError where they are not.
+    Missing coefficients are zero, further ones are cut where they are zero. Raises UserError where they are not. Calls
+    `complain` where the identity changes too much from frame to frame; single frames with another one end up in `bad`.
     """
-    notes = list(tracking.notes)
-    expression = np.stack([track.expression for track in tracking.frames.values()])
-    expression = _fitted(expression, head.num_expressions, "expression", notes)
-    shape = _fitted(next(iter(tracking.frames.values())).shape[None], IDENTITY_COEFFICIENTS, "identity", notes)[0]
+    notes, flaws, bad = list(tracking.notes), list(tracking.flaws), dict(tracking.bad)
+    rows = list(tracking.frames.values())
+    expression = _fitted(np.stack([t.expression for t in rows]), head.num_expressions, "expression", notes)
+    identities = compare_identities(
+        _fitted(np.stack([t.shape for t in rows]), IDENTITY_COEFFICIENTS, "identity", notes), head
+    )
     frames = {
-        number: replace(track, expression=row, shape=shape)
+        number: replace(track, expression=row, shape=identities.median)
         for (number, track), row in zip(tracking.frames.items(), expression, strict=True)
     }
-    return replace(tracking, frames=frames, notes=notes)
+    if identities.are_many:
+        complain(f"{identities.sentence()}; let the tracker find one identity for the whole clip, and track it again")
+    elif not identities.are_same:
+        flaws.append(f"{identities.sentence()}: the median is used")
+        for number, change in zip(tracking.frames, identities.change, strict=True):
+            if change > MAX_CHANGE:
+                bad[number] = f"its identity is more than {1e3 * MAX_CHANGE:g} mm off the clip's"
+                del frames[number]
+    return replace(tracking, frames=frames, bad=dict(sorted(bad.items())), notes=notes, flaws=flaws)
 
 
 def _fitted(values: np.ndarray, count: int, what: str, notes: list[str]) -> np.ndarray:
@@ -126,7 +139,7 @@ def nearest_rotation(R: np.ndarray, name: str) -> np.ndarray:
 
 
 def _check_camera(
-    frames: dict[int, FrameTrack], paths: dict[int, Path], notes: list[str], complain: Callable[[str], object]
+    frames: dict[int, FrameTrack], paths: dict[int, Path], flaws: list[str], complain: Callable[[str], object]
 ) -> None:
     first_number, first = next(iter(frames.items()))
     worst, worst_number = 0.0, first_number
@@ -148,4 +161,4 @@ def _check_camera(
         if worst > INTRINSICS_ERROR:
             complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
         else:
-            notes.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")
+            flaws.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")

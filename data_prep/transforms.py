@@ -8,6 +8,7 @@ has moved a part of a larger data set, writes one.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES
+from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS
 from avatar.errors import UserError, refuse
 from avatar.files import opening
@@ -56,7 +57,7 @@ class ListedFrame:
         path = self.path("file_path")
         if path is None:
             raise UserError(f"{self.listing}: frame {self.position} has no file_path; export the folder again")
-        if path.suffix.lower() in IMAGE_SUFFIXES:
+        if path.suffix.lower() in (*IMAGE_SUFFIXES, *OTHER_PICTURES):
             return path
         candidates = [path.with_name(path.name + suffix) for suffix in (".png", *IMAGE_SUFFIXES)]
         return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
@@ -73,11 +74,14 @@ class ListedFrame:
         if not is_path(value):
             raise UserError(f"{where} is not a path; export the folder again")
         forms = PurePosixPath(value), PureWindowsPath(value)
-        if any(form.is_absolute() or form.drive or ".." in form.parts for form in forms):
+        if any(form.root or form.drive or ".." in form.parts for form in forms):
             raise UserError(
                 f"{where} is {value!r}, which leaves {self.listing.parent}; give a folder that holds its own frames"
             )
-        return self.listing.parent / value
+        place = self.listing.parent / value
+        if "\\" in value and not os.path.exists(place):  # noqa: PTH110 (Path.exists raises for a name that is too long)
+            place = self.listing.parent / forms[1].as_posix()  # written on Windows
+        return place
 
 
 def is_path(value: Any) -> bool:
@@ -85,7 +89,7 @@ def is_path(value: Any) -> bool:
     if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
         return False
     try:
-        return max(len(part.encode()) for part in value.split("/")) <= 255
+        return max(len(part.encode()) for part in re.split(r"[/\\]", value)) <= 255
     except UnicodeEncodeError:
         return False
 

@@ -6,9 +6,10 @@
     FOLDER/flame_param/00000.npz              `flame_param_path`: one timestep's FLAME parameters
 
 An entry has `transform_matrix` (the camera in the world, OpenGL axes) and intrinsics, its own or shared (`fl_x`, `fl_y`,
-`cx`, `cy`, `w`, `h`, or `camera_angle_x`). A parameter file has `translation`, `rotation`, `neck_pose`, `jaw_pose` [3],
-`eyes_pose` [6] as rotation vectors, `expr`, `shape` and perhaps `static_offset` [V, 3], whatever further axes of length
-1. There are no eyelids: they are zero. The static offset is not used: the Gaussians learn where they belong.
+`cx`, `cy`, `w`, `h`, or `camera_angle_x`); `cy` is counted from the bottom of the picture. A parameter file has
+`translation`, `rotation`, `neck_pose`, `jaw_pose` [3], `eyes_pose` [6] as rotation vectors, `expr`, `shape` and perhaps
+`static_offset` [V, 3], whatever further axes of length 1. There are no eyelids: they are zero. The static offset is not
+used: the Gaussians learn where they belong.
 """
 
 from __future__ import annotations
@@ -94,6 +95,7 @@ def _read_frame(frame: ListedFrame, root: RootJoint, size: tuple[int, int]) -> F
         root.position(shape, expression),
     )
     intrinsics, tracked_size = pinhole(frame, size)
+    intrinsics[3] = tracked_size[1] - intrinsics[3]
     return FrameTrack(
         expression=expression,
         jaw=six_d(values("jaw_pose", 3)),

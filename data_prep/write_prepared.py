@@ -13,10 +13,15 @@ from safetensors.numpy import save
 
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_manifest
 from avatar.errors import UserError
+from avatar.files.names import safe_name
+from data_prep.contents import find_damage, write_contents
 
 
-def is_current(target: Path, input_hash: str, is_chosen: bool) -> bool:
-    """Whether `target` was prepared from these inputs. A chosen folder that is something else is never overwritten."""
+def is_current(target: Path, input_hash: str, is_chosen: bool, say: Callable[[str], object] = lambda _: None) -> bool:
+    """Whether `target` was prepared from these inputs and is whole; `say` hears where it is damaged.
+
+    A chosen folder that is something else is never overwritten.
+    """
     try:
         names = {path.name for path in target.iterdir()}
     except FileNotFoundError:
@@ -27,8 +32,11 @@ def is_current(target: Path, input_hash: str, is_chosen: bool) -> bool:
         if is_chosen and names:
             raise UserError(f"{target} exists and is not a prepared subject; choose another --out")
         return False
+    if (damage := find_damage(target)) is not None:
+        say(f"the prepared subject {target} is damaged: {damage}; it is made again")
+        return False
     try:
-        return read_manifest(target).input_hash == input_hash and (target / TRACKS_FILE).is_file()
+        return read_manifest(target).input_hash == input_hash
     except UserError:
         return False
 
@@ -42,7 +50,7 @@ def write_prepared(
     """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        building = Path(tempfile.mkdtemp(prefix=f".{safe_name(target.name)}-", dir=target.parent))
     except OSError as error:
         raise UserError(
             f"nothing can be written in {target.parent} ({error.strerror}); name another folder with --out, "
@@ -52,6 +60,7 @@ def write_prepared(
         (building / TRACKS_FILE).write_bytes(save(arrays))
         write_masks(building)
         (building / MANIFEST_FILE).write_text(manifest.to_json(), encoding="utf-8")
+        write_contents(building)
         building.chmod(0o755)
         _replace(target, building, manifest.input_hash)
     except OSError as error:
@@ -73,7 +82,7 @@ def _replace(target: Path, building: Path, input_hash: str) -> None:
                 continue  # moved away just now by another process
         if is_current(target, input_hash, is_chosen=False):
             return
-        stale = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
+        stale = Path(tempfile.mkdtemp(prefix=f".{safe_name(target.name)}-old-", dir=target.parent))
         try:
             with contextlib.suppress(FileNotFoundError):
                 target.rename(stale / "old")

@@ -16,6 +16,7 @@ from folder_damage import (
     every,
     freeze,
     hostile,
+    masks_of_three_labels,
     matching,
     nan_in,
     remove,
@@ -24,7 +25,6 @@ from folder_damage import (
     shift_masks,
     swap_frames,
     write,
-    zero_one_masks,
 )
 
 TWO = (5, 6)
@@ -96,7 +96,10 @@ CASES: dict[str, tuple[Edit, str]] = {
         resize("alpha/*.jpg", (128, 128)),
         r"alpha/00001\.jpg is 128x128 pixels but the images are",
     ),
-    "masks of 0 and 1": (zero_one_masks, r"the head mask files in .*parsing hold 0 and 1; multiply them by 255"),
+    "masks of three labels": (
+        masks_of_three_labels,
+        r"the head masks in .*parsing reach only 2 of 255 \(values 0, 1, 2\).*; make the person 255",
+    ),
     "head masks empty": (
         write("parsing/0000[56]_neckhead.png", EMPTY_MASK),
         r"00005 \(00005_neckhead\.png is empty: no head was found\)",

@@ -88,9 +88,11 @@ def shift_masks(folder: Path) -> None:
         cv2.imwrite(str(path), np.roll(read_mask(path), (32, 32), (0, 1)))
 
 
-def zero_one_masks(folder: Path) -> None:
+def masks_of_three_labels(folder: Path) -> None:
     for path in matching(folder, "parsing/*_neckhead*"):
-        cv2.imwrite(str(path), read_mask(path) // 255)
+        labels = read_mask(path) // 255
+        labels[:20] *= 2
+        cv2.imwrite(str(path), labels)
 
 
 def all_zero(number: int) -> Edit:

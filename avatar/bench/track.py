@@ -35,7 +35,6 @@ from avatar.errors import UserError
 from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
-from avatar.head.expression_names import load_expression_names
 from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
@@ -214,7 +213,7 @@ def compare(
 def tracked_by_landmarks(tracked: Path, head: Path, own: Recording, assets: HeadAssets) -> Recording:
     """The fit to the stored landmarks of a tracked folder alone, without its pictures."""
     clip = Clip(load_landmarks(tracked / LANDMARKS_FILE), own.intrinsics, [], [])
-    names = load_expression_names(head, assets.num_expressions)
+    names = assets.names
     fit = fit_landmarks(assets, names, find_embedding(head, assets), clip.landmarks, Pinhole(*own.intrinsics))
     rows = as_tracks(fit, fit.motion, clip, assets.num_expressions)
     tracks = {

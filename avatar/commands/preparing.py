@@ -53,7 +53,7 @@ def run_check(arguments: Namespace) -> int:
         fps=arguments.fps,
         max_left_out=Source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
         ignore_misfit=arguments.ignore_misfit,
-        progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False),
+        progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False, disable=total == 0),
     )
     print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))
     if arguments.out is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from argparse import Namespace
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,15 +16,16 @@ from avatar.files.names import safe_name
 from avatar.files.places import cache_folder, named_path
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
-from data_prep.avatar_track import read_info, recognise
+from data_prep.avatar_track import recognise
+from data_prep.contents import find_damage, write_contents
 from data_prep.open import HEAD_VARIABLE
 from data_prep.track.crop import parse_crop
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.footage.source import Span
+from data_prep.track.inputs import tracking_key
 from data_prep.track.progress import Item
-from data_prep.track.stages import hash_of
-from data_prep.track.track import STAGES_VERSION, Choices, track
+from data_prep.track.track import Choices, track
 
 
 def run_track(arguments: Namespace) -> int:
@@ -62,14 +64,18 @@ def is_video(path: Path) -> bool:
 
 
 def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> Path:
-    """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing."""
+    """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing or
+    damaged."""
     assets = assets or load_head_assets(head)
-    key = hash_of([STAGES_VERSION, open_footage(video).content_hash(), assets.fingerprint])[:12]
+    key = tracking_key(open_footage(video), Choices().to_json(), head, assets)[:12]
     folder = cache_folder() / "tracked" / f"{safe_name(video.resolve().stem)}-{key}"
-    if recognise(folder) and read_info(folder).head_fingerprint == assets.fingerprint:
-        print(f"using the tracking {folder}")
-        return folder
-    track(video, folder, head, assets, progress=bar)
+    if folder.is_dir():
+        if (damage := find_damage(folder)) is None:
+            print(f"using the tracking {folder}")
+            return folder
+        print(f"the tracking {folder} is damaged: {damage}; it is made again")
+        shutil.rmtree(folder)
+    track(video, folder, head, assets, progress=bar, seal=write_contents)
     return folder
 
 

@@ -22,6 +22,7 @@ from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.lock import locked
+from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.runs.avatar_file import check_head
@@ -31,6 +32,7 @@ from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.order import within_passes
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
+from data_prep.not_subjects import check_folder
 from data_prep.open import open_subject
 
 # Adam's epsilon makes whole steps of gradients that are nothing but rounding.
@@ -45,6 +47,8 @@ def run_train(arguments: Namespace) -> int:
         refuse_changes(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
     load_config(overrides)  # a mistake in it before one in the folder
+    if not is_video(arguments.folder):
+        check_folder(arguments.folder)
     check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
     return train_new(tracked_source(arguments), overrides, run, arguments.device)
 
@@ -72,7 +76,7 @@ def asked_device(overrides: list[str]) -> str | None:
 def default_run(folder: Path | None) -> Path:
     if folder is None:
         raise UserError("say which run to go on with: avatar train --resume RUN")
-    return Path("runs") / (folder.resolve().stem if folder.is_file() else folder.resolve().name)
+    return Path("runs") / safe_name(folder.resolve().stem if folder.is_file() else folder.resolve().name)
 
 
 def train_new(source: Source, overrides: list[str], run: Path, device: str | None = None) -> int:

@@ -5,6 +5,7 @@ The foreground matte of an image is a mask file, or the image itself: then its t
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import cv2
@@ -14,11 +15,17 @@ from avatar.errors import UserError
 from avatar.files import opening
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+OTHER_PICTURES = (".webp", ".bmp", ".tif", ".tiff", ".gif", ".heic", ".avif", ".jp2", ".ppm", ".exr", ".tga", ".jxl")
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
+_PALETTE = 3  # the colour type of a PNG that holds indices into a palette
 MAX_PIXELS = 2**26  # 8192x8192; a decoder allocates what the header says before it looks how much there is
 MAX_BYTES = 2**28  # of a file
+_STARTS = {  # of pictures that are not read: where, what, the format
+    "WebP": (8, b"WEBP"), "BMP": (0, b"BM"), "TIFF": (0, b"II*\0"), "big-endian TIFF": (0, b"MM\0*"), "GIF": (0, b"GIF8"),
+    "HEIC": (4, b"ftyphei"), "AVIF": (4, b"ftypavi"),
+}  # fmt: skip
 _TAIL = 4096  # some writers pad after the end marker
 
 
@@ -27,17 +34,17 @@ def read_image(path: Path) -> np.ndarray:
     return cv2.cvtColor(_decode(read_bytes(path), path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """uint8 [H, W]: the transparency of a PNG that has any, else the luminance. Raises UserError as `read_image` does."""
-    return decode_mask(read_bytes(path), path)
+def read_mask(path: Path, label: int | None = None) -> np.ndarray:
+    """uint8 [H, W], 0 to 255; see `decode_mask`. Raises UserError as `read_image` does."""
+    return decode_mask(read_bytes(path), path, label)
 
 
-def read_matte(path: Path, image: Path) -> np.ndarray:
+def read_matte(path: Path, image: Path, label: int | None = None) -> np.ndarray:
     """uint8 [H, W], 255 where `image` shows the person: the mask file `path`, or the transparency of the image itself.
 
     Raises UserError as `read_image` does.
     """
-    return (decode_transparency if path == image else decode_mask)(read_bytes(path), path)
+    return decode_transparency(read_bytes(path), path) if path == image else read_mask(path, label)
 
 
 def decode_image(data: bytes, path: Path) -> np.ndarray:
@@ -45,12 +52,32 @@ def decode_image(data: bytes, path: Path) -> np.ndarray:
     return cv2.cvtColor(_decode(data, path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
-def decode_mask(data: bytes, path: Path) -> np.ndarray:
-    """`read_mask` of bytes that were read already; `path` is for the message."""
+def decode_mask(data: bytes, path: Path, label: int | None = None) -> np.ndarray:
+    """uint8 [H, W], 0 to 255: the values of a mask file that was read already; `path` is for the message.
+
+    With a `label`, the file is a label image that holds 0 and this value, which becomes 255. Raises UserError for others.
+    """
+    values = decode_values(data, path)
+    if label is None:
+        return values
+    is_person = values == label
+    strange = values[~is_person & (values != 0)]
+    if len(strange):
+        raise UserError(f"{path} holds the value {strange[0]} beside 0 and {label}; make all masks alike")
+    return np.where(is_person, np.uint8(255), np.uint8(0))
+
+
+def decode_values(data: bytes, path: Path) -> np.ndarray:
+    """uint8 [H, W] that a mask file holds: its transparency if there is any, the indices of a coloured palette, the
+    values of a 16-bit file that needs only 8 of them, else its luminance. Raises UserError as `read_image` does."""
     matte = _transparency(data, path)
     if matte is not None and matte.min() < 255:
         return matte
-    return _decode(data, path, cv2.IMREAD_GRAYSCALE)
+    values = _decode(data, path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if values.dtype == np.uint16:
+        return _of_16_bits(values) if values.max() > 255 else values.astype(np.uint8)
+    indices = _palette_indices(data, path)
+    return values if indices is None else indices
 
 
 def decode_transparency(data: bytes, path: Path) -> np.ndarray:
@@ -73,9 +100,27 @@ def _transparency(data: bytes, path: Path) -> np.ndarray | None:
     if channels.ndim != 3 or channels.shape[2] != 4:  # the decoder has no place for a transparent grey
         return None
     matte = channels[..., 3]
-    if matte.dtype == np.uint16:
-        matte = (matte.astype(np.float32) / 257).round()  # 65535 is 257 x 255
-    return np.ascontiguousarray(matte, np.uint8)
+    return np.ascontiguousarray(_of_16_bits(matte) if matte.dtype == np.uint16 else matte, np.uint8)
+
+
+def _of_16_bits(values: np.ndarray) -> np.ndarray:
+    return (values.astype(np.float32) / 257).round().astype(np.uint8)  # 65535 is 257 x 255
+
+
+def _palette_indices(data: bytes, path: Path) -> np.ndarray | None:
+    """uint8 [H, W] of a PNG with a palette of colours, whose luminance says nothing; None for others and for greys."""
+    if not data.startswith(_PNG_START) or data[_PNG_COLOUR_TYPE : _PNG_COLOUR_TYPE + 1] != bytes([_PALETTE]):
+        return None
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+            palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
+            indices = np.asarray(image)
+            colours = palette[np.unique(indices)]
+    except Exception as error:  # a damaged file fails in many ways
+        raise UserError(f"{path} is damaged and cannot be decoded ({error}); write or copy it again") from None
+    return None if (colours == colours[:, :1]).all() else indices.astype(np.uint8)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -91,6 +136,9 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     elif data.startswith(_PNG_START):
         complete = _PNG_END in data[-_TAIL:]
     else:
+        known = (name for name, (at, start) in _STARTS.items() if data[at : at + len(start)] == start)
+        if (name := next(known, None)) is not None:
+            raise UserError(f"{path} is a {name} picture, and JPEG and PNG are read; convert it to PNG")
         raise UserError(f"{path} is neither a JPEG nor a PNG file, whatever its name says")
     if not complete:
         raise UserError(f"{path} is cut short; write or copy it again")

@@ -7,8 +7,9 @@ prepared folder. `MANIFEST_VERSION` grows with every change of meaning; other ve
 from __future__ import annotations
 
 import json
+import os
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -17,9 +18,10 @@ from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.opening import MissingFile, read_json
 
-MANIFEST_VERSION = 4
+MANIFEST_VERSION = 5
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
 GIVEN = "given."  # before the names of the tracks as they were before their refinement
+MASKS = ("alpha", "head", "mouth")  # keys of `Manifest.labels`
 _MAX_BYTES = 2**28
 
 
@@ -59,6 +61,7 @@ class Manifest:
     input_hash: str  # of names, sizes and times of the inputs, and the options: decides whether to prepare again
     data_hash: str  # of the contents: the same data gives the same hash on every machine
     refinement: Refinement | None = None  # of the tracking; None where it is the tracker's own
+    labels: dict[str, int] = field(default_factory=dict)  # of masks that are label images: what is read as 255
 
     def to_json(self) -> str:
         return json.dumps({"version": MANIFEST_VERSION, **asdict(self)}, indent=1)
@@ -106,6 +109,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         notes=tuple(str(note) for note in _of(raw, "notes", list)),
         head_masks=_of(raw, "head_masks", str),
         mouth_masks=_of(raw, "mouth_masks", str),
+        labels=_labels(_of(raw, "labels", dict)),
         head_path=_of(raw, "head_path", str),
         head_fingerprint=_of(raw, "head_fingerprint", str),
         input_hash=_of(raw, "input_hash", str),
@@ -122,6 +126,13 @@ def _parse(raw: dict[str, Any]) -> Manifest:
     if set(manifest.train) & set(manifest.test):
         raise ValueError("a frame is in both train and test")
     return manifest
+
+
+def _labels(raw: dict[str, Any]) -> dict[str, int]:
+    for kind in raw:
+        if kind not in MASKS or not 0 < _of(raw, kind, int) < 255:
+            raise ValueError(f"the label of {kind} is {raw[kind]}")
+    return raw
 
 
 def _refinement(raw: Any) -> Refinement:
@@ -188,7 +199,7 @@ def _relative_or_none(value: Any) -> str | None:
 def _relative(value: str) -> str:
     """Frame files must stay inside the folder that the manifest names."""
     escapes = any(p.is_absolute() or p.drive or ".." in p.parts for p in (PurePosixPath(value), PureWindowsPath(value)))
-    value.encode()  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
+    os.fsencode(value)  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
     if not value or escapes or "\0" in value:
         raise ValueError(f"the path {value!r} leaves the subject's folder")
     return value

@@ -142,14 +142,15 @@ class Subject:
         image = self._same_size(read_image(source / record.image), source / record.image)
         alpha = np.full(shape, 255, np.uint8)
         if record.alpha is not None:
-            alpha = self._same_size(read_matte(source / record.alpha, source / record.image), source / record.alpha)
+            path = source / record.alpha
+            alpha = self._same_size(read_matte(path, source / record.image, self.manifest.labels.get("alpha")), path)
         if record.head_mask is None:
             head_mask = head_of_matte(alpha)
         else:
             root = self.folder if self.manifest.head_masks == "derived" else source
-            head_mask = self._mask(root, record.head_mask, shape, default=255)
+            head_mask = self._mask(root, record.head_mask, shape, "head", default=255)
         root = self.folder if self.manifest.mouth_masks == "derived" else source
-        mouth_mask = self._mask(root, record.mouth_mask, shape, default=0)
+        mouth_mask = self._mask(root, record.mouth_mask, shape, "mouth", default=0)
         pixels = FramePixels(image, alpha, head_mask, mouth_mask)
         if size is None or size == self.width:
             return pixels
@@ -170,10 +171,10 @@ class Subject:
             mouth_mask=mouth_mask,
         )
 
-    def _mask(self, root: Path, path: str | None, shape: tuple[int, int], default: int) -> np.ndarray:
+    def _mask(self, root: Path, path: str | None, shape: tuple[int, int], kind: str, default: int) -> np.ndarray:
         if path is None:
             return np.full(shape, default, np.uint8)
-        return self._same_size(read_mask(root / path), root / path)
+        return self._same_size(read_mask(root / path, self.manifest.labels.get(kind)), root / path)
 
     def _same_size(self, pixels: np.ndarray, path: Path) -> np.ndarray:
         height, width = pixels.shape[:2]

@@ -22,13 +22,14 @@ from avatar.errors import UserError
 from avatar.files.opening import is_there
 from avatar.files.pickles import load_npy, load_npz, load_pickle
 from avatar.head.expression_names import ExpressionNames, load_expression_names
+from avatar.head.find import find_model_file, notes_on_choice
 from avatar.head.unwrap import LAYOUT_METHOD, NoLayout, unwrap
 from avatar.head.uv_obj import read_uv_obj
 
 IDENTITY_COEFFICIENTS = 300  # FLAME's shapedirs: 300 identity directions, then the expression directions
 JOINT_NAMES = ("root", "neck", "jaw", "left eye", "right eye")
 LAYOUT_TENSOR = "layout_method"
-LAYOUT_IS_MADE = "note: no UV layout (head_template.obj) lies beside the head model: the program makes one"
+LAYOUT_IS_MADE = "no UV layout (head_template.obj) lies beside the head model: the program makes one"
 EYES = ("left eye", "right eye")
 REQUIRED_KEYS = ("v_template", "f", "shapedirs", "J_regressor", "weights", "kintree_table")
 
@@ -52,6 +53,7 @@ class HeadAssets:
     fingerprint: str  # SHA-256 over all of the above
     names: ExpressionNames = field(default_factory=ExpressionNames)  # of the expression coefficients
     layout_method: int = 0  # LAYOUT_METHOD of `uvs` that the program made because no OBJ lay beside the model file
+    notes: tuple[str, ...] = ()  # what was chosen or made when it was read
 
     def __repr__(self) -> str:
         return (
@@ -139,30 +141,7 @@ def load_head_assets(path: Path) -> HeadAssets:
         fingerprint=fingerprint_of(tensors, parents, regions, method),
         names=load_expression_names(folder, directions.shape[2] - IDENTITY_COEFFICIENTS),
         layout_method=method,
-    )
-
-
-def find_model_file(path: Path) -> Path:
-    """The model file itself, or the one file of a folder that is a head model."""
-    if not is_there(path):
-        raise UserError(
-            f"the head model {path} does not exist; give --head the model file or its folder "
-            "(FLAME 2023 Open can be had from https://flame.is.tue.mpg.de)"
-        )
-    if not path.is_dir():
-        return path
-    named = [path / name for name in ("generic_model.pkl", "generic_model.npz") if is_there(path / name)]
-    if named:
-        return named[0]
-    candidates = sorted(p for p in path.iterdir() if p.suffix in (".pkl", ".npz") and "mask" not in p.name.lower())
-    candidates = [p for p in candidates if not any(word in p.name.lower() for word in ("embedding", "texture"))]
-    if len(candidates) == 1:
-        return candidates[0]
-    if not candidates:
-        raise UserError(f"the folder {path} holds no head model (generic_model.pkl, or another .pkl or .npz)")
-    raise UserError(
-        f"the folder {path} holds several files that could be the head model "
-        f"({', '.join(p.name for p in candidates)}); give --head one of them"
+        notes=(*notes_on_choice(path, model_file), *([LAYOUT_IS_MADE] if obj is None else [])),
     )
 
 

@@ -48,16 +48,20 @@ def subject_drive(subject: Subject, size: int | None) -> Drive:
 
 
 def smoothed(drive: Drive, sigma: float) -> Drive:
-    """Expression, jaw and head pose as Gaussian means over neighbouring frames, `sigma` frames wide; 0 changes nothing.
+    """Expression, jaw, neck and head pose as Gaussian means over neighbouring frames, `sigma` wide; 0 changes nothing.
 
     The window is centred, so nothing is delayed. Gaze and eyelids stay as they are: saccades and blinks are quick.
     """
     if sigma == 0.0:
         return drive
     expression = _filtered(torch.stack([p.expression for p in drive.params]), sigma)
-    jaw = _filtered_rotations(matrix_from_6d(torch.stack([p.jaw for p in drive.params])), sigma)
+    jaw, neck = (
+        _filtered_rotations(matrix_from_6d(torch.stack([getattr(p, joint) for p in drive.params])), sigma)[:, :2]
+        for joint in ("jaw", "neck")
+    )
     params = [
-        replace(p, expression=e, jaw=j[:2].reshape(6)) for p, e, j in zip(drive.params, expression, jaw, strict=True)
+        replace(p, expression=e, jaw=j.reshape(6), neck=n.reshape(6))
+        for p, e, j, n in zip(drive.params, expression, jaw, neck, strict=True)
     ]
     cameras = drive.cameras
     if cameras is not None:

@@ -9,9 +9,9 @@ from pathlib import Path
 from avatar.data.images import IMAGE_SUFFIXES
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence, loss_severity
-from data_prep.check.view import HEAD, IMAGE
-from data_prep.frame_files import describe_numbers, gaps
+from data_prep.frame_files import ALPHA, HEAD, IMAGE, describe_numbers, gaps
 from data_prep.frame_offset import RADIUS
+from data_prep.mask_values import judge_values, mask_kinds
 from data_prep.pairing import describe_reasons
 
 _SHOWN = 6  # file names in a sentence
@@ -36,6 +36,7 @@ def _unreadable(clip: Clip) -> list[Finding]:
         if not reasons:
             continue
         shown = [reason.partition("; ")[0] for reason in list(reasons.values())[:_SHOWN]]
+        advice = next(iter(reasons.values())).partition("; ")[2] or "write or copy it again"
         rest = f" and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
         findings.append(
             Finding(
@@ -43,7 +44,7 @@ def _unreadable(clip: Clip) -> list[Finding]:
                 "unreadable",
                 f"{len(reasons)} of {len(clip.views)} files of {clip.files.title(kind)} cannot be read: "
                 f"{', '.join(shown)}{rest}",
-                "write or copy them again; frames without them are left out of training",
+                f"{advice}; frames without them are left out of training",
                 clip.names(reasons),
             )
         )
@@ -85,25 +86,23 @@ def _sizes(clip: Clip) -> list[Finding]:
 
 
 def _mask_values(clip: Clip) -> list[Finding]:
-    findings = []
-    kinds = {kind for view in clip.views.values() for kind in view.brightest}
-    for kind in sorted(kinds):
-        values = {n: view.brightest[kind] for n, view in clip.views.items() if kind in view.brightest}
-        if max(values.values()) == 1:
-            findings.append(
-                Finding(
-                    "error",
-                    "mask-range",
-                    f"the files of {clip.files.title(kind)} hold 0 and 1, not 0 to 255",
-                    "multiply them by 255",
-                )
-            )
-        elif kind == HEAD and (empty := [n for n, value in values.items() if value == 0]):
+    findings = [Finding("note", "mask-labels", note, "nothing, if that is meant") for note in clip.label_notes]
+    for kind, paths in mask_kinds(clip.files).items():
+        seen = [view for view in clip.views.values() if kind in view.brightest]
+        if not seen:
+            continue
+        darkest, brightest = min(view.darkest[kind] for view in seen), max(view.brightest[kind] for view in seen)
+        problem, note = judge_values(kind, paths, darkest, brightest)
+        findings += [from_sentence("mask-range", problem)] if problem else []
+        findings += [Finding("warning", "mask-range", note, "make these masks again")] if note else []
+    for kind, what in ((HEAD, "head mask"), (ALPHA, "matte")):
+        empty = [n for n, view in clip.views.items() if view.brightest.get(kind) == 0]
+        if empty:
             findings.append(
                 Finding(
                     loss_severity(len(empty), len(clip.views), clip.max_left_out),
                     "empty-mask",
-                    f"the head mask is empty in {clip.phrase(empty)}: no head was found there",
+                    f"the {what} is empty in {clip.phrase(empty)}: no head was found there",
                     "segment them again, or accept that they are left out of training",
                     clip.names(empty),
                 )

@@ -5,19 +5,35 @@ from __future__ import annotations
 import numpy as np
 
 from data_prep.check.clip import Clip
-from data_prep.check.findings import Finding
+from data_prep.check.findings import Finding, from_sentence
+from data_prep.mask_polarity import polarity_problems
 from data_prep.misfit import ADVICE
 
 # Of the size of the projected head. On clips whose tracking error is known (0.15 degrees, 0.4 mm, 2%) lips are off by less
 # than 0.018 and the mesh sticks out of the mask by less than 0.01.
 MAX_MOUTH, MAX_OVERHANG = 0.05, 0.05
 MIN_INSIDE = 0.9  # of the mesh without neck; the same clips have 0.99
+# On the same clips, lips overlap by more than 0.8, or are off by less than 0.005 where masks are drawn otherwise.
+USUAL_LIPS, USUAL_AWAY, MIN_PIXELS = 0.8, 0.012, 1.0  # overlap; of the head's size; pixels
+MIN_DROP = 0.3  # of the overlap of lips in a frame, below the clip's own median
 _ROBUST_SD = 1.4826  # times the median absolute deviation: the standard deviation of a normal distribution
 _OUTLIER = 6.0  # robust standard deviations
 IGNORED = "nothing, if you are sure: --ignore-misfit lets training start; compare mesh and masks on the page of --out"
 
 
 def check_fit(clip: Clip) -> list[Finding]:
+    return _polarity(clip) or _residuals(clip)  # no mesh lies on inverted masks
+
+
+def _polarity(clip: Clip) -> list[Finding]:
+    if clip.head is None:
+        return []
+    unread = [number for number in clip.files.images if not clip.is_whole(number)]
+    problems = polarity_problems(clip.head, clip.tracking.frames, clip.files, clip.max_left_out, unread)
+    return [from_sentence("inverted-mask", problem) for problem in problems]
+
+
+def _residuals(clip: Clip) -> list[Finding]:
     if not clip.fits or clip.judgement is None:
         return []
     if clip.judgement.problem is not None:
@@ -28,7 +44,7 @@ def check_fit(clip: Clip) -> list[Finding]:
     size = np.array([fit.size for fit in fits])
     inside = np.array([fit.inside for fit in fits])
     overhang, mouth = np.array([f.overhang for f in fits]) / size, np.array([f.mouth for f in fits]) / size
-    findings = []
+    findings = _lips(clip)
     for what, values, limit, region in (
         ("the tracked head sticks out of the head mask", overhang, MAX_OVERHANG, "head"),
         ("the tracked lips are away from the mouth mask", mouth, MAX_MOUTH, "mouth"),
@@ -72,3 +88,40 @@ def check_fit(clip: Clip) -> list[Finding]:
             )
         )
     return findings
+
+
+def _lips(clip: Clip) -> list[Finding]:
+    """Lips that do not follow the mouth in the pictures: over the clip, and in single frames."""
+    fits = {n: fit for n, fit in clip.fits.items() if np.isfinite(fit.lips) and np.isfinite(fit.mouth / fit.size)}
+    if not fits:
+        return []
+    overlap = np.array([fit.lips for fit in fits.values()])
+    usual = float(np.median(overlap))
+    pixels = float(np.median([fit.mouth for fit in fits.values()]))
+    away = float(np.median([fit.mouth / fit.size for fit in fits.values()]))
+    if usual < USUAL_LIPS and away > USUAL_AWAY and pixels >= MIN_PIXELS:
+        return [
+            Finding(
+                "warning",
+                "lips",
+                f"in the median, the tracked lips overlap the mouth masks by only {usual:.2f} and lie {pixels:.1f} pixels "
+                f"away ({away:.1%} of the head's size)",
+                "does the tracked mouth open and close with the video's? Compare them on the page of --out",
+            )
+        ]
+    spread = _ROBUST_SD * float(np.median(np.abs(overlap - usual)))
+    least = usual - max(MIN_DROP, _OUTLIER * spread)
+    low = [n for n, f in fits.items() if f.lips < least and MIN_PIXELS < f.mouth <= MAX_MOUTH * f.size]  # not far away
+    if not low:
+        return []
+    worst = min(low, key=lambda n: fits[n].lips)
+    return [
+        Finding(
+            "warning",
+            "lips",
+            f"the tracked lips hardly overlap the mouth mask in {clip.phrase(low)}: {fits[worst].lips:.2f} in "
+            f"{clip.name(worst)}, where {usual:.2f} is usual",
+            "look at these frames: is the mask wrong or the tracking? Redo it, or remove the frames",
+            clip.names(low),
+        )
+    ]

@@ -25,6 +25,7 @@ def check_head(assets: HeadAssets) -> list[Finding]:
     layout = Trimesh(flat_uvs, assets.uv_faces.numpy(), process=False)
     no_area = ~mesh.nondegenerate_faces()
     return [
+        *(Finding("note", "head-model", note, "nothing, if that is meant") for note in assets.notes),
         *_faces(no_area, assets, "no area on the head", "no Gaussian on them has a direction to face"),
         *_faces(
             ~layout.nondegenerate_faces() & ~no_area, assets, "no area in the UV layout", "no Gaussian lies on them"

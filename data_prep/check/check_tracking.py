@@ -9,11 +9,10 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
-from data_prep.check.clip import Clip
+from data_prep.check.clip import NOT_SOUGHT, Clip
 from data_prep.check.findings import Finding, from_sentence, grouped, loss_severity
 from data_prep.check.motion import suddenness
-from data_prep.check.view import TRACKING
-from data_prep.frame_files import describe_numbers
+from data_prep.frame_files import TRACKING, describe_numbers
 
 # A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
 # neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.
@@ -103,7 +102,7 @@ def repeated_tracking(clip: Clip) -> list[int]:
 
 def _offset(clip: Clip) -> list[Finding]:
     findings = []
-    if clip.offset is None and clip.head is not None:
+    if clip.offset is None and clip.offset_evidence != NOT_SOUGHT:
         findings.append(from_sentence("frame-offset", clip.offset_evidence))
     if clip.part_offsets is not None and clip.part_offsets[0] != clip.part_offsets[1]:
         first, last = clip.part_offsets

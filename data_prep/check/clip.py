@@ -17,11 +17,12 @@ from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.check.findings import frames_phrase
-from data_prep.check.view import IMAGE, TRACKING, View, look_at
+from data_prep.check.view import View, look_at
 from data_prep.fit import Fit, MeshProjector, fit_of_masks
 from data_prep.formats import METRICAL_TRACKER, open_tracked_folder
-from data_prep.frame_files import FrameFiles
+from data_prep.frame_files import IMAGE, TRACKING, FrameFiles
 from data_prep.frame_offset import OffsetEstimate, detect_offset
+from data_prep.mask_values import refuse_colours, with_labels
 from data_prep.masks import read_masks
 from data_prep.metrical_tracker import read_tracking
 from data_prep.misfit import Judgement, judge, sample
@@ -29,7 +30,7 @@ from data_prep.tracked_folder import TrackedFolder
 from data_prep.tracking import FrameTrack, Tracking, fit_coefficients
 
 MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
-GIVEN = "given with --frame-offset"
+GIVEN, NOT_SOUGHT = "given with --frame-offset", "not looked for: images, tracking or head model are missing"
 T = TypeVar("T")
 
 
@@ -48,6 +49,7 @@ class Clip:
     source: TrackedFolder
     tracking: Tracking
     complaints: tuple[tuple[str, str], ...]  # (which check, sentence): what stops `prepare` while reading
+    label_notes: tuple[str, ...]  # which masks are label images
     head: HeadModel | None
     offset: int | None  # image number - tracking number; None where it could not be found
     offset_evidence: str  # how it was found, or why it was not
@@ -128,27 +130,34 @@ def read_clip(
     """Read everything. Raises UserError only when the folder's files cannot be listed."""
     complaints: list[tuple[str, str]] = []
     source = open_tracked_folder(folder, tracking, format, lambda message: complaints.append(("layout", message)))
-    try:
-        source.refuse_offset(frame_offset)
-    except UserError as error:
-        complaints.append(("frame-offset", str(error)))
+    files, label_notes = with_labels(source.files)
+    source = replace(source, files=files)
+    for check, refuse in (
+        ("frame-offset", lambda: source.refuse_offset(frame_offset)),
+        ("mask-range", lambda: refuse_colours(files)),
+    ):
+        try:
+            refuse()
+        except UserError as error:
+            complaints.append((check, str(error)))
     views, steps = _read_views(source.files, progress)
     size = next((view.sizes[IMAGE] for view in views.values() if IMAGE in view.sizes), None)
     tracks = _read_tracking(source, assets, size, lambda message: complaints.append(("tracking", message)))
     head = None
     if assets is not None and tracks.frames:
         try:
-            tracks = fit_coefficients(tracks, assets)
+            tracks = fit_coefficients(tracks, assets, lambda message: complaints.append(("identity", message)))
             head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
         except UserError as error:
             complaints.append(("head-model", str(error)))
-    offset, evidence = frame_offset, GIVEN
+    offset, evidence = frame_offset, NOT_SOUGHT if frame_offset is None else GIVEN
     if source.is_paired:
         offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
     clip = Clip(
         source,
         tracks,
         tuple(complaints),
+        tuple(label_notes),
         head,
         offset,
         evidence,
@@ -184,8 +193,9 @@ def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View],
     steps: dict[int, float] = {}
     previous: tuple[int, np.ndarray] | None = None
     numbers = list(files.images)
+    decoders = files.decoders()
     with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
-        looks = pool.map(lambda n: look_at(_files_of(files, n), files.decode_parsing), numbers)
+        looks = pool.map(lambda n: look_at(_files_of(files, n), decoders), numbers)
         for number, view in zip(numbers, progress(looks, len(numbers), "images"), strict=True):
             views[number] = replace(view, grey=None)
             if view.grey is None:

@@ -17,11 +17,13 @@ from data_prep.check.check_files import check_files, lost_frames
 from data_prep.check.check_fit import check_fit
 from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
+from data_prep.check.check_motion import check_motion
 from data_prep.check.check_tracking import behind_camera, check_behind_camera, check_tracking, repeated_tracking
 from data_prep.check.clip import Clip, Progress, read_clip, silent
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
-from data_prep.check.view import HEAD, TRACKING
+from data_prep.frame_files import ALPHA, HEAD, TRACKING
+from data_prep.not_subjects import check_folder
 from data_prep.pairing import describe_reasons
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
@@ -73,6 +75,10 @@ def check_tracked_folder(
     findings: list[Finding] = []
     assets = None
     try:
+        check_folder(folder)
+    except UserError as error:
+        return Check(folder, (from_sentence("layout", str(error)),), None, None)
+    try:
         assets = load_head()
     except UserError as error:
         findings.append(from_sentence("head-model", str(error)))
@@ -91,7 +97,7 @@ def check_tracked_folder(
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     findings += [] if assets is None else check_head(assets)
-    findings += check_files(clip) + check_tracking(clip) + check_fit(clip)
+    findings += check_files(clip) + check_tracking(clip) + check_motion(clip) + check_fit(clip)
     findings += check_behind_camera(clip) + check_images(clip)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     lost = left_out(clip)
@@ -126,6 +132,8 @@ def left_out(clip: Clip) -> dict[int, str]:
             reasons[image] = f"it has no file in {', '.join(absent)}"
         elif view.brightest.get(HEAD) == 0:
             reasons[image] = "its head mask is empty"
+        elif view.brightest.get(ALPHA) == 0:
+            reasons[image] = "its matte is empty"
         elif image in behind:
             reasons[image] = "the tracked head is behind the camera"
         elif image in repeated:
@@ -149,6 +157,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
         fov = np.degrees(2 * np.arctan(0.5 * first.size[0] / first.intrinsics[0]))
         found["field of view"] = f"{fov:.1f} degrees"
     if clip.fits:
+        found["head outside the picture, median"] = f"{np.median([fit.outside for fit in clip.fits.values()]):.1%}"
         for name, title in (
             ("overlap", "overlap of mesh and head mask (IoU), median"),
             ("overhang", "mesh sticks out of the head mask, median, pixels"),

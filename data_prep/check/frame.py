@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.data.images import read_image, read_matte
+from avatar.data.images import read_bytes, read_image
 from avatar.data.subject import head_of_matte
 from avatar.types import Camera, Frame
 from data_prep.check.clip import Clip
@@ -29,7 +29,7 @@ def _frame(clip: Clip, number: int) -> Frame:
     height, width = image.shape[:2]
     alpha = np.full((height, width), 255, np.uint8)
     if number in files.alphas:
-        alpha = read_matte(files.alphas[number], files.images[number])
+        alpha = files.decode_alpha(read_bytes(files.alphas[number]), files.alphas[number])
     head, mouth = read_masks(files, number)
     if head is None or not (files.head_masks or files.parsing):
         head = head_of_matte(alpha)

@@ -28,7 +28,7 @@ def write_page(check: Check, cost: Mapping[str, str] | None, out: Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
         page = out / PAGE
-        page.write_text(render_page(check, cost), encoding="utf-8")
+        page.write_text(render_page(check, cost), encoding="utf-8", errors="replace")  # names may be none of UTF-8
         if check.clip is not None:
             write_frames(check.clip, out / TABLE)
     except OSError as error:

@@ -11,17 +11,15 @@ import cv2
 import numpy as np
 from skimage.measure import label
 
-from avatar.data.images import decode_image, decode_mask, decode_transparency, read_bytes
+from avatar.data.images import read_bytes
 from avatar.data.subject import head_of_matte
 from avatar.errors import UserError
 from data_prep import face_parsing
 from data_prep.face_parsing import mask_of
 from data_prep.fit import measured_size
+from data_prep.frame_files import ALPHA, HEAD, IMAGE, PARSING
 from data_prep.projection import filled
 
-# As FrameFiles.of_kind names them.
-IMAGE, ALPHA, HEAD, MOUTH = "imgs", "alpha", "parsing *_neckhead", "parsing *_mouth"
-PARSING, TRACKING = "face parsing", "checkpoint"
 FAR = 0.05  # of the image width: further from the person than soft hair reaches
 _ON = 127
 Decode = Callable[[bytes, Path], np.ndarray]
@@ -42,29 +40,28 @@ class Matte:
 class View:
     problems: dict[str, str] = field(default_factory=dict)  # kind of file -> why it cannot be read
     sizes: dict[str, tuple[int, int]] = field(default_factory=dict)  # kind -> width, height
-    brightest: dict[str, int] = field(default_factory=dict)  # kind of mask -> its largest value
+    darkest: dict[str, int] = field(default_factory=dict)  # kind of mask -> its least value
+    brightest: dict[str, int] = field(default_factory=dict)  # and its largest
     digest: bytes = b""  # of the image file
     grey: np.ndarray | None = None  # uint8 [h, w] at the measured size
     head_colour: np.ndarray | None = None  # float [3], mean over the head mask
     background_colour: np.ndarray | None = None  # float [3], mean over what the matte calls background
     matte: Matte | None = None
+    cut: float = 0.0  # share of the picture's upper edge that the head mask covers
 
 
-def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> View:
+def look_at(paths: Mapping[str, Path], decoders: Mapping[str, Decode]) -> View:
     """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing.
 
-    `decode_parsing` gives the classes of a PARSING file, out of which the head mask is made.
+    The decoder of PARSING gives classes, out of which the head mask is made.
     """
     problems: dict[str, str] = {}
     pixels: dict[str, np.ndarray] = {}
     digest = b""
     for kind, path in paths.items():
-        decode: Decode = decode_image if kind == IMAGE else decode_parsing if kind == PARSING else decode_mask
-        if kind == ALPHA and path == paths.get(IMAGE):
-            decode = decode_transparency
         try:
             data = read_bytes(path)
-            pixels[kind] = decode(data, path)
+            pixels[kind] = decoders[kind](data, path)
         except UserError as error:
             problems[kind] = str(error)
             continue
@@ -73,9 +70,11 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     sizes = {kind: (array.shape[1], array.shape[0]) for kind, array in pixels.items()}
     if PARSING in pixels:
         pixels[HEAD] = mask_of(pixels.pop(PARSING), face_parsing.HEAD)
-    brightest = {kind: int(array.max()) for kind, array in pixels.items() if kind != IMAGE}
+    darkest, brightest = (
+        {kind: int(extreme(array)) for kind, array in pixels.items() if kind != IMAGE} for extreme in (np.min, np.max)
+    )
     if IMAGE not in pixels:
-        return View(problems, sizes, brightest, digest)
+        return View(problems, sizes, darkest, brightest, digest)
     width, height = sizes[IMAGE]
     size = measured_size(width, height)
     small = {
@@ -95,12 +94,14 @@ def look_at(paths: Mapping[str, Path], decode_parsing: Decode = decode_mask) -> 
     return View(
         problems,
         sizes,
+        darkest,
         brightest,
         digest,
         grey=cv2.cvtColor(image, cv2.COLOR_RGB2GRAY),
         head_colour=None if head is None else _mean_colour(image, head > _ON),
         background_colour=None if alpha is None else _mean_colour(image, alpha <= 2),
         matte=matte,
+        cut=0.0 if head is None else float((head[0] > _ON).mean()),
     )
 
 

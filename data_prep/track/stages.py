@@ -56,9 +56,15 @@ class Stages:
             ) from None
         return result, key
 
-    def finish(self, target: Path, temporary: tuple[str, ...], better: Mapping[str, str] | None = None) -> None:
-        """Remove what only the making needed, put each stage of `better` in the place of the one that it is named with, and
-        give the folder its name."""
+    def finish(
+        self,
+        target: Path,
+        temporary: tuple[str, ...],
+        better: Mapping[str, str] | None = None,
+        seal: Callable[[Path], object] = lambda _: None,
+    ) -> None:
+        """Remove what only the making needed, put each stage of `better` in the place of the one that it is named with,
+        call `seal`, and give the folder its name."""
         try:
             for name in temporary:
                 shutil.rmtree(self.folder / name, ignore_errors=True)
@@ -68,6 +74,7 @@ class Stages:
             for record in self.folder.glob(f"*/{RECORD}"):
                 record.unlink()
             (self.folder / LOCK_FILE).unlink(missing_ok=True)
+            seal(self.folder)
             self.folder.rename(target)
         except OSError as error:
             raise UserError(

@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.third_party import FACE_LANDMARKER, SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find
-from avatar.head.assets import LAYOUT_IS_MADE, HeadAssets
+from avatar.head.assets import HeadAssets
 from data_prep.avatar_track import (
     FRAMES,
     LANDMARKS_FILE,
@@ -36,13 +35,13 @@ from data_prep.track.footage.source import Footage, View
 from data_prep.track.frames import (
     in_view,
 )
+from data_prep.track.inputs import look_inputs, matte_network, tracking_key
 from data_prep.track.look import Look
 from data_prep.track.progress import Progress, silent
 from data_prep.track.quality import judge
-from data_prep.track.stages import growing, hash_of
+from data_prep.track.stages import growing
 from data_prep.track.work import DESPILLED, Choices, Work
 
-STAGES_VERSION = 9  # raised when what a stage makes changes
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
 )
@@ -56,25 +55,25 @@ def track(
     choices: Choices | None = None,
     say: Callable[[str], object] = print,
     progress: Progress = silent,
+    seal: Callable[[Path], object] = lambda _: None,
 ) -> TrackingInfo:
     """Track one person's face through `video` (a file or a folder of pictures) and write the tracked folder `out`.
 
     The folder appears under its name when it is complete; until then its stages lie beside it, and the same call goes on
     from them. Nothing is done where `out` holds just this already. Raises UserError, with what to do, where the video or
-    the choices are of no use, and where `out` is something else.
+    the choices are of no use, and where `out` is something else. `seal` is called with the complete folder before it gets
+    its name.
     """
     choices = choices or Choices()
     footage = open_footage(video)
     say(f"{video}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
     for note in footage.notes:
         say(f"note: {note}")
-    if head.layout_is_made:
-        say(LAYOUT_IS_MADE)
+    for note in head.notes:
+        say(f"note: {note}")
     mattes = None if choices.matte is None else open_footage(choices.matte)
-    network = _matte_network()
-    options = choices.to_json()
-    seen = {"video": footage.content_hash(), "version": STAGES_VERSION, "landmarks": FACE_LANDMARKER.sha256}
-    key = hash_of([seen, options, head.fingerprint, network])
+    network, options, seen = matte_network(), choices.to_json(), look_inputs(footage)
+    key = tracking_key(footage, options, head_path, head)
     if out.exists() and not _is_empty(out):
         if recognise(out) and (known := read_info(out)).source.get("key") == key:
             say(f"{out} holds this tracking already")
@@ -117,9 +116,9 @@ def track(
         )
         write_tracking(stages.folder, info, fit.tracks)
         if spill:
-            stages.finish(out, ("look", "fit"), better={DESPILLED: FRAMES})
+            stages.finish(out, ("look", "fit"), {DESPILLED: FRAMES}, seal)
         else:
-            stages.finish(out, ("look", "fit", DESPILLED))
+            stages.finish(out, ("look", "fit", DESPILLED), seal=seal)
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
 
@@ -128,11 +127,6 @@ def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, f
     """fx, fy, cx, cy in pixels of the view; the principal point is the middle of the source picture."""
     centre = view.to_view(footage.width / 2, footage.height / 2)
     return focal.pixels * view.width / view.box.width, focal.pixels * view.height / view.box.height, *centre
-
-
-def _matte_network() -> str:
-    """The hash of the network that mattes are made with."""
-    return (SELFIE_MULTICLASS if find(SELFIE_MULTICLASS) is not None else SELFIE_SEGMENTATION).sha256
 
 
 def _left_out(look: Look) -> dict[int, str]:

@@ -30,6 +30,7 @@ from data_prep.track.frames import (
     write_given_mattes,
     write_masks,
 )
+from data_prep.track.inputs import head_inputs
 from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matte import open_matter, sharpened
@@ -160,7 +161,7 @@ class Work:
             return fit.figures
 
         figures, key = self._stages.run(
-            "fit", {"of": inputs, "head": self._head.fingerprint, "camera": list(intrinsics)}, make
+            "fit", {"of": inputs, "head": head_inputs(head_path, self._head), "camera": list(intrinsics)}, make
         )
         return Fit.load(self._folder / "fit" / TRACKS_FILE, intrinsics, landmarks.size, figures, key)
 

@@ -30,7 +30,8 @@ MISTAKES = {
     "no such sweep": (["sweep", "{tmp}/x.yaml"], "x.yaml cannot be read (No such file or directory)"),
     "a folder of runs": (["view", "{run}/.."], "holds {run}/../run"),
     "eval of a folder of runs": (["eval", "{run}/.."], "holds {run}/../run"),
-    "no head model": (["train", "{tmp}"], "no head model for {tmp}: give --head PATH, or set AVATAR_HEAD"),
+    "nothing to train on": (["train", "{tmp}"], "{tmp} is empty; docs/data.md says what belongs to a tracked folder"),
+    "no head model": (["train", "{bare}"], "no head model for {bare}: give --head PATH, or set AVATAR_HEAD"),
     "head model gone": (["train", "{data}", "--head", "{tmp}/x.pkl"], "x.pkl does not exist; give --head"),
     "unknown key": (["train", "{data}", "trainer.iteration=5"], "the nearest is 'trainer.iterations'"),
     "bad size": (["train", "{data}", "--size", "3"], "data.size=3 is out of range"),
@@ -89,7 +90,17 @@ def test_a_mistake_gets_one_sentence_and_a_status(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     arguments, sentence = MISTAKES[mistake]
-    places = {"tmp": tmp_path, "data": tracked_folder, "run": trained, "other": other_head, "twin": twin}
+    bare = tmp_path / "bare"
+    if "{bare}" in "".join(arguments):  # a tracked folder without a head model
+        (bare / "imgs").mkdir(parents=True)
+    places = {
+        "tmp": tmp_path,
+        "bare": bare,
+        "data": tracked_folder,
+        "run": trained,
+        "other": other_head,
+        "twin": twin,
+    }
     monkeypatch.setattr("urllib.request.urlopen", _no_network)
     output = avatar(*(a.format(**places) for a in arguments), status=1)
     assert sentence.format(**places) in output

@@ -126,7 +126,8 @@ def write_vhap(
         if angle:
             shared |= {"camera_angle_x": 2 * np.arctan(width / (2 * shot.K[0, 0]))}
         else:
-            shared |= {"fl_x": shot.K[0, 0], "fl_y": shot.K[1, 1], "cx": shot.K[0, 2], "cy": shot.K[1, 2]}
+            shared |= {"fl_x": shot.K[0, 0], "fl_y": shot.K[1, 1], "cx": shot.K[0, 2]}
+            shared |= {"cy": height - shot.K[1, 2]}  # counted from the bottom
         entry = {
             "timestep_index": step,
             "camera_index": 0,

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from preparing import prepare_folder
 from tracked_folder import write_tracked_folder
 
+from avatar.commands import tracking
 from avatar.data.manifest import read_manifest
 from avatar.data.source import Source
 from avatar.data.split import SplitSizes
@@ -49,10 +52,6 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     other, _, reused = run(split=SplitSizes(test=2))
     assert not reused and other != first and len(read_manifest(other).test) == 2
 
-    (first / "manifest.json").write_text("{")
-    assert not run()[2] and run()[2]
-    (first / "tracks.safetensors").unlink()
-    assert not run()[2] and run()[2]
     assert sorted(p.name for p in (tmp_path / "cache" / "subjects").iterdir()) == sorted([first.name, other.name])
 
 
@@ -68,6 +67,15 @@ def test_another_head_model_prepares_again(tmp_path: Path) -> None:
     assert run(head) == head.fingerprint
     assert run(replace(head, fingerprint="f" * 64)) == "f" * 64
     assert run(head) == head.fingerprint
+
+
+def test_prepared_again_when_the_head_model_has_moved(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=6)
+    head = load_head_assets(folder / "head_model")
+    shutil.copytree(folder / "head_model", tmp_path / "moved")
+    for place in (folder / "head_model", tmp_path / "moved"):
+        prepare(Source(folder, place, frame_offset=1), head, out=tmp_path / "out", say=lambda _: None)
+        assert read_manifest(tmp_path / "out").head_path == str(place)
 
 
 def test_a_failed_preparation_keeps_the_old_one(tmp_path: Path) -> None:
@@ -102,3 +110,111 @@ def test_the_data_hash_does_not_depend_on_the_place(tmp_path: Path) -> None:
     first, _ = prepare_folder(a, tmp_path / "out1")
     second, _ = prepare_folder(tmp_path / "b" / "two", tmp_path / "out2")
     assert first.data_hash == second.data_hash and first.manifest.input_hash != second.manifest.input_hash
+
+
+def flip(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+def place(path: Path, content: bytes) -> int:
+    return path.read_bytes().index(content)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "tracks cut short": lambda p: cut(p / "tracks.safetensors"),
+    "a flipped bit in the tracks": lambda p: flip(p / "tracks.safetensors", -5),
+    "tracks missing": lambda p: (p / "tracks.safetensors").unlink(),
+    "a flipped bit in the manifest": lambda p: flip(
+        p / "manifest.json", p.joinpath("manifest.json").read_bytes().find(b"179.2")
+    ),
+    "manifest cut short": lambda p: cut(p / "manifest.json"),
+    "a flipped bit in a mask": lambda p: flip(p / "mouth" / "00003.png", -20),
+    "a mask missing": lambda p: (p / "mouth" / "00003.png").unlink(),
+    "its hashes cut short": lambda p: (p / "contents.sha256").write_text(""),
+    "its hashes missing": lambda p: (p / "contents.sha256").unlink(),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_prepared_subject_is_made_again_and_it_is_said(name: str, tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=6, mouth_masks=False)
+    _, said = prepare_folder(folder, tmp_path / "out", frame_offset=1)
+    assert not any("is damaged" in line for line in said)
+    before = {path: path.read_bytes() for path in sorted((tmp_path / "out").rglob("*")) if path.is_file()}
+    DAMAGES[name](tmp_path / "out")
+    _, said = prepare_folder(folder, tmp_path / "out", frame_offset=1)
+    assert "is damaged" in said[0] and "made again" in said[0], said
+    after = {path: path.read_bytes() for path in sorted((tmp_path / "out").rglob("*")) if path.is_file()}
+    assert after == before
+    _, said = prepare_folder(folder, tmp_path / "out", frame_offset=1)
+    assert said == [f"using the prepared subject {tmp_path / 'out'}"]
+
+
+NAMES = {
+    "255 characters": "x" * 255,
+    "255 bytes of two each": "\u00e9" * 127,
+    "not UTF-8": os.fsdecode(b"Zo\xeb"),
+    "a line break": "a\nb",
+    "blanks": "   ",
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_folders_of_any_name_are_prepared(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
+    folder = write_tracked_folder(tmp_path / "subject", frames=6).rename(tmp_path / NAMES[name])
+    head = load_head_assets(folder / "head_model")
+    source = Source(folder, folder / "head_model", frame_offset=1)
+    prepared = prepare(source, head, say=lambda _: None)
+    assert len(prepared.name.encode()) < 100 and prepared.name.isprintable()
+    subject = Subject.open(prepared)
+    assert subject.frame(2).image.shape == (64, 64, 3) and subject.name.isprintable()
+    said: list[str] = []
+    assert prepare(source, head, say=said.append) == prepared and len(said) == 1
+
+
+def test_frames_whose_names_are_not_utf_8_are_prepared(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=6)
+    for path in sorted((folder / "imgs").iterdir()):
+        path.rename(path.with_name(os.fsdecode(b"Zo\xeb_") + path.name))
+    subject, _ = prepare_folder(folder, tmp_path / "out", frame_offset=1)
+    assert subject.frame(2).image.shape == (64, 64, 3)
+
+
+def test_a_place_with_the_longest_name_can_be_chosen(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=6)
+    subject, _ = prepare_folder(folder, tmp_path / ("x" * 255), frame_offset=1)
+    assert len(subject) == 6
+
+
+def test_a_damaged_tracking_in_the_cache_is_made_again_and_it_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
+    video = tmp_path / ("x" * 250 + ".mp4")
+    video.write_bytes(b"a video")
+    head = write_tracked_folder(tmp_path / "subject", frames=2) / "head_model"
+    made: list[Path] = []
+
+    def fake_track(video: Path, out: Path, *_: object, seal: Callable[[Path], object], **__: object) -> None:
+        (out / "frames").mkdir(parents=True)
+        (out / "frames" / "00000.jpg").write_bytes(b"picture")
+        (out / "tracking.json").write_text("{}")
+        seal(out)
+        made.append(out)
+
+    monkeypatch.setattr(tracking, "track", fake_track)
+    monkeypatch.setattr(tracking, "open_footage", lambda path: SimpleNamespace(content_hash=lambda: "ab"))
+    folder = tracking.tracked_once(video, head)
+    assert tracking.tracked_once(video, head) == folder and made == [folder]
+    flip(folder / "frames" / "00000.jpg", 2)
+    capsys.readouterr()
+    assert tracking.tracked_once(video, head) == folder and made == [folder, folder]
+    assert "frames/00000.jpg is not what was written; it is made again" in capsys.readouterr().out
+    assert tracking.tracked_once(video, head) == folder and made == [folder, folder]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -50,6 +51,18 @@ def test_smoothing_is_a_centred_gaussian_and_leaves_gaze_and_blinks() -> None:
     assert float(values[9] / values[10]) == pytest.approx(float(ratio), abs=1e-5)
     assert [float(p.eyelids[0]) for p in out.params] == [float(p.eyelids[0]) for p in peak]
     assert all(torch.equal(a.eyes, b.eyes) for a, b in zip(out.params, peak, strict=True))
+
+
+@pytest.mark.parametrize("joint", ["jaw", "neck"])
+def test_smoothing_calms_a_joint_that_trembles(joint: str) -> None:
+    """As VHAP's neck does, which holds a part of the head's motion."""
+    nod = [torch.tensor([1.0, 0, 0, 0, math.cos(a), -math.sin(a)]) for a in (0.05 * (-1) ** n for n in range(20))]
+    trembling = drive(20, params=[replace(rest_params(), **{joint: rows}) for rows in nod])
+    out = torch.stack([getattr(p, joint) for p in smoothed(trembling, 2.0).params])
+    assert float(out[:, 5].abs()[6:-6].max()) < 0.01 * 0.05
+    if joint == "neck":
+        still = [p.jaw for p in smoothed(trembling, 2.0).params]
+        assert all(torch.equal(jaw, rest_params().jaw) for jaw in still)
 
 
 def test_whose_camera() -> None:

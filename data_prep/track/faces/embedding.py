@@ -15,7 +15,8 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
-from avatar.head.assets import HeadAssets, find_model_file
+from avatar.head.assets import HeadAssets
+from avatar.head.find import find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces.landmark_groups import LEFT_IRIS, NUM_MESH, RIGHT_IRIS
 
@@ -43,12 +44,17 @@ class LandmarkEmbedding:
         )
 
 
+def official_file(head: Path) -> Path:
+    """Where the embedding of a head model (file or folder) would lie."""
+    return find_model_file(head).parent / OFFICIAL_FILE
+
+
 def official_embedding(head: Path, assets: HeadAssets) -> LandmarkEmbedding | None:
     """The embedding that lies beside a head model (file or folder); None where there is none.
 
     Its 105 points are contours of eyes, brows, nose and lips. Raises UserError for a file that does not fit the model.
     """
-    path = find_model_file(head).parent / OFFICIAL_FILE
+    path = official_file(head)
     if not is_there(path):
         return None
     arrays = load_npz(path)

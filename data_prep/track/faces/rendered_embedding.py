@@ -14,6 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from avatar.errors import UserError
 from avatar.files.places import cache_folder
+from avatar.files.third_party import FACE_LANDMARKER
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces.embedding import LandmarkEmbedding, load_embedding, save_embedding
@@ -25,7 +26,7 @@ Landmarker = Callable[[UInt8[np.ndarray, "H W 3"]], Float32[np.ndarray, "478 3"]
 
 HEADS = 80
 FEWEST = 20  # pictures with a face, below which nothing is learned
-_RECIPE = 1  # counts changes of the pictures and of the search; a cached embedding is of one recipe
+RECIPE = 1  # counts changes of the pictures and of the search; a cached embedding is of one recipe
 _SEEN_SHARE = 0.35  # of the pictures in which a vertex must be visible to be a candidate
 _NEIGHBOURS = 6  # vertices whose triangles are tried for a landmark
 _ITERATIONS = 20
@@ -52,7 +53,8 @@ def cached_embedding(assets: HeadAssets) -> LandmarkEmbedding | None:
 
 
 def _place(assets: HeadAssets) -> Path:
-    return cache_folder() / "embeddings" / f"{assets.fingerprint[:16]}-{_RECIPE}.npz"
+    name = f"{assets.fingerprint[:16]}-{FACE_LANDMARKER.sha256[:8]}-{RECIPE}.npz"
+    return cache_folder() / "embeddings" / name
 
 
 def make_embedding(assets: HeadAssets, landmarker: Landmarker, heads: int = HEADS) -> LandmarkEmbedding:

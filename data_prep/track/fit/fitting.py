@@ -10,7 +10,6 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
-from avatar.head.expression_names import load_expression_names
 from data_prep.track.faces.detect import FaceDetector
 from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding, official_embedding
 from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
@@ -32,10 +31,9 @@ def fit_tracks(
     progress: Progress,
 ) -> Fit:
     embedding = find_embedding(head_path, head)
-    names = load_expression_names(head_path, head.num_expressions)
     camera = Pinhole(*clip.intrinsics)
     with side_by_side():
-        by_landmarks = fit_landmarks(head, names, embedding, clip.landmarks, camera)
+        by_landmarks = fit_landmarks(head, head.names, embedding, clip.landmarks, camera)
         read = clip.images.__getitem__, clip.mattes.__getitem__
         by_pictures = fit_pictures(head, by_landmarks, camera, *read, progress)
     tracks = as_tracks(by_landmarks, by_pictures.motion, clip, head.num_expressions)

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, has_transparency, read_bytes, read_image
+from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES, has_transparency, read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.track.footage.source import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque
 from data_prep.track.footage.timing import DEFAULT_FPS
@@ -110,6 +110,9 @@ def open_pictures(folder: Path) -> PictureFolder:
     if not files:
         inside = next((name for name in ("imgs", "frames", "images") if (folder / name).is_dir()), None)
         hint = f"; it looks like a tracked folder: give {folder / inside} to track its pictures again" if inside else ""
+        others = sorted({p.suffix.lower() for p in folder.iterdir()} & set(OTHER_PICTURES))
+        if others and not hint:
+            raise UserError(f"{folder} holds {' and '.join(others)} files; convert them to PNG")
         raise UserError(f"{folder} holds no PNG or JPEG pictures{hint or ' and is not a video'}")
     if len(files) > _MAX_PICTURES:
         raise UserError(f"{folder} holds {len(files)} pictures; more than {_MAX_PICTURES} are not read")

@@ -192,13 +192,16 @@ DEFECTS: dict[str, tuple[Edit, str, str, str]] = {
     ),
 }
 MISFIT = {"residual": "warning"}
+CUT_OFF = {"cut-off": "warning"}
 ALSO: dict[str, dict[str, str]] = {  # what a defect shows besides, truthfully
     "tracking repeats": MISFIT,
     "head behind the camera": {"jumps": "warning"},
     "rotation jumps": MISFIT,
     "wide focal length": {"residual": "error"},
     "pixels not square": MISFIT,
-    "principal point outside": {"residual": "error"},
+    "principal point outside": {"residual": "error"} | CUT_OFF,
+    "position jumps far": CUT_OFF,
+    "speck in the mask": {"cut-off": "note"},
     "head sticks out": {"mask-area": "warning"},
     "repeated images": MISFIT,
 }

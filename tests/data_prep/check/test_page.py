@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import shutil
 import subprocess
 from html.parser import HTMLParser
@@ -34,7 +35,9 @@ class Sources(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_tracked_folder(tmp_path_factory.mktemp("page") / "so <me> & one", 24)
+    name = "so <me> & one" + os.fsdecode(b"\xeb")  # not UTF-8 at the end
+    folder = write_tracked_folder(tmp_path_factory.mktemp("page") / "folder", 24)
+    folder = folder.rename(folder.with_name(name))
     all_zero(5)(folder)
     out = folder.parent / "out"
     assert main(["check", str(folder), "--frame-offset", "1", "--out", str(out)]) == 1

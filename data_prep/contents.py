@@ -1,0 +1,40 @@
+"""What a cached folder held when it was written: a cut file or a flipped bit is noticed, and the folder made again."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+CONTENTS_FILE = "contents.sha256"  # in the format of sha256sum
+
+
+def write_contents(folder: Path) -> None:
+    """Write the hash of every file into `CONTENTS_FILE`."""
+    lines = [f"{_hash(path)}  {name}\n" for name, path in _files(folder).items()]
+    (folder / CONTENTS_FILE).write_text("".join(lines), encoding="utf-8")
+
+
+def find_damage(folder: Path) -> str | None:
+    """What is not as `write_contents` found it; None where all is. Files that were added do not count."""
+    try:
+        lines = (folder / CONTENTS_FILE).read_text(encoding="utf-8").splitlines()
+        recorded = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    except (OSError, ValueError):
+        return f"{CONTENTS_FILE} is missing or cannot be read"
+    files = _files(folder)
+    for name, digest in recorded.items():
+        try:
+            if name not in files or _hash(files[name]) != digest:
+                return f"{name} is {'missing' if name not in files else 'not what was written'}"
+        except OSError as error:
+            return f"{name} cannot be read ({error.strerror})"
+    return None if recorded else f"{CONTENTS_FILE} is empty"
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != CONTENTS_FILE)
+    return {path.relative_to(folder).as_posix(): path for path in found}
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
