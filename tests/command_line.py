@@ -16,5 +16,5 @@ def avatar(*arguments: object, status: int = 0) -> str:
             returned = main([str(argument) for argument in arguments])
         except SystemExit as stop:  # argparse: --help, --version, usage
             returned = int(stop.code or 0)
-    assert returned == status, output.getvalue()
+    assert returned == status, output.getvalue().encode(errors="replace").decode()  # pytest-xdist sends UTF-8 alone
     return output.getvalue()

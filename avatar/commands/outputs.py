@@ -31,10 +31,6 @@ def check_folder_output(output: Path) -> None:
 def check_run_folder(run: Path, inputs: Iterable[Path | None]) -> None:
     """Raise UserError when a new run would be, or would write over, what it is trained on."""
     read = [path for path in inputs if path is not None]
-    try:
-        str(run).encode()
-    except UnicodeEncodeError:
-        raise UserError(f"{run} is not a UTF-8 name, which the format of avatars needs; choose another --out") from None
     check_folder_output(run)
     check_outputs([run], read)
     for path in read:
