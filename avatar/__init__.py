@@ -6,11 +6,12 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from avatar.version import __version__
+
 if TYPE_CHECKING:
     from avatar.runs.trained import TrainedAvatar
 
 __all__ = ["__version__", "load"]
-__version__ = "0.1.0"
 
 # After every operation torch's OpenMP threads wait for the next one in a busy loop, for milliseconds, on the cores that the
 # splatter's own threads want; where anything else runs, that loop is what makes a step ten times slower. Torch's GNU

@@ -6,56 +6,10 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
-from avatar.errors import UserError
-
-EXIT_ERROR = 1
-EXIT_INTERRUPTED = 130
-_INTERRUPTED = "avatar: interrupted"
-
-
-def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object] = lambda: None) -> int:
-    """Run one command; returns the exit status. What a user can mend is printed as a sentence, without a stack trace.
-
-    `when_loaded` is called when everything that the command needs is imported, and nothing is done yet.
-    """
-    try:
-        # The commands import torch and the compiled core; --help must answer without them.
-        from avatar.commands import find_command
-        from avatar.commands.arguments import parse
-
-        arguments = parse(argv)
-        command = find_command(arguments.command)
-        when_loaded()
-        return command(arguments)
-    except UserError as error:
-        return _failed(str(error))
-    except BrokenPipeError:
-        return _nobody_reads()
-    except OSError as error:
-        place = "" if error.filename is None else f"{error.filename}: "
-        return _failed(f"{place}{error.strerror or error}")
-    except UnicodeEncodeError as error:
-        if error.reason != "surrogates not allowed":
-            raise
-        return _failed(f"{error.object} has a name that is not UTF-8, which a library needs here: rename it")
-    except (MemoryError, RuntimeError) as error:
-        if type(error).__name__ == "OutOfMemoryError":  # torch's for a GPU, which need not be imported yet
-            return _failed(
-                "the GPU's memory is full: lower --size or model.uv_size, end other programs that use it, or take "
-                "--device cpu"
-            )
-        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for it
-            raise
-        return _failed(f"there is not enough memory ({str(error).splitlines()[0] if str(error) else 'out of memory'})")
-    except KeyboardInterrupt:
-        with suppress(KeyboardInterrupt):
-            print(_INTERRUPTED, file=sys.stderr)
-        return EXIT_INTERRUPTED
+from avatar.commands.main import EXIT_INTERRUPTED, INTERRUPTED, drop_output, failed, main, nobody_reads
 
 
 def run() -> NoReturn:
@@ -79,10 +33,10 @@ def run() -> NoReturn:
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        status = _nobody_reads()
+        status = nobody_reads()
     except OSError as error:
-        _drop_output()
-        status = status or _failed(f"the output cannot be written ({error.strerror})")
+        drop_output()
+        status = status or failed(f"the output cannot be written ({error.strerror})")
     sys.exit(status)
 
 
@@ -100,25 +54,8 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _failed(reason: str) -> int:
-    with suppress(OSError):
-        print(f"avatar: {reason}", file=sys.stderr)
-    return EXIT_ERROR
-
-
-def _nobody_reads() -> int:
-    """What was printed went to a program that has ended, such as `head`."""
-    _drop_output()
-    return EXIT_ERROR
-
-
-def _drop_output() -> None:
-    """Python flushes at the end, and would complain again."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def _leave(_: int, __: FrameType | None) -> NoReturn:
-    os.write(2, f"{_INTERRUPTED}\n".encode())
+    os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(EXIT_INTERRUPTED)
 
 

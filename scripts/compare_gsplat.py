@@ -21,12 +21,12 @@ import torch
 from torch import Tensor
 
 from avatar.bench.clock import paired_medians
-from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.bench.splat_gpu import settle, splat_gsplat
-from avatar.commands.opening import open_trained
-from avatar.compute.choose import choose_device
+from avatar.pipeline.device import choose_device
+from avatar.runs.run import open_trained
 from avatar.splat import splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
+from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.types import Camera, Gaussians, Rendering
 
 COUNTS = (10_000, HEAD_SPLATS, 30_000, 100_000, 300_000)

@@ -30,7 +30,6 @@ from triton.backends import nvidia
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
@@ -38,6 +37,7 @@ from avatar.kernels.start import watched
 from avatar.losses.photometric import dssim
 from avatar.splat import splat
 from avatar.splat.capacity import fixed_capacity
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.train.step import PerceptualTerm, Weighted
 from avatar.types import Gaussians
 

@@ -22,7 +22,6 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from avatar.bench.scenes import head_camera
 from avatar.config import load_config
 from avatar.data.loader import FrameLoader
 from avatar.data.recording import Recording
@@ -37,6 +36,7 @@ from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
 from avatar.render import Renderer
 from avatar.splat.capacity import fixed_capacity
+from avatar.splat.scenes import head_camera
 from avatar.tracking.freedom import find_freedom
 from avatar.train.ahead import Guard
 from avatar.train.align import Alignment

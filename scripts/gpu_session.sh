@@ -28,13 +28,13 @@ run() { # NAME COMMAND...: its output goes to OUT/NAME.log
   fi
   echo "-- $name: $((SECONDS - begin)) s"
 }
-self_test='import torch; from avatar.compute.self_test import self_test; print(max(self_test(torch.device("cuda", 0)).values()))'
+self_test='import torch; from avatar.pipeline.self_test import self_test; print(max(self_test(torch.device("cuda", 0)).values()))'
 
 case $part in
 checks)
   run device nvidia-smi
   run doctor avatar doctor
-  run self-test python3 -c 'from avatar.compute.choose import choose_device; choose_device("cuda", print)'
+  run self-test python3 -c 'from avatar.pipeline.device import choose_device; choose_device("cuda", print)'
   # Without torch's caching allocator, so that a write beside a buffer is not one into the next.
   for tool in memcheck racecheck initcheck; do
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 run "$tool" timeout 240 compute-sanitizer --tool "$tool" --error-exitcode 9 \

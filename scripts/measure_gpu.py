@@ -20,17 +20,17 @@ from count_launches import Rehearsal
 from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.bench.splat_gpu import device_of, settle
-from avatar.compute.choose import choose_device
 from avatar.compute.device import interpreted
 from avatar.compute.replay import own_stream
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.losses.photometric import dssim
+from avatar.pipeline.device import choose_device
 from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
+from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.train.step import Objective, PerceptualTerm, Weighted
 from avatar.train.steps import WARM, Steps
 from avatar.types import Gaussians

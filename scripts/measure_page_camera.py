@@ -31,7 +31,7 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 from torch import Tensor
 
-from avatar.commands.driving import head_of
+from avatar.commands.reenact import head_of
 from avatar.errors import UserError
 from avatar.export.drawing import reduce_avatar
 from avatar.export.landmarker_pack import PACK, make_pack

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from avatar.commands.driving import head_of
+from avatar.commands.reenact import head_of
 from avatar.head.assets import HeadAssets
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar

@@ -88,8 +88,8 @@ def main() -> int:
 def load() -> None:
     import triton.runtime.interpreter  # noqa: F401
 
-    import avatar.bench.scenes
     import avatar.model
+    import avatar.splat.scenes
     import avatar.train.trainer  # noqa: F401
 
 

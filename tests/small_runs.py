@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from avatar.commands.opening import split_sizes
 from avatar.config import Config, chosen_options, load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
+from avatar.pipeline.open import split_sizes
 from avatar.runs.checkpoint import Checkpoint
 from avatar.runs.run import start_run
 from avatar.train.step import choose_perceptual

@@ -1,4 +1,4 @@
-"""Imports go one way: data_prep to avatar's types, head model and files; back only from the command line."""
+"""Imports go one way, and every package and module of avatar/ and data_prep/ has its place in that way."""
 
 from __future__ import annotations
 
@@ -10,31 +10,29 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMAND_LINE = {"avatar/commands", "avatar/bench"}
-BELOW = {"types", "errors", "tensors", "compute", "head", "data", "files", "html"}  # what importers may build on
-END_OF_THE_PATH = "avatar/motion/reenact.py"  # motion in, video out: it uses all before it, and nothing uses it
-# No package imports one that is to its right in this order, which is that of the data.
+# None of these imports one that comes after it, inside of functions neither.
 ORDER = [
-    "files",
-    "tensors",
-    "head",
-    "data",
-    "gaussians",
-    "splat",
-    "losses",
-    "tracking",
-    "motion",
-    "runs",
-    "train",
-    "refine",
-    "evaluation",
+    *("avatar.errors", "avatar.version", "avatar.tensors", "avatar.files", "avatar.html"),
+    *("avatar.compute", "avatar.types", "avatar.kernels"),
+    *("avatar.head", "avatar.data", "avatar.config_values", "avatar.config"),
+    *("data_prep", "data_prep.check", "data_prep.track", "data_prep.live"),
+    *("avatar.losses", "avatar.splat", "avatar.gaussians", "avatar.model", "avatar.render"),
+    *("avatar.tracking", "avatar.motion", "avatar.runs", "avatar.train", "avatar.refine", "avatar.evaluation"),
+    *("avatar.pipeline", "avatar.report", "avatar.view", "avatar.export", "avatar.sweep"),
+    *("avatar.demo", "avatar.bench", "avatar.commands", "avatar.cli", "avatar"),
 ]
+ON_TOP = {"avatar.pipeline", "avatar.bench", "avatar.commands"}  # what may use the importers of data_prep
+BELOW = {"types", "errors", "version", "tensors", "compute", "head", "data", "files", "html"}  # what importers may use
 
 
 def imports(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module in ("avatar", "data_prep"):
+            yield from (
+                f"{node.module}.{alias.name}" for alias in node.names if alias.name != "_core"
+            )  # the compiled one
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             yield node.module
 
@@ -43,25 +41,49 @@ def modules(folder: str) -> list[Path]:
     return sorted((ROOT / folder).rglob("*.py"))
 
 
-@pytest.mark.parametrize("path", modules("avatar"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_only_the_command_line_uses_the_importers(path: Path) -> None:
-    if not any(path.is_relative_to(ROOT / place) for place in COMMAND_LINE):
-        assert not [name for name in imports(path) if name.split(".")[0] == "data_prep"]
+def room(name: str) -> str:
+    """Of a module or of what is imported from one: the entry of ORDER that it belongs to."""
+    place = ".".join(name.split(".")[:2])
+    return place if place in ORDER else name.split(".")[0]
 
 
-@pytest.mark.parametrize("path", modules("data_prep"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_importers_build_on_what_is_below_them(path: Path) -> None:
-    used = {name.split(".")[1] for name in imports(path) if name.startswith("avatar.")}
-    assert used <= BELOW
+def name_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-@pytest.mark.parametrize("package", ORDER)
-def test_packages_follow_the_data(package: str) -> None:
-    above = set(ORDER[ORDER.index(package) + 1 :]) | {"commands", "cli", "bench"}
-    place = ROOT / "avatar" / package
-    for path in sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]:
-        used = {name.split(".")[1] for name in imports(path) if name.startswith("avatar.")}
-        assert path.match(END_OF_THE_PATH) or not used & above, path
+MODULES = {name_of(path): path for folder in ("avatar", "data_prep") for path in modules(folder)}
+
+
+def test_every_package_and_module_has_a_place() -> None:
+    names = {".".join(name.split(".")[:2]) for name in MODULES}
+    folders = {name for name in names if (ROOT / name.replace(".", "/")).is_dir()}
+    assert {name for name in names if name.startswith("avatar")} | folders == {*ORDER}
+
+
+IMPORTS = {
+    name: {other for other in imports(path) if other.split(".")[0] in ("avatar", "data_prep")}
+    for name, path in MODULES.items()
+}
+
+
+def test_imports_go_one_way() -> None:
+    up = [
+        (name, other)
+        for name, used in IMPORTS.items()
+        for other in used
+        if ORDER.index(room(other)) > ORDER.index(room(name))
+    ]
+    assert not up
+
+
+def test_only_what_is_on_top_uses_the_importers() -> None:
+    users = {room(name) for name, used in IMPORTS.items() if any(other.startswith("data_prep") for other in used)}
+    assert {user for user in users if user.startswith("avatar")} <= ON_TOP
+
+
+def test_importers_build_on_what_is_below_them() -> None:
+    used = {(name, other) for name, used in IMPORTS.items() if name.startswith("data_prep") for other in used}
+    assert not [pair for pair in used if pair[1].startswith("avatar.") and pair[1].split(".")[1] not in BELOW]
 
 
 def test_the_root_of_the_package_stays_small() -> None:

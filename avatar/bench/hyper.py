@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.scenes import HEAD_SPLATS
 from avatar.errors import UserError
 from avatar.gaussians.hyper import Heads, HyperHead, HyperHeads, unpack
 from avatar.gaussians.hyper_cpu import HEADS, condition
+from avatar.splat.scenes import HEAD_SPLATS
 
 LATENT_SIZES, QUICK_LATENT_SIZES = (1, 2, 4, 8, 16, 32, 64, 128), (1, 8)
 COVARIANCE_FLOATS = 6_000_000  # of one head's covariances; it is timed on as many Gaussians as have these

@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-import avatar
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.splat import splat
+from avatar.splat.scenes import head_camera, head_shell
+from avatar.version import __version__
 
 SIMD = ("baseline", "avx2", "avx512")
 
@@ -21,7 +21,7 @@ SIMD = ("baseline", "avx2", "avx512")
 def describe_machine() -> dict[str, Any]:
     """The machine and the versions, for the JSON of every benchmark; `load` is what else ran in the last minute."""
     return {
-        "avatar": avatar.__version__,
+        "avatar": __version__,
         "torch": torch.__version__,
         "system": f"{platform.system()} {platform.machine()}",
         "processor": processor_name(),

@@ -14,13 +14,13 @@ from tqdm import tqdm
 
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.train import Trainee, per_step, run_steps, steps_at_once, trainee
-from avatar.commands.opening import open_run
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
 from avatar.evaluation.networks import find_lpips
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
+from avatar.pipeline.open import open_run
 from avatar.render import Renderer
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run

@@ -19,8 +19,6 @@ import torch
 from avatar.bench import Request
 from avatar.bench.disturb import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed
 from avatar.bench.results import leave
-from avatar.commands.opening import split_sizes
-from avatar.commands.plan import round_steps
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
@@ -32,6 +30,8 @@ from avatar.head.model import HeadModel
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.model import Avatar
+from avatar.pipeline.open import split_sizes
+from avatar.pipeline.plan import round_steps
 from avatar.refine.refine import refine_subject
 from avatar.render import Renderer
 from avatar.tracking.motion import EXPRESSION, values_of

@@ -16,10 +16,10 @@ from torch import Tensor
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import available_simd, limited_to
 from avatar.bench.plain import splat_plain
-from avatar.bench.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.bench.splat_gpu import ON_GPU, device_of, gpu_backends, settle, splat_gsplat
 from avatar.errors import UserError
 from avatar.splat import splat
+from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.types import Gaussians, Rendering
 
 # What float32 and the cut-offs allow; tests/splat holds the kernel to the same.

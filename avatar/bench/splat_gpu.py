@@ -6,8 +6,8 @@ from importlib.util import find_spec
 
 import torch
 
-from avatar.compute.choose import sees_gpu
 from avatar.compute.device import CPU, interpreted
+from avatar.pipeline.device import sees_gpu
 from avatar.types import Camera, Gaussians, Rendering
 
 ON_GPU = ("gpu", "gsplat")

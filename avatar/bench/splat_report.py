@@ -11,11 +11,11 @@ from avatar.bench import Request
 from avatar.bench.floor import measured_copy_bandwidth, measured_flops
 from avatar.bench.machine import available_simd
 from avatar.bench.results import leave
-from avatar.bench.scenes import HEAD_SPLATS
 from avatar.bench.splat import Row, all_variants, measure
 from avatar.bench.splat_gpu import ON_GPU, gpu_backends
 from avatar.bench.splat_plot import total, write_plot
 from avatar.bench.splat_work import Work, floors, work_of
+from avatar.splat.scenes import HEAD_SPLATS
 
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
 USUAL_SIZES, USUAL_COUNTS = (256, 512), (HEAD_SPLATS, 50_000)

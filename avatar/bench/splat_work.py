@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 
 from avatar.bench.floor import floor_ms
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.splat import Counters, counters
+from avatar.splat.scenes import head_camera, head_shell
 
 # Floating-point operations of the kernels for one splat at one pixel, an fma as two (csrc/splat/raster_forward.h and
 # raster_backward.h): distances 2, falloff 17, then alpha, transmittance and colour, or their gradients and nine sums.
@@ -24,7 +24,7 @@ PIXEL_BYTES = 16  # image and alpha
 MEMORY_SCRIPT = """
 import sys, torch
 from pathlib import Path
-from avatar.bench.scenes import head_camera, head_shell
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.splat import splat
 from avatar.types import Gaussians
 def high_water():

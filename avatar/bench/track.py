@@ -23,8 +23,6 @@ from avatar.bench import Request
 from avatar.bench.placement import Placement, corners_distance, placement
 from avatar.bench.refine import MEASURED_EVERY, Figures, Trial, figures
 from avatar.bench.results import leave
-from avatar.commands.opening import split_sizes
-from avatar.commands.tracking import bar
 from avatar.config import Config, load_config
 from avatar.data.recording import TRACK_SHAPES, Recording
 from avatar.data.source import Source
@@ -35,6 +33,8 @@ from avatar.errors import UserError
 from avatar.evaluation.networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
+from avatar.pipeline.open import split_sizes
+from avatar.pipeline.track import bar
 from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps
 from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo

@@ -14,7 +14,6 @@ from avatar.bench.clock import Time, paired_medians, time_of
 from avatar.bench.floor import floor_ms
 from avatar.bench.splat_gpu import settle
 from avatar.bench.stages import StagedStep, network_of
-from avatar.commands.opening import split_sizes
 from avatar.compute.device import on_gpu
 from avatar.compute.replay import own_stream
 from avatar.config import Config, load_config
@@ -23,6 +22,7 @@ from avatar.data.shelf import Shelf, shelf_bytes
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
+from avatar.pipeline.open import split_sizes
 from avatar.tracking.likeness import Likeness
 from avatar.train.ahead import Guard
 from avatar.train.optim import make_optimizer

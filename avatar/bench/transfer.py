@@ -24,7 +24,6 @@ from avatar.bench import Request
 from avatar.bench.disturb import disturbed
 from avatar.bench.refine import Trial
 from avatar.bench.results import leave
-from avatar.commands.opening import split_sizes
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
@@ -39,6 +38,7 @@ from avatar.losses.metrics import psnr
 from avatar.model import Avatar
 from avatar.motion.repertoire import learn_repertoire
 from avatar.motion.transfer import TRANSFERS, transfer_motion
+from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
 from avatar.train.align import WITH_REFINEMENT
 from avatar.types import Camera, HeadParams

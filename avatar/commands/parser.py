@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import avatar
 from avatar.bench import PARTS
 from avatar.commands.options import (
     add_avatar,
@@ -18,6 +17,7 @@ from avatar.commands.options import (
     add_token,
     add_tracking,
 )
+from avatar.version import __version__
 
 
 def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
@@ -27,7 +27,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
         description="Animatable 3D Gaussian head avatars from a video of one person, on a CPU or a GPU.",
         epilog="To begin: avatar demo OUT. avatar COMMAND --help lists a command's options.",
     )
-    parser.add_argument("--version", action="version", version=f"avatar {avatar.__version__}")
+    parser.add_argument("--version", action="version", version=f"avatar {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
     track = commands.add_parser("track", help="track a face through a video, and write a folder to train on")
@@ -197,6 +197,9 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     sweep.add_argument("--partition", metavar="NAME", help="of the SLURM cluster")
     sweep.add_argument("--status", action="store_true", help="say what has become of each job, and start nothing")
     sweep.add_argument("--retry-failed", action="store_true", help="try jobs again that have failed with a sentence")
+
+    # Without help, so that the list of commands does not name it: the engines call it.
+    commands.add_parser("sweep-job").add_argument("folder", type=Path)
 
     commands.add_parser("doctor", help="say what this installation can do and what is missing")
     return parser, commands.choices

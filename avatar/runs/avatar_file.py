@@ -18,7 +18,6 @@ import torch
 from safetensors.torch import save as serialize
 from torch import Tensor
 
-import avatar
 from avatar.compute.memory import check_memory
 from avatar.config import Config, config_from_dict
 from avatar.data.manifest import parse_intrinsics, parse_number, parse_positions
@@ -36,6 +35,7 @@ from avatar.model import Avatar
 from avatar.motion.rest import RestPose
 from avatar.runs.checkpoint import check_fit, load_module, module_tensors
 from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shapes
+from avatar.version import __version__
 
 AVATAR_FILE = "avatar.safetensors"
 AVATAR_FORMAT = 1
@@ -85,7 +85,7 @@ def write_portrait(path: Path, portrait: Portrait, licence: str | None = None) -
         tensors |= {f"{_HEAD}{name}": value for name, value in head_tensors(portrait.head).items()}
     header = {
         "format": AVATAR_FORMAT,
-        "program": avatar.__version__,
+        "program": __version__,
         "step": portrait.step,
         "config": portrait.config.to_dict(),
         "perceptual": portrait.perceptual,

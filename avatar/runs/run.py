@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-import avatar
 from avatar.config import Config, config_from_dict
 from avatar.data.source import Source
 from avatar.data.subject import Subject
@@ -29,6 +28,7 @@ from avatar.model import Avatar
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.trained import TrainedAvatar, load_avatar, runs_in
+from avatar.version import __version__
 
 RUN_FILE = "run.json"
 RUN_FORMAT = 2
@@ -144,7 +144,7 @@ def read_run_info(run: Path) -> RunInfo:
 def versions() -> dict[str, str]:
     """What a result depends on besides the configuration."""
     return {
-        "avatar": avatar.__version__,
+        "avatar": __version__,
         "python": platform.python_version(),
         "machine": platform.machine(),
         "threads": str(torch.get_num_threads()),

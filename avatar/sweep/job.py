@@ -1,6 +1,6 @@
 """One job: `avatar train`, resumed where it was stopped, then `avatar eval`. Running it again changes nothing.
 
-As a program, which engines start wherever they like: python -m avatar.sweep.job FOLDER
+Engines start it as a program, wherever they like: `avatar sweep-job FOLDER`.
 What its commands say goes into FOLDER/log.txt, of bounded size. When it is killed, nothing of it lives on, and the next
 one goes on.
 """
@@ -8,16 +8,14 @@ one goes on.
 from __future__ import annotations
 
 import os
-import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
-from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.sweep.output import BoundedLog, end_of, old_of
@@ -124,18 +122,3 @@ def heart(folder: Path) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-
-
-def main(arguments: Sequence[str]) -> int:
-    from avatar.cli import main as command
-
-    try:
-        run_job(Path(arguments[0]), lambda words: command(words))
-    except UserError as error:
-        print(f"avatar: {error}", file=sys.stderr)
-        return EXIT_ERROR
-    return OK
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -26,7 +26,7 @@ class Worker:
         environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "AVATAR_THREADS": str(threads)}
         if gpus is not None:
             environment["CUDA_VISIBLE_DEVICES"] = gpus
-        words = [sys.executable, "-m", "avatar.sweep.job", str(folder)]
+        words = [sys.executable, "-m", "avatar.cli", "sweep-job", str(folder)]
         self._folder = folder
         self._process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         self._end = b""

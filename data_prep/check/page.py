@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-import avatar
 from avatar.errors import UserError
 from avatar.html import Markup, document, element, fold, join, picture, section, tiles
+from avatar.version import __version__
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding
 from data_prep.check.folder import Check, facts
@@ -55,7 +55,7 @@ def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
         figures = {name: _shown(value) for name, value in facts(check.clip, check.coverage).items()}
         evidence = figures.pop("offset found")
         parts.append(section("Figures", element("p", f"Offset: {evidence}.", class_="soft"), tiles(figures)))
-    parts.append(element("p", f"avatar {avatar.__version__} check", class_="soft"))
+    parts.append(element("p", f"avatar {__version__} check", class_="soft"))
     return document(f"Check of {check.folder.name}", parts)
 
 

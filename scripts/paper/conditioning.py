@@ -40,11 +40,11 @@ from avatar.bench.hyper import (
     random_heads,
 )
 from avatar.bench.results import new_figure
-from avatar.bench.scenes import HEAD_SPLATS
 from avatar.files.atomic import write_atomically
 from avatar.gaussians.covariance import conditional_mean
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import HEADS
+from avatar.splat.scenes import HEAD_SPLATS
 
 TEXTBOOK, COLUMNS, TRICK, FUSED = "covariance, solver", "model=covariance", "trick, solver", "trick, compiled"
 PUBLISHED = {8: 2.5, 128: 151.0}  # naive / trick, RTX 2080 Ti, about 15,000 Gaussians, one head of three values

@@ -27,7 +27,6 @@ from systems import add_source_arguments, folders_and_overrides, systems
 from torch import Tensor
 
 from avatar.bench.results import new_figure
-from avatar.commands.opening import split_sizes
 from avatar.config import Config, load_config
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
@@ -38,6 +37,7 @@ from avatar.files.atomic import write_atomically
 from avatar.head.assets import HeadAssets
 from avatar.losses.metrics import psnr, ssim
 from avatar.model import Avatar
+from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
 from avatar.runs.checkpoint import (
     Checkpoint,

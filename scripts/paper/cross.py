@@ -27,8 +27,8 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.head.model import HeadModel
 from avatar.motion.drive import choose_cameras, subject_drive
-from avatar.motion.reenact import DEFAULT_CHOICES, check_same_head
 from avatar.motion.transfer import transfer_motion
+from avatar.pipeline.reenact import DEFAULT_CHOICES, check_same_head
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from data_prep.open import find_head, open_subject

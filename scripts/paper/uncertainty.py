@@ -30,11 +30,11 @@ from torch import Tensor
 
 from avatar.bench.quality import held_out_frames
 from avatar.bench.results import new_figure
-from avatar.commands.opening import open_run
 from avatar.data.loader import FrameLoader
 from avatar.gaussians.hyper import HyperHead, HyperHeads
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.losses.metrics import squared_error
+from avatar.pipeline.open import open_run
 from avatar.runs.run import RUN_FILE, Run
 from avatar.splat.sh import C0
 from avatar.types import Frame

@@ -14,11 +14,11 @@ from avatar.bench.clock import Time
 from avatar.bench.quality import Curve, Point, measure, pareto
 from avatar.bench.quality_report import run, table
 from avatar.bench.train import Trainee
-from avatar.commands.opening import open_run
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
+from avatar.pipeline.open import open_run
 
 ANY = Time(1.0, 1.0, 1)
 

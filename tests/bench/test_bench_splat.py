@@ -11,10 +11,10 @@ import torch
 
 from avatar import cli
 from avatar.bench.machine import available_simd
-from avatar.bench.scenes import head_shell
 from avatar.bench.splat import Variant, measure
 from avatar.errors import UserError
 from avatar.splat import splat
+from avatar.splat.scenes import head_shell
 from avatar.types import Gaussians, Rendering
 
 

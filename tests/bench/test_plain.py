@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from avatar.bench.plain import splat_plain
-from avatar.bench.scenes import head_shell
 from avatar.splat import splat
+from avatar.splat.scenes import head_shell
 from avatar.types import Camera, Gaussians
 
 CAMERA = Camera(torch.eye(3), torch.tensor([0.01, -0.02, 0.6]), 90.0, 85.0, 22.0, 17.0, 45, 37)  # no multiple of a tile

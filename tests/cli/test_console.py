@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from command_line import avatar
 
-from avatar.commands import diagnosing
+from avatar.commands import doctor
 
 # The installed script with a command of its own in place of all others: this starts within milliseconds.
 SCRIPT = """
@@ -78,10 +78,10 @@ def test_help_that_nobody_reads_is_no_error_to_show(tmp_path: Path) -> None:
 
 
 def test_a_name_that_a_library_cannot_take_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diagnosing, "run_doctor", lambda _: "runs/Zo\udceb".encode())
+    monkeypatch.setattr(doctor, "run_doctor", lambda _: "runs/Zo\udceb".encode())
     output = avatar("doctor", status=1)
     assert output.startswith("avatar: runs/Zo") and "not UTF-8" in output and output.count("\n") == 1
-    monkeypatch.setattr(diagnosing, "run_doctor", lambda _: "…".encode("ascii"))
+    monkeypatch.setattr(doctor, "run_doctor", lambda _: "…".encode("ascii"))
     with pytest.raises(UnicodeEncodeError):  # a mistake of the program
         avatar("doctor")
 

@@ -12,16 +12,16 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
-from avatar.commands import demonstrating
-from avatar.commands.tracking import can_track
+from avatar.commands import demo
 from avatar.files.third_party import FOLDER_VARIABLE
+from avatar.pipeline.track import can_track
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.runs.run import read_run_info
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstrating, "RECIPE", [*SMALL, "trainer.iterations=16"])
+    monkeypatch.setattr(demo, "RECIPE", [*SMALL, "trainer.iterations=16"])
 
 
 def test_an_interrupted_demo_goes_on(tmp_path: Path) -> None:
@@ -54,11 +54,11 @@ def test_people_are_filmed_and_tracked_where_that_is_possible(tmp_path: Path, mo
         shutil.rmtree(head)
         (folder / "head_model").rename(head)
 
-    monkeypatch.setattr(demonstrating, "can_track", lambda say: True)
-    monkeypatch.setattr(demonstrating, "track", tracked)
-    monkeypatch.setattr(demonstrating, "VIDEO_SIZE", 64)
+    monkeypatch.setattr(demo, "can_track", lambda say: True)
+    monkeypatch.setattr(demo, "track", tracked)
+    monkeypatch.setattr(demo, "VIDEO_SIZE", 64)
     for person in ("ACTOR", "DRIVER"):
-        monkeypatch.setattr(demonstrating, person, getattr(demonstrating, person)._replace(frames=3))
+        monkeypatch.setattr(demo, person, getattr(demo, person)._replace(frames=3))
     output = avatar("demo", out)
     head = out / "head_model"
     assert videos == [("actor.mp4", True, head), ("driver.mp4", True, head)]
@@ -77,6 +77,6 @@ def test_what_tracking_lacks_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (why,) = said
     assert "pip install 'hyperavatar[track]'" in why or "face_landmarker.task" in why
     made: list[str] = []
-    monkeypatch.setattr(demonstrating, "make_tracked", lambda person, out: made.append(person.name))
+    monkeypatch.setattr(demo, "make_tracked", lambda person, out: made.append(person.name))
     avatar("demo", tmp_path / "demo", status=1)  # nothing was made
     assert made == ["actor", "driver"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from command_line import avatar
 
-from avatar import doctor
+from avatar.commands import doctor
 from avatar.errors import UserError
 from avatar.files.third_party import FACE_LANDMARKER, LPIPS_FILES, TRACKING_FILES, lpips_folder, models_folder
 

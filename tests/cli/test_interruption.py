@@ -13,7 +13,7 @@ import pytest
 import torch
 from command_line import avatar
 
-from avatar.commands import diagnosing
+from avatar.commands import doctor
 
 # What the installed script does; `main` begins when the program has taken care of signals.
 SCRIPT = """
@@ -110,7 +110,7 @@ def test_a_full_or_forbidden_disk_gets_a_sentence(monkeypatch: pytest.MonkeyPatc
     def refuse(_: object) -> int:
         raise PermissionError(13, "Permission denied", "/somewhere/file")
 
-    monkeypatch.setattr(diagnosing, "run_doctor", refuse)
+    monkeypatch.setattr(doctor, "run_doctor", refuse)
     assert avatar("doctor", status=1) == "avatar: /somewhere/file: Permission denied\n"
 
 
@@ -127,7 +127,7 @@ def test_memory_that_runs_out_gets_a_sentence(monkeypatch: pytest.MonkeyPatch, e
     def refuse(_: object) -> int:
         raise error
 
-    monkeypatch.setattr(diagnosing, "run_doctor", refuse)
+    monkeypatch.setattr(doctor, "run_doctor", refuse)
     output = avatar("doctor", status=1)
     assert output.startswith("avatar: there is not enough memory (") and output.count("\n") == 1
 
@@ -136,7 +136,7 @@ def test_a_full_gpu_gets_a_sentence_that_says_what_to_lower(monkeypatch: pytest.
     def refuse(_: object) -> int:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
 
-    monkeypatch.setattr(diagnosing, "run_doctor", refuse)
+    monkeypatch.setattr(doctor, "run_doctor", refuse)
     output = avatar("doctor", status=1)
     assert (
         output.startswith("avatar: the GPU's memory is full: lower --size or model.uv_size") and output.count("\n") == 1
@@ -147,7 +147,7 @@ def test_a_mistake_of_the_program_keeps_its_stack_trace(monkeypatch: pytest.Monk
     def fail(_: object) -> int:
         raise RuntimeError("a tensor has the wrong shape")
 
-    monkeypatch.setattr(diagnosing, "run_doctor", fail)
+    monkeypatch.setattr(doctor, "run_doctor", fail)
     with pytest.raises(RuntimeError, match="wrong shape"):
         avatar("doctor")
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from avatar.commands import plan
 from avatar.data.source import Source
 from avatar.errors import UserError
+from avatar.pipeline import plan
 
 
 def test_what_rounds_are_trained_for() -> None:

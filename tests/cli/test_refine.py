@@ -16,9 +16,10 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
-from avatar.commands import plan, rounds
-from avatar.commands.opening import source_of
+from avatar.commands import train
 from avatar.data.source import Source
+from avatar.pipeline import plan, train_refined
+from avatar.pipeline.open import source_of
 from avatar.refine import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 
@@ -173,7 +174,8 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=2.5))
     monkeypatch.setattr(plan, "LEAST_STEPS", 5)
     ticks = iter((0.0, 0.0, 1.0, 1.0, 11.0, 31.0, 57.0))
-    monkeypatch.setattr(rounds, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
+    for module in (train, train_refined):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
     output = avatar(*words, "--refine", 1, "--minutes", 1)
     assert "allow 10 steps; 10 are taken" in output and "of 1 minutes" in output
     assert "31 s of 1 minutes are gone, and a step takes 1.000 s: 27 steps are taken" in output
@@ -193,14 +195,15 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
         clock[0] += 90.0
         return source_of(arguments)
 
-    monkeypatch.setattr(rounds, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    monkeypatch.setattr(rounds.training, "tracked_source", tracked)
+    for module in (train, train_refined):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(train, "tracked_source", tracked)
     monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 10.0)
     monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.05))
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
-    monkeypatch.setattr(rounds, "train_round", lambda plan, *_: (0, plan))
-    monkeypatch.setattr(rounds, "go_on_or_begin", lambda *_: 0)
+    monkeypatch.setattr(train_refined, "train_round", lambda plan, *_: (0, plan))
+    monkeypatch.setattr(train_refined, "go_on_or_begin", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
     # 0.97 of 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
     assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output
@@ -218,9 +221,9 @@ def test_what_the_first_folder_was_allowed_later_ones_are(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[Source] = []
-    monkeypatch.setattr(rounds, "go_on_or_begin", lambda source, *_: opened.append(source) or 0)
-    monkeypatch.setattr(rounds, "open_run", lambda *_: None)
-    monkeypatch.setattr(rounds, "refine_run", lambda *_: 0)
+    monkeypatch.setattr(train_refined, "go_on_or_begin", lambda source, *_: opened.append(source) or 0)
+    monkeypatch.setattr(train_refined, "open_run", lambda *_: None)
+    monkeypatch.setattr(train_refined, "refine_run", lambda *_: 0)
     words = ("--frame-offset", 1, "--fps", 30, "--max-left-out", 0.5, "--ignore-misfit", "--refine", 1)
     avatar("train", folder, "--out", tmp_path / "run", *words, *QUICK)
     given, later = opened

@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from avatar.commands.doctor import find_gpu
 from avatar.compute import choose, self_test
-from avatar.compute.choose import NoGpu, check_gpu, choose_device, sees_gpu
-from avatar.compute.self_test import WrongGpu
-from avatar.doctor import find_gpu
 from avatar.errors import UserError
+from avatar.pipeline.device import NoGpu, check_gpu, choose_device, sees_gpu
+from avatar.pipeline.self_test import WrongGpu
 
 CUDA = torch.device("cuda", 0)
 

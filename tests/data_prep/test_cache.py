@@ -14,13 +14,13 @@ import pytest
 from preparing import prepare_folder
 from tracked_folder import write_tracked_folder
 
-from avatar.commands import tracking
 from avatar.data.manifest import read_manifest
 from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.pipeline import track
 from data_prep.prepare import prepare
 
 
@@ -209,12 +209,12 @@ def test_a_damaged_tracking_in_the_cache_is_made_again_and_it_is_said(
         seal(out)
         made.append(out)
 
-    monkeypatch.setattr(tracking, "track", fake_track)
-    monkeypatch.setattr(tracking, "open_footage", lambda path: SimpleNamespace(content_hash=lambda: "ab"))
-    folder = tracking.tracked_once(video, head)
-    assert tracking.tracked_once(video, head) == folder and made == [folder]
+    monkeypatch.setattr(track, "track", fake_track)
+    monkeypatch.setattr(track, "open_footage", lambda path: SimpleNamespace(content_hash=lambda: "ab"))
+    folder = track.tracked_once(video, head)
+    assert track.tracked_once(video, head) == folder and made == [folder]
     flip(folder / "frames" / "00000.jpg", 2)
     capsys.readouterr()
-    assert tracking.tracked_once(video, head) == folder and made == [folder, folder]
+    assert track.tracked_once(video, head) == folder and made == [folder, folder]
     assert "frames/00000.jpg is not what was written; it is made again" in capsys.readouterr().out
-    assert tracking.tracked_once(video, head) == folder and made == [folder, folder]
+    assert track.tracked_once(video, head) == folder and made == [folder, folder]

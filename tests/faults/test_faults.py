@@ -25,7 +25,7 @@ from small_runs import run_info, train_small
 from tracked_folder import write_tracked_folder
 
 from avatar.commands.arguments import parse
-from avatar.commands.measuring import run_eval
+from avatar.commands.eval import run_eval
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError

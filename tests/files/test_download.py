@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from avatar.cli import main
-from avatar.commands import third_party as command
+from avatar.commands import models as command
 from avatar.errors import UserError
 from avatar.files import download as downloads
 from avatar.files.third_party import ThirdPartyFile, download, find, models_folder, require

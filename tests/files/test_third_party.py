@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from avatar.cli import main
-from avatar.commands import third_party as command
+from avatar.commands import models as command
 from avatar.errors import UserError
 from avatar.files.third_party import (
     LPIPS_FILES,

@@ -11,12 +11,12 @@ import torch
 from interpreter import HAS_GPU
 
 from avatar.bench import splat_gpu
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.bench.splat import Variant, all_variants, passes_of, reference_of, validate
 from avatar.bench.splat_gpu import gpu_backends, splat_gsplat
 from avatar.bench.splat_report import others_line
 from avatar.errors import UserError
 from avatar.splat import splat
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Rendering
 
 SHELL, SIZE = head_shell(40), 24

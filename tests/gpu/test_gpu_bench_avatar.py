@@ -13,8 +13,8 @@ pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.bench import PARTS, render, render_plot, train, train_report
 from avatar.bench.clock import Time
-from avatar.commands import benchmarking
-from avatar.commands.benchmarking import bench_device
+from avatar.commands import bench
+from avatar.commands.bench import bench_device
 from avatar.errors import UserError
 from avatar.runs.run import open_trained
 
@@ -62,7 +62,7 @@ def test_a_gpu_is_for_the_parts_that_measure_one(monkeypatch: pytest.MonkeyPatch
         asked.append(name)
         return torch.device("cuda", 1)
 
-    monkeypatch.setattr(benchmarking, "choose_device", choose)
+    monkeypatch.setattr(bench, "choose_device", choose)
     assert bench_device("train", "cuda:1") == torch.device("cuda", 1) and bench_device("splat", None).type == "cuda"
     assert asked == ["cuda:1", "auto"]
     for part in PARTS:

@@ -12,10 +12,10 @@ import pytest
 import torch
 from heads import grid_head
 
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.losses.photometric import dssim
 from avatar.splat import splat
 from avatar.splat.capacity import fixed_capacity
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.train.step import PerceptualTerm, Weighted
 from avatar.types import Gaussians
 

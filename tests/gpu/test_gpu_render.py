@@ -9,10 +9,10 @@ import torch
 from heads import grid_head, random_params
 from interpreter import DEVICE, error, the_cpus_way
 
-from avatar.bench.scenes import head_camera
 from avatar.config import load_config
 from avatar.model import Avatar
 from avatar.render import Renderer
+from avatar.splat.scenes import head_camera
 from avatar.types import Gaussians
 
 RECIPES = ("preset=fast", "preset=paper", "model=flashavatar")

@@ -4,8 +4,8 @@ import torch
 from heads import OPEN, grid_head, mouth_head, rest_params
 
 from avatar.head.model import HeadModel
-from avatar.motion.reenact import say_open_lips
 from avatar.motion.rest import RestPose, find_mean, frame_rest
+from avatar.pipeline.reenact import say_open_lips
 
 
 def neutral(opening: float) -> RestPose:

@@ -20,9 +20,9 @@ from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
 from avatar.bench.hyper import by_covariance, covariance_leaves, random_heads
-from avatar.commands.opening import open_run
 from avatar.errors import UserError
 from avatar.losses.metrics import squared_error
+from avatar.pipeline.open import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
 
 

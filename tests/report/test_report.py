@@ -13,8 +13,8 @@ from small_runs import train_small
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
-from avatar.commands.opening import open_run
 from avatar.errors import UserError
+from avatar.pipeline.open import open_run
 from avatar.report.page import bins_tables, means_table, read_curves, read_results
 from avatar.report.pictures import uncertainty_map
 

@@ -17,7 +17,7 @@ from small_runs import open_small, small_config, train_small
 from torch import Tensor
 
 import avatar
-from avatar.commands import driving, exporting, refining
+from avatar.commands import export, reenact, refine
 from avatar.commands.arguments import parse
 from avatar.data.manifest import MANIFEST_FILE, read_manifest
 from avatar.errors import UserError
@@ -85,7 +85,7 @@ def test_a_value_that_is_not_finite_is_refused_with_the_tensors_name(
 @pytest.mark.parametrize(
     "words",
     [
-        *(f"export {{file}} --head {{head}} --out {{tmp}}/a{suffix}" for suffix in exporting.SUFFIXES.values()),
+        *(f"export {{file}} --head {{head}} --out {{tmp}}/a{suffix}" for suffix in export.SUFFIXES.values()),
         "view {file} --head {head} --port 0",
         "reenact {file} --head {head} --driver {tmp}/x.csv --out {tmp}/a.mp4",
     ],
@@ -165,17 +165,17 @@ def test_every_place_that_is_derived_from_an_avatars_name_is_here(
     file = changed(run, tmp_path / "a.safetensors", lambda header, _: header.update(name=HOSTILE_NAMES[kind]))
     name = read_portrait(file).recording.name
     assert is_name(name)  # of pictures and videos that the viewer saves, too
-    monkeypatch.setattr(exporting, "open_trained", lambda *_: Namespace(name=name, source=file))
+    monkeypatch.setattr(export, "open_trained", lambda *_: Namespace(name=name, source=file))
     monkeypatch.chdir(tmp_path)
     places: list[Path] = []
 
     def note(trained: Namespace, out: Path, arguments: Namespace) -> None:
         places.append(out)
 
-    for format in exporting.WRITERS:
-        monkeypatch.setitem(exporting.WRITERS, format, note)
-        exporting.run_export(parse(["export", str(file), "--head", str(head), "--format", format]))
-    assert len(places) == len(exporting.SUFFIXES) and all(place.name == str(place) for place in places)
+    for format in export.WRITERS:
+        monkeypatch.setitem(export.WRITERS, format, note)
+        export.run_export(parse(["export", str(file), "--head", str(head), "--format", format]))
+    assert len(places) == len(export.SUFFIXES) and all(place.name == str(place) for place in places)
     assert {is_name(place.name) for place in places} == {True}
 
 
@@ -203,14 +203,14 @@ def test_a_prepared_subjects_name_chooses_no_place(
     assert is_name(manifest.name)
     found: list[Path] = []
     run = Namespace(subject=Namespace(name=manifest.name, manifest=manifest))
-    monkeypatch.setattr(refining, "open_run", lambda *_: run)
-    monkeypatch.setattr(refining, "refine_run", lambda run, target, device: found.append(target) or 1)
-    refining.run_refine(parse(["refine", str(tmp_path / "run")]))
-    assert found[0].parent == tmp_path / "run" / refining.REFINED_FOLDER
+    monkeypatch.setattr(refine, "open_run", lambda *_: run)
+    monkeypatch.setattr(refine, "refine_run", lambda run, target, device: found.append(target) or 1)
+    refine.run_refine(parse(["refine", str(tmp_path / "run")]))
+    assert found[0].parent == tmp_path / "run" / refine.REFINED_FOLDER
 
 
 @pytest.mark.parametrize("name", ["x" * 250 + ".npz", "caf\udce9.npz", ".npz", "a b.csv"])
 def test_a_drivers_name_makes_a_name_that_fits(name: str, tmp_path: Path) -> None:
     choices = Namespace(transfer="relative")
-    place = driving.default_video(tmp_path, tmp_path / name, choices)  # type: ignore[arg-type]
+    place = reenact.default_video(tmp_path, tmp_path / name, choices)  # type: ignore[arg-type]
     assert place.parent == Path("reenact") and is_name(place.name) and len(place.name.encode()) < 200

@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.compute.device import interpreted
 from avatar.splat import splat
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Camera, Gaussians, Rendering
 
 SIMD = ("baseline", "avx2", "avx512")

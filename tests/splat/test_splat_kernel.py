@@ -29,8 +29,8 @@ from splat.scenes import (
 )
 
 from avatar import _core
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.splat import counters
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Gaussians
 
 HEAD = Scene(head_shell(), head_camera(200), torch.ones(3))

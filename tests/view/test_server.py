@@ -18,7 +18,7 @@ from lively import lively_run
 from view_client import TOKEN, WIDTH, Page, started
 from waiting import until
 
-from avatar.commands.viewing import address, checked_url
+from avatar.commands.view import address, checked_url
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.server import LARGEST, Viewer, padded

@@ -15,7 +15,7 @@ from stream_packets import live_link
 from waiting import until
 
 from avatar.commands.arguments import parse
-from avatar.commands.viewing import run_send
+from avatar.commands.send import run_send
 from avatar.errors import UserError
 from avatar.motion.drive import Drive
 from avatar.motion.drive_file import write_drive

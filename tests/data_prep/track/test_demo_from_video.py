@@ -8,7 +8,7 @@ import pytest
 from command_line import avatar
 from small_runs import SMALL
 
-from avatar.commands import demonstrating
+from avatar.commands import demo
 from avatar.runs.run import read_run_info
 from data_prep.avatar_track import read_info
 
@@ -17,10 +17,10 @@ FRAMES = 30
 
 @pytest.mark.slow
 def test_the_demo_begins_with_videos(tracking_models: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstrating, "RECIPE", SMALL)
-    monkeypatch.setattr(demonstrating, "VIDEO_SIZE", 256)
+    monkeypatch.setattr(demo, "RECIPE", SMALL)
+    monkeypatch.setattr(demo, "VIDEO_SIZE", 256)
     for person in ("ACTOR", "DRIVER"):
-        monkeypatch.setattr(demonstrating, person, getattr(demonstrating, person)._replace(frames=FRAMES))
+        monkeypatch.setattr(demo, person, getattr(demo, person)._replace(frames=FRAMES))
     out = tmp_path / "demo"
     output = avatar("demo", out)
     assert "looking for the face" in output and "The demo is done" in output and str(out / "actor.mp4") in output

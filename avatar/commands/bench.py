@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 
 from avatar.bench import PARTS, Request
-from avatar.commands import OK
 from avatar.commands.outputs import check_folder_output, check_outputs
-from avatar.compute.choose import choose_device
 from avatar.compute.device import CPU
 from avatar.config_values import check_device
 from avatar.errors import UserError, check_installed
+from avatar.pipeline import OK
+from avatar.pipeline.device import choose_device
 
 
 def run_bench(arguments: Namespace) -> int:

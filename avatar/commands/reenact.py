@@ -1,23 +1,20 @@
-"""avatar reenact and drive-file: motion onto an avatar, and motion as a file."""
+"""avatar reenact: a person's motion on another person's avatar."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
 
-from avatar.commands import OK
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_driver, source_of
 from avatar.commands.outputs import check_file, check_outputs
-from avatar.commands.tracking import is_video, tracked_once
-from avatar.compute.choose import choose_device
 from avatar.files.names import safe_name
 from avatar.files.video import VIDEO_SUFFIXES
-from avatar.motion.drive import subject_drive
-from avatar.motion.drive_file import write_drive
-from avatar.motion.reenact import Choices, reenact, sidecars
+from avatar.pipeline import OK
+from avatar.pipeline.device import choose_device
+from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_driver
+from avatar.pipeline.reenact import Choices, reenact, sidecars
+from avatar.pipeline.track import is_video, tracked_once
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained import TrainedAvatar
-from data_prep.open import open_subject
 
 
 def run_reenact(arguments: Namespace) -> int:
@@ -58,13 +55,3 @@ def default_video(avatar: Path, driver: Path, choices: Choices) -> Path:
     """RUN/reenact/DRIVER-TRANSFER.mp4; reenact/... in the current folder for an avatar that is a file alone."""
     folder = avatar if (avatar / RUN_FILE).is_file() else Path()
     return folder / "reenact" / f"{safe_name(driver.resolve().stem)}-{choices.transfer}.mp4"
-
-
-def run_drive_file(arguments: Namespace) -> int:
-    check_file(arguments.out, [".npz"], "a drive file")
-    source = source_of(arguments)
-    check_outputs([arguments.out], [source.folder, source.head, source.tracking])
-    subject, assets = open_subject(source)
-    write_drive(arguments.out, subject_drive(subject, None), assets.fingerprint)
-    print(f"{len(subject)} frames written to {arguments.out}")
-    return OK

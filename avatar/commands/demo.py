@@ -1,4 +1,4 @@
-"""avatar demo-data and demo: subjects of the program's own making, and everything run on them."""
+"""avatar demo: everything that the program does, on two people of its own making."""
 
 from __future__ import annotations
 
@@ -7,26 +7,24 @@ from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
 
-from avatar.commands import OK
-from avatar.commands.measuring import writing_figures
-from avatar.commands.opening import open_driver, open_run
+from avatar.commands.eval import writing_figures
 from avatar.commands.outputs import check_folder_output, check_outputs
-from avatar.commands.tracking import bar, can_track
-from avatar.commands.training import resume_run, train_new
 from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
-from avatar.files.video import VIDEO_SUFFIXES
 from avatar.head.assets import load_head_assets
-from avatar.motion.reenact import reenact
+from avatar.pipeline import OK
+from avatar.pipeline.open import open_driver, open_run
+from avatar.pipeline.reenact import reenact
+from avatar.pipeline.track import bar, can_track
+from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from data_prep.track.track import track
 
 RECIPE = ["experiment=demo"]
-NAMES_OF_VIDEOS = (*VIDEO_SUFFIXES, ".avi", ".m4v", ".webm")  # what a person calls so is no folder
 SUBJECT_SIZE, VIDEO_SIZE = 192, 384  # pixels of the pictures, a side
 
 
@@ -37,22 +35,6 @@ class Person(NamedTuple):
 
 
 ACTOR, DRIVER = Person("actor", 500, 1), Person("driver", 100, 2)
-
-
-def run_demo_data(arguments: Namespace) -> int:
-    check_outputs([arguments.out], [])
-    if arguments.video or arguments.out.suffix.lower() in NAMES_OF_VIDEOS:
-        size = 512 if arguments.size is None else arguments.size
-        make_video(arguments.out, arguments.frames, size, arguments.seed, arguments.motion)
-        if not (head := head_beside(arguments.out)).exists():
-            make_head_model(head)
-            print(f"Head   {head}")
-        print(f"Next   avatar train {arguments.out} --head {head}")
-        return OK
-    arguments.size = 256 if arguments.size is None else arguments.size
-    make_subject(arguments.out, arguments.frames, arguments.size, arguments.seed, arguments.motion)
-    print(f"Next   avatar train {arguments.out}")
-    return OK
 
 
 def run_demo(arguments: Namespace) -> int:

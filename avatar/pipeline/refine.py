@@ -1,21 +1,18 @@
-"""avatar refine: tracking made sharper by the avatar itself."""
+"""Tracking refined through a trained avatar."""
 
 from __future__ import annotations
 
 import time
-from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from avatar.commands import INTERRUPTED, OK
-from avatar.commands.opening import open_run
-from avatar.commands.outputs import check_folder_output, check_outputs
-from avatar.commands.plan import FIRST_PASSES
-from avatar.compute.choose import choose_device
 from avatar.data.refinement import Refinement, Round
 from avatar.files.names import shortened
+from avatar.pipeline import INTERRUPTED, OK
+from avatar.pipeline.device import choose_device
+from avatar.pipeline.plan import FIRST_PASSES
 from avatar.refine.record import frames_csv, sheet, summary
 from avatar.refine.refine import fingerprint, refine_subject
 from avatar.runs.run import Run
@@ -23,17 +20,6 @@ from data_prep.refined import check_target, frame_numbers, write_folder
 
 REFINED_FOLDER = "refined"
 MANY_PASSES = 2 * FIRST_PASSES
-
-
-def run_refine(arguments: Namespace) -> int:
-    run = open_run(arguments.run, arguments.head, arguments.folder)
-    target: Path = arguments.out or arguments.run / REFINED_FOLDER / run.subject.name
-    check_folder_output(target)
-    check_outputs([target], [Path(run.subject.manifest.source)])
-    status = refine_run(run, target, arguments.device or "auto")
-    if status == OK:
-        print(f"Next         avatar train {target} --out ANOTHER_RUN")
-    return status
 
 
 def refine_run(run: Run, target: Path, device: str | None = None) -> int:

@@ -1,23 +1,19 @@
-"""avatar eval, report and compare: figures of trained avatars."""
+"""avatar eval: a trained avatar's figures on the held-out frames."""
 
 from __future__ import annotations
 
-import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from avatar.commands import OK
-from avatar.commands.opening import open_run
-from avatar.commands.outputs import check_folder_output, check_outputs
-from avatar.compute.choose import choose_device
 from avatar.errors import UserError
-from avatar.evaluation.compare import compare_runs
-from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import choose_protocols
 from avatar.files.lock import locked
+from avatar.pipeline import OK
+from avatar.pipeline.device import choose_device
+from avatar.pipeline.open import open_run
 
 
 def run_eval(arguments: Namespace) -> int:
@@ -41,23 +37,3 @@ def writing_figures(run: Path) -> Iterator[None]:
             yield
         except OSError as error:
             raise UserError(f"{folder} cannot be written ({error.strerror or error}); {otherwise}") from error
-
-
-def run_report(arguments: Namespace) -> int:
-    from avatar.report.page import write_report
-
-    print(f"Report {write_report(open_run(arguments.run, arguments.head, arguments.folder))}")
-    return OK
-
-
-def run_compare(arguments: Namespace) -> int:
-    if arguments.out is not None:
-        check_folder_output(arguments.out)
-        check_outputs([arguments.out], [])
-    comparison = compare_runs(arguments.runs, arguments.protocol)
-    if arguments.out is not None:
-        write_tables(arguments.out, comparison)
-        print(f"Written to {arguments.out}", file=sys.stderr)  # the table may be piped
-    _, table = FORMATS[arguments.format]
-    print(table(comparison), end="")
-    return OK

@@ -77,7 +77,7 @@ def check_gpu(device: torch.device) -> None:
     _check_age(device)
     _check_triton()
     _check_compiler()
-    from avatar.compute.self_test import self_test
+    from avatar.pipeline.self_test import self_test
 
     try:
         self_test(device)

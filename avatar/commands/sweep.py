@@ -7,10 +7,10 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from avatar.commands import INTERRUPTED, OK
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.evaluation.compare_tables import FORMATS, text, write_tables
+from avatar.pipeline import INTERRUPTED, OK
 from avatar.sweep.conduct import conduct
 from avatar.sweep.engines import EngineOptions, make_engine
 from avatar.sweep.results import fold_results

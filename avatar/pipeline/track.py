@@ -1,16 +1,13 @@
-"""avatar track: a video in, a tracked folder out; and videos where other commands take tracked folders."""
+"""A video where a tracked folder is wanted: tracked once, and kept in the cache."""
 
 from __future__ import annotations
 
 import shutil
-from argparse import Namespace
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from tqdm import tqdm
 
-from avatar.commands import OK
-from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.places import cache_folder, named_path
@@ -19,31 +16,11 @@ from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.avatar_track import recognise
 from data_prep.contents import find_damage, write_contents
 from data_prep.open import HEAD_VARIABLE
-from data_prep.track.crop import parse_crop
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
-from data_prep.track.footage.source import Span
 from data_prep.track.inputs import tracking_key
 from data_prep.track.progress import Item
 from data_prep.track.track import Choices, track
-
-
-def run_track(arguments: Namespace) -> int:
-    check_folder_output(arguments.out)
-    check_outputs([arguments.out], [arguments.video, arguments.matte, arguments.head])
-    head = head_for_video(arguments.video, arguments.head)
-    choices = Choices(
-        crop=parse_crop(arguments.crop),
-        size=arguments.size,
-        span=Span(arguments.start or 0.0, arguments.end),
-        focal=arguments.focal,
-        field_of_view=arguments.fov,
-        matte=arguments.matte,
-    )
-    track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=bar)
-    print(f"Look at  {arguments.out / 'overlay'}")
-    print(f"Next     avatar train {arguments.out}")
-    return OK
 
 
 def head_for_video(video: Path, given: Path | None) -> Path:

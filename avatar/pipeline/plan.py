@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 import torch
 
-from avatar.commands.opening import split_sizes
-from avatar.commands.training import new_avatar
 from avatar.compute.device import CPU
 from avatar.config import load_config
 from avatar.data.manifest import parse_number
@@ -19,6 +17,8 @@ from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import read_json
+from avatar.pipeline.open import split_sizes
+from avatar.pipeline.train import new_avatar
 from avatar.refine.refine import estimated_seconds
 from avatar.train.align import WITH_REFINEMENT
 from avatar.train.cost import measure_cost

@@ -5,7 +5,6 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Callable
 
-from avatar.commands import OK
 from avatar.errors import UserError
 from avatar.files.third_party import (
     FETCHED_LPIPS,
@@ -22,6 +21,7 @@ from avatar.files.third_party import (
 )
 from avatar.losses.lpips import MissingWeights, download_lpips, load_lpips
 from avatar.losses.lpips_network import NETS, Net
+from avatar.pipeline import OK
 
 MISSING = 1
 

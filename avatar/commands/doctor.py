@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
-import avatar
 from avatar.compute.present import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError
@@ -28,6 +28,7 @@ from avatar.files.third_party import (
     models_folder,
     sha256_of,
 )
+from avatar.version import __version__
 
 DOWNLOAD = "avatar models --download"
 EXTRAS = {"mediapipe": ("track", "track videos"), "viser": ("view", "avatar view")} | dict.fromkeys(
@@ -51,7 +52,7 @@ def diagnose(say: Callable[[str], None] = print) -> int:
     found = [*essentials(), gpu(), head_model(), *map(model_file, TRACKING_FILES), *map(lpips, LPIPS_FILES)]
     found += [package(name) for name in EXTRAS]
     system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
-    say(f"avatar {avatar.__version__}, Python {platform.python_version()}, {system}\n")
+    say(f"avatar {__version__}, Python {platform.python_version()}, {system}\n")
     for line in table(found):
         say(line)
     if missing := [finding for finding in found if finding.addresses]:
@@ -112,7 +113,7 @@ def gpu() -> Finding:
 def find_gpu() -> str:
     import torch
 
-    from avatar.compute.choose import check_gpu, describe_gpu
+    from avatar.pipeline.device import check_gpu, describe_gpu
 
     device = torch.device("cuda", 0)
     check_gpu(device)
@@ -180,3 +181,7 @@ def package(name: str) -> Finding:
         return Finding(name, version(name))
     except PackageNotFoundError:
         return Finding(name, "missing", f"{purpose}: pip install 'hyperavatar[{extra}]'")
+
+
+def run_doctor(_: Namespace) -> int:
+    return diagnose()

@@ -1,4 +1,4 @@
-"""avatar prepare and check: what a tracked folder holds."""
+"""avatar check: what a tracked folder holds, and whether it can be trained on."""
 
 from __future__ import annotations
 
@@ -8,34 +8,15 @@ from argparse import Namespace
 
 from tqdm import tqdm
 
-from avatar.commands import OK
-from avatar.commands.opening import source_of
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.config import load_config
 from avatar.data.source import Source
-from avatar.data.subject import Subject
 from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
 from avatar.train.cost import measure_cost
 from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
 from data_prep.open import find_head
-from data_prep.prepare import prepare
-
-
-def run_prepare(arguments: Namespace) -> int:
-    source = source_of(arguments)
-    if arguments.out is not None:
-        check_folder_output(arguments.out)
-        check_outputs([arguments.out], [source.folder, source.head, source.tracking])
-    prepared = prepare(source, load_head_assets(source.head), out=arguments.out)
-    subject = Subject.open(prepared)
-    print(
-        f"{subject.name}: {len(subject)} frames of {subject.width}x{subject.height}, "
-        f"{len(subject.split.train)} to train, {len(subject.split.test)} to test"
-    )
-    print(f"Prepared in {prepared}")
-    return OK
 
 
 def run_check(arguments: Namespace) -> int:

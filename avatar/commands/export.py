@@ -10,8 +10,6 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from avatar.commands import OK
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
@@ -22,6 +20,8 @@ from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
+from avatar.pipeline import OK
+from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.run import open_trained

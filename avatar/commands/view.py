@@ -1,4 +1,4 @@
-"""avatar view and send: an avatar on the screen, and what drives it live."""
+"""avatar view: an avatar on the screen, and what drives it live."""
 
 from __future__ import annotations
 
@@ -19,20 +19,17 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.commands import INTERRUPTED, OK
-from avatar.commands.driving import head_of
-from avatar.commands.opening import DRIVE_SUFFIXES, open_drive_file, open_run
-from avatar.compute.choose import choose_device
+from avatar.commands.reenact import head_of
 from avatar.errors import UserError
-from avatar.head.assets import load_head_assets
-from avatar.motion.drive_file import read_drive
+from avatar.pipeline import INTERRUPTED, OK
+from avatar.pipeline.device import choose_device
+from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_run
 from avatar.runs.clips import Clip, driven_clip, own_clip
 from avatar.runs.run import RUN_FILE, Run, open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.gate import LOCAL
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
-from avatar.view.sender import send
 from avatar.view.stage import Stage
 from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
@@ -194,10 +191,3 @@ def truth_of(run: Run) -> Callable[[int, int], Float[Tensor, "H W 3"]]:
         return run.subject.frame(index, width).composite(run.trained.background)
 
     return truth
-
-
-def run_send(arguments: Namespace) -> int:
-    drive = read_drive(arguments.drive, load_head_assets(arguments.head), width=512)
-    count = send(drive, "127.0.0.1", arguments.port, arguments.loop, token=checked_token(arguments.token))
-    print(f"{count} frames of {arguments.drive} sent to port {arguments.port}")
-    return OK

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.bench.scenes import head_camera, head_shell
 from avatar.compute.device import on_gpu
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose_raw
@@ -18,6 +17,7 @@ from avatar.gaussians.hyper_cpu import Interpolation, Touching, condition, touch
 from avatar.gaussians.rigidity import Hold, Skull, held
 from avatar.losses.photometric import dssim, photometric_loss
 from avatar.splat import splat
+from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Gaussians
 
 TOLERANCE = 1e-4  # of the largest value of each field

@@ -1,0 +1,22 @@
+"""avatar refine: tracking refined through a trained avatar."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.pipeline import OK
+from avatar.pipeline.open import open_run
+from avatar.pipeline.refine import REFINED_FOLDER, refine_run
+
+
+def run_refine(arguments: Namespace) -> int:
+    run = open_run(arguments.run, arguments.head, arguments.folder)
+    target: Path = arguments.out or arguments.run / REFINED_FOLDER / run.subject.name
+    check_folder_output(target)
+    check_outputs([target], [Path(run.subject.manifest.source)])
+    status = refine_run(run, target, arguments.device or "auto")
+    if status == OK:
+        print(f"Next         avatar train {target} --out ANOTHER_RUN")
+    return status

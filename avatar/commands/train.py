@@ -1,0 +1,188 @@
+"""avatar train: a tracked folder or a video in, a run out; with --refine, training and refinement in turns."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+from avatar.commands.outputs import check_run_folder
+from avatar.config import chosen_options, flatten, load_config
+from avatar.data.source import Source
+from avatar.errors import UserError
+from avatar.files.lock import locked
+from avatar.files.names import safe_name
+from avatar.pipeline.open import at_new_place, source_of
+from avatar.pipeline.plan import ROUNDS_FOLDER, Plan, plan_file
+from avatar.pipeline.track import head_for_video, is_video, tracked_once
+from avatar.pipeline.train import resume_run, train_new
+from avatar.pipeline.train_refined import begin_rounds, train_refined
+from avatar.runs.run import RUN_FILE, RunInfo, read_run_info, refuse_trained
+from data_prep.not_subjects import check_folder
+
+MAX_ROUNDS = 10
+
+
+def run_train(arguments: Namespace) -> int:
+    settle_paths(arguments)
+    run = arguments.out or default_run(arguments.folder)
+    overrides = config_overrides(arguments)
+    has_plan = plan_file(run).exists()
+    if arguments.device is not None and (arguments.refine is not None or has_plan):
+        overrides.append(f"device={arguments.device}")
+    if arguments.resume and has_plan:
+        forget_video(arguments)
+        plan = Plan.load(run)
+        refuse_changed_plan(run, plan, arguments, overrides)
+        source = moved_plan_source(run, plan.source, arguments)
+        with locked(run / ROUNDS_FOLDER):
+            return train_refined(run, plan, source, time.monotonic() - plan.spent)
+    if arguments.minutes is not None and arguments.refine is None:
+        raise UserError("--minutes goes with --refine; without it, say --iterations")
+    if arguments.resume:
+        if arguments.refine is not None:
+            raise UserError(f"{run} began without --refine: leave it out to resume, or start a new run")
+        forget_video(arguments)
+        refuse_changed_run(run, read_run_info(run), arguments, overrides)
+        return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
+    begin = time.monotonic()
+    load_config(overrides)  # a mistake in it before one in the folder
+    if not is_video(arguments.folder):
+        check_folder(arguments.folder)
+    check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
+    if arguments.refine is None:
+        return train_new(tracked_source(arguments), overrides, run, arguments.device)
+    check_rounds(run, arguments.refine, arguments.minutes, overrides)
+    return begin_rounds(run, arguments.refine, arguments.minutes, tracked_source(arguments), overrides, begin)
+
+
+def settle_paths(arguments: Namespace) -> None:
+    """Which of the paths that were typed without an option is the run, and which the tracked folder."""
+    runs = [path for path in arguments.paths if (path / RUN_FILE).is_file() or plan_file(path).is_file()]
+    if runs and not arguments.resume:
+        raise UserError(f"{runs[0]} is a run: add --resume to go on with it, or give the tracked folder of a new one")
+    named = [*([] if arguments.out is None else [arguments.out]), *runs]
+    if len({path.resolve() for path in named}) > 1:
+        raise UserError(f"{named[0]} and {named[1]} are two runs: one at a time is resumed")
+    arguments.out = next(iter(named), None)
+    folders = [path for path in arguments.paths if path not in runs]
+    if len(folders) > 1:
+        raise UserError(f"neither {folders[0]} nor {folders[1]} is a run: say which to resume with --out RUN")
+    arguments.folder = arguments.folder or next(iter(folders), None)
+
+
+def check_rounds(run: Path, rounds: int, minutes: float | None, overrides: list[str]) -> None:
+    """Before a video is tracked. Raises UserError for a mistake, and where the folder holds a run, or rounds, already."""
+    if not 1 <= rounds <= MAX_ROUNDS:
+        raise UserError(f"--refine must be from 1 to {MAX_ROUNDS}, not {rounds}")
+    if minutes is not None and not 0.0 < minutes < float("inf"):
+        raise UserError(f"--minutes must be a positive number, not {minutes:g}")
+    load_config(overrides)  # a mistake in it before one in the folder
+    refuse_trained(run)
+    if plan_file(run).exists():
+        raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")
+
+
+def refuse_changed_plan(run: Path, plan: Plan, arguments: Namespace, overrides: list[str]) -> None:
+    """A resumed run keeps its decisions."""
+    for option, was, now in (
+        ("--refine", plan.rounds, arguments.refine),
+        ("--minutes", plan.minutes, arguments.minutes),
+    ):
+        if now not in (None, was):
+            began = f"without {option}" if was is None else f"with {option} {was:g}"
+            raise UserError(f"{run} began {began}, not {now:g}: leave it out to resume")
+    if overrides and load_config(overrides) != load_config(plan.overrides):
+        began = " ".join(plan.overrides) or "no override"
+        raise UserError(f"{run} began with {began}: leave the overrides out to resume, or start a new run")
+    refuse_other_source(run, plan.source, arguments)
+
+
+def moved_plan_source(run: Path, source: Source, arguments: Namespace) -> Source:
+    """The source, at its new place where the folder or the head model has moved. Raises UserError for another folder."""
+    folder, head = arguments.folder, arguments.head
+    if folder is not None and folder.resolve() != source.folder and source.folder.is_dir():
+        raise UserError(f"{run} began on {source.folder}, not on {folder}: leave it out to resume")
+    source = source if folder is None else at_new_place(source, folder.resolve())
+    return source if head is None else replace(source, head=head)
+
+
+def tracked_source(arguments: Namespace) -> Source:
+    """What to train on; a video is tracked first."""
+    if is_video(arguments.folder):
+        head = head_for_video(arguments.folder, arguments.head)
+        arguments.head, arguments.folder = head, tracked_once(arguments.folder, head)
+    return source_of(arguments)
+
+
+def forget_video(arguments: Namespace) -> None:
+    """A run that is resumed knows where the tracking of its video is."""
+    if arguments.folder is not None and is_video(arguments.folder):
+        arguments.folder = None
+
+
+def asked_device(overrides: list[str]) -> str | None:
+    """What the command line says of `device`, the one key of a configuration that a run may change."""
+    own = [override for override in overrides if override.partition("=")[0] == "device"]
+    return load_config(own).device if own else None
+
+
+def default_run(folder: Path | None) -> Path:
+    if folder is None:
+        raise UserError("say which run to go on with: avatar train --resume RUN")
+    return Path("runs") / safe_name(folder.resolve().stem if folder.is_file() else folder.resolve().name)
+
+
+def config_overrides(arguments: Namespace) -> list[str]:
+    """The options that are short forms of configuration keys, before the overrides, so that those win."""
+    short = {"data.size": arguments.size, "trainer.iterations": arguments.iterations, "trainer.seed": arguments.seed}
+    groups = [o for o in arguments.overrides if "." not in o.partition("=")[0]]
+    keys = [o for o in arguments.overrides if o not in groups]
+    return [*groups, *(f"{key}={value}" for key, value in short.items() if value is not None), *keys]
+
+
+def refuse_changed_run(run: Path, info: RunInfo, arguments: Namespace, overrides: list[str]) -> None:
+    """A resumed run keeps its decisions; naming another value for one is an error, not a silent choice."""
+    if overrides:
+        recorded = {**flatten(info.config.to_dict()), **info.options}
+        asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
+        limited = (
+            recorded["trainer.passes"] is not None
+            and asked["trainer.passes"] == recorded["trainer.passes"]
+            and asked["trainer.iterations"] > recorded["trainer.iterations"]
+        )
+        free = {"device", *(["trainer.iterations"] if limited else [])}  # what was asked for is not recorded
+        for key in (override.partition("=")[0] for override in overrides):
+            if key not in free and recorded[key] != asked[key]:
+                raise UserError(
+                    f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
+                    "start a new run"
+                )
+    refuse_other_source(run, info.source, arguments)
+
+
+def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None:
+    """Of the options that say how the folder is read, none may change."""
+    given = replace(
+        source,
+        tracking=source.tracking if arguments.tracking is None else arguments.tracking.resolve(),
+        frame_offset=source.frame_offset if arguments.frame_offset is None else arguments.frame_offset,
+        format=arguments.format or source.format,
+        fps=source.fps if arguments.fps is None else arguments.fps,
+        max_left_out=source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
+        ignore_misfit=source.ignore_misfit or arguments.ignore_misfit,
+    )
+    for field, option in (
+        ("tracking", "--tracking"),
+        ("frame_offset", "--frame-offset"),
+        ("format", "--format"),
+        ("fps", "--fps"),
+        ("max_left_out", "--max-left-out"),
+        ("ignore_misfit", "--ignore-misfit"),
+    ):
+        was, now = getattr(source, field), getattr(given, field)
+        if was != now:
+            began = f"without {option}" if was in (None, False) else f"with {option} {was}"
+            given_now = option if now is True else f"{option} {now}"
+            raise UserError(f"{run} began {began}, not with {given_now}: leave it out to resume, or start a new run")

@@ -1,0 +1,79 @@
+"""Training and refinement in turns, and then the run itself.
+
+RUN/rounds/plan.json      what the rounds began with
+RUN/rounds/1/run          a first, shorter training
+RUN/rounds/1/NAME         the subject, refined through its avatar: what the next round, or the run itself, trains on
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from avatar.data.source import Source
+from avatar.files.lock import locked
+from avatar.files.names import safe_name
+from avatar.pipeline import OK
+from avatar.pipeline.open import open_run
+from avatar.pipeline.plan import ROUNDS_FOLDER, Pace, Plan, steps_in_time
+from avatar.pipeline.refine import refine_run
+from avatar.pipeline.train import resume_run, train_new
+from avatar.runs.checkpoint import list_checkpoints
+from avatar.runs.run import RUN_FILE
+
+
+def begin_rounds(
+    run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str], begin: float
+) -> int:
+    """The minutes are counted from `begin` on, of `time.monotonic`: they include the tracking of a video."""
+    iterations, in_rounds = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
+    plan = Plan(rounds, source, tuple(overrides), minutes, iterations, in_rounds, time.monotonic() - begin)
+    with locked(run / ROUNDS_FOLDER):
+        plan.save(run)
+        return train_refined(run, plan, source, begin)
+
+
+def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
+    """Train, refine, and so on, and at last train the run itself; what is done already is not done again."""
+    name = safe_name(plan.source.folder.resolve().name)
+    for number in range(1, plan.rounds + 1):
+        stage = run / ROUNDS_FOLDER / str(number)
+        if not (stage / name).is_dir():
+            print(f"Round {number} of {plan.rounds}: a first avatar, and the tracking refined through it")
+            status, plan = train_round(plan, source, stage, begin, plan.rounds - number)
+            plan.save(run)
+            if status != OK:
+                return status
+        # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
+        source = replace(source, folder=stage / name, tracking=None, frame_offset=None, format=None, fps=None)
+    status = go_on_or_begin(source, plan.final_overrides(), run)
+    if status == OK and plan.minutes is not None:
+        print(f"Time         {(time.monotonic() - begin) / 60:.1f} of {plan.minutes:g} minutes")
+    return status
+
+
+def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: int) -> tuple[int, Plan]:
+    """The round in the folder `stage`, with `to_come` after it; and the plan, with the time that is gone. A round that was
+    made in one sitting shows what steps take, and so how many there is time for."""
+    at_once, started = not is_begun(stage / "run"), time.monotonic()
+    status = go_on_or_begin(source, plan.round_overrides(), stage / "run")
+    trained = time.monotonic()
+    if status != OK:
+        return status, replace(plan, spent=trained - begin)
+    run = open_run(stage / "run", source.head, source.folder)
+    status = refine_run(run, stage / safe_name(plan.source.folder.resolve().name))
+    refined = time.monotonic()
+    plan = replace(plan, spent=refined - begin)
+    if status == OK and at_once and plan.minutes is not None:
+        pace = Pace((trained - started) / plan.round_iterations, refined - trained)
+        plan = plan.paced(pace, to_come, len(run.subject.split.train))
+    return status, plan
+
+
+def go_on_or_begin(source: Source, overrides: list[str], run: Path) -> int:
+    return resume_run(run, source.head, source.folder) if is_begun(run) else train_new(source, overrides, run)
+
+
+def is_begun(run: Path) -> bool:
+    return (run / RUN_FILE).is_file() and bool(list_checkpoints(run / "checkpoints"))
