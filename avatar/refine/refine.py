@@ -18,17 +18,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from safetensors.torch import save as serialize
 from torch import Tensor
 from tqdm import tqdm
 
 from avatar.compute.device import brought, on_gpu
 from avatar.compute.native import thread_count
 from avatar.data.subject import Subject
-from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
-from avatar.files.atomic import write_atomically
 from avatar.model import Avatar
+from avatar.refine.progress import read_progress, write_progress
 from avatar.refine.smoothing import smoothed
 from avatar.tracking.descent import Descent, Problem, curvature, descend
 from avatar.tracking.freedom import Freedom, find_freedom
@@ -43,7 +41,6 @@ SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
 UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
-_MAX_PROGRESS = 2**28  # bytes
 PROGRESS_FORMAT = 3  # grows with every change of what refinement finds
 
 
@@ -82,7 +79,7 @@ def refine_subject(
     with frozen(avatar), interruption() as interrupted:
         work = _Work(avatar, subject, size, background)
         key = work.key()
-        moves, figures = _read_progress(progress, key, len(work.freedom.index))
+        moves, figures = read_progress(progress, key, len(work.freedom.index))
         if len(moves):
             say(f"going on after {len(moves)} of {len(subject)} frames ({progress})")
         matrices = work.curvatures()
@@ -95,7 +92,7 @@ def refine_subject(
                 bar.update(1)
                 bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
                 if len(moves) % SAVE_EVERY == 0 or interrupted():
-                    _write_progress(progress, key, moves, figures)
+                    write_progress(progress, key, moves, figures)
                 if interrupted():
                     return None
         first = torch.linalg.cholesky(matrices[0])
@@ -280,22 +277,3 @@ class _Work:
     def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:
         made = self.targets(frame, 1)
         return UNSEEN if made is None else self.likeness.measure(values, self.pose(frame), made[0])
-
-
-def _read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list[tuple[float, ...]]]:
-    """Moves and figures of the frames that are done; none from a file that is damaged or of something else."""
-    try:
-        if read_metadata(path, _MAX_PROGRESS).get("key") != key:
-            return [], []
-        tensors = read_tensors(path, _MAX_PROGRESS)
-        moves, figures = tensors["moves"], tensors["figures"]
-    except (UserError, KeyError):
-        return [], []
-    if moves.shape[1:] != (values,) or figures.shape != (len(moves), 3):
-        return [], []
-    return list(moves), [tuple(row) for row in figures.tolist()]
-
-
-def _write_progress(path: Path, key: str, moves: list[Tensor], figures: list[tuple[float, ...]]) -> None:
-    tensors = {"moves": torch.stack(moves), "figures": torch.tensor(figures, dtype=torch.float64)}
-    write_atomically(path, serialize(tensors, metadata={"key": key}))

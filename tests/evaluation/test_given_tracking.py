@@ -13,7 +13,7 @@ from disc import TEST, make_run
 from avatar.data.refinement import Refinement, Round
 from avatar.data.subject import Subject
 from avatar.evaluation.evaluate import evaluate
-from avatar.evaluation.tracked import describe_tracking, tracking_notes
+from avatar.evaluation.tracked import OF_MARK, describe_tracking, tracking_notes
 
 
 def refined(subject: Subject, trained_on: tuple[int, ...], first: int = 0) -> Subject:
@@ -51,7 +51,7 @@ def test_frames_that_an_avatar_was_trained_on_are_counted_by_their_numbers(tmp_p
     tracking = describe_tracking(make_run(tmp_path / "run", one), TEST)
     (found,) = tracking["rounds"]
     assert (found["frames_trained_on"], found["measured_frames_trained_on"]) == (5, 2)
-    (note,) = tracking_notes(tracking)
-    assert "2 of the measured frames" in note and "runs/first" in note
+    note, warning = tracking_notes(tracking)
+    assert "2 of them measured" in note and "runs/first" in note and warning == OF_MARK
     clean = describe_tracking(make_run(tmp_path / "clean", refined(subject, (7, 8, 9), first=100)), TEST)
-    assert clean["rounds"][0]["measured_frames_trained_on"] == 0 and not tracking_notes(clean)
+    assert clean["rounds"][0]["measured_frames_trained_on"] == 0 and len(tracking_notes(clean)) == 1
