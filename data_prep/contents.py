@@ -5,7 +5,11 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from avatar.errors import UserError
+from avatar.files.opening import open_file, read_text
+
 CONTENTS_FILE = "contents.sha256"  # in the format of sha256sum
+_MAX_BYTES = 2**26  # of it: half a million files
 
 
 def write_contents(folder: Path) -> None:
@@ -17,17 +21,17 @@ def write_contents(folder: Path) -> None:
 def find_damage(folder: Path) -> str | None:
     """What is not as `write_contents` found it; None where all is. Files that were added do not count."""
     try:
-        lines = (folder / CONTENTS_FILE).read_text(encoding="utf-8").splitlines()
+        lines = read_text(folder / CONTENTS_FILE, _MAX_BYTES).splitlines()
         recorded = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
-    except (OSError, ValueError):
+    except UserError:
         return f"{CONTENTS_FILE} is missing or cannot be read"
     files = _files(folder)
     for name, digest in recorded.items():
         try:
             if name not in files or _hash(files[name]) != digest:
                 return f"{name} is {'missing' if name not in files else 'not what was written'}"
-        except OSError as error:
-            return f"{name} cannot be read ({error.strerror})"
+        except (UserError, OSError):
+            return f"{name} cannot be read"
     return None if recorded else f"{CONTENTS_FILE} is empty"
 
 
@@ -37,4 +41,5 @@ def _files(folder: Path) -> dict[str, Path]:
 
 
 def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with open_file(path, None) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

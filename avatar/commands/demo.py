@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +13,7 @@ from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
+from avatar.files.opening import read_json
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.open import open_driver, open_run
@@ -75,7 +75,7 @@ def discard(_: str) -> None:
 
 def figures(results: Path) -> str:
     """Of the protocol that masks nothing away."""
-    strict = json.loads(results.read_bytes())["protocols"]["strict"]
+    strict = read_json(results)["protocols"]["strict"]
     means = strict["means"]
     return f"PSNR {means['psnr']:.2f}, SSIM {means['ssim']:.4f} over {len(strict['frames'])} of them"
 

@@ -5,6 +5,7 @@ Reading a FIFO waits for a writer that may never come. A device or a sparse file
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import stat
@@ -76,9 +77,13 @@ def read_bytes(path: Path | str, limit: int) -> bytes:
 
 
 def read_text(path: Path | str, limit: int) -> str:
-    """The text of a UTF-8 file, without a byte order mark. Raises as `open_file` does."""
+    """The text of a file in UTF-8, or in UTF-16 with a byte order mark, as editors on Windows save it, without that mark.
+
+    Raises as `open_file` does.
+    """
+    data = read_bytes(path, limit)
     try:
-        return read_bytes(path, limit).decode("utf-8-sig")
+        return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is not UTF-8 text (byte {error.start}); save it as UTF-8") from None
 

@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.opening import is_there
 
 NAMED = ("generic_model.pkl", "generic_model.npz")  # FLAME's own name for the model of no gender
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz")
@@ -18,15 +19,15 @@ def find_model_file(path: Path) -> Path:
 
     Raises UserError where there is none, where several could be it, and for an archive.
     """
-    if path.is_file():
-        if path.suffix.lower() in ARCHIVES or (path.suffix != ".npz" and zipfile.is_zipfile(path)):
-            raise UserError(f"{path} is an archive; unpack it, and give --head the folder")
-        return path
-    if not path.is_dir():
+    if not is_there(path):
         raise UserError(
             f"the head model {path} does not exist; give --head the model file or its folder "
             "(FLAME 2023 Open can be had from https://flame.is.tue.mpg.de)"
         )
+    if not path.is_dir():
+        if path.is_file() and (path.suffix.lower() in ARCHIVES or (path.suffix != ".npz" and zipfile.is_zipfile(path))):
+            raise UserError(f"{path} is an archive; unpack it, and give --head the folder")
+        return path  # whoever reads it refuses what is no regular file
     for depth in range(_DEPTH + 1):
         found = candidates(path, depth)
         named = [file for file in found if file.name in NAMED]
@@ -51,7 +52,9 @@ def candidates(folder: Path, depth: int = 0) -> list[Path]:
     return sorted(
         file
         for file in found
-        if file.is_file() and not file.name.startswith(".") and not any(word in file.name.lower() for word in _OTHERS)
+        if not file.is_dir()
+        and not file.name.startswith(".")
+        and not any(word in file.name.lower() for word in _OTHERS)
     )
 
 

@@ -172,7 +172,7 @@ def test_folders_of_any_name_are_prepared(name: str, tmp_path: Path, monkeypatch
     head = load_head_assets(folder / "head_model")
     source = Source(folder, folder / "head_model", frame_offset=1)
     prepared = prepare(source, head, say=lambda _: None)
-    assert len(prepared.name.encode()) < 100 and prepared.name.isprintable()
+    assert len(prepared.name.encode()) < 200 and prepared.name.isprintable()
     subject = Subject.open(prepared)
     assert subject.frame(2).image.shape == (64, 64, 3) and subject.name.isprintable()
     said: list[str] = []
