@@ -18,7 +18,7 @@ from avatar.runs.checkpoint import Checkpoint
 from avatar.runs.run import start_run
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
-from data_prep.open import open_subject
+from data_prep.prepare.open import open_subject
 
 SMALL = (
     "model.uv_size=20",

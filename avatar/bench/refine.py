@@ -39,7 +39,7 @@ from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps, within_passes
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
-from data_prep.open import find_head, open_subject
+from data_prep.prepare.open import find_head, open_subject
 
 SEED = 0
 MEASURED_EVERY = 2  # held-out frames

@@ -37,8 +37,8 @@ from avatar.pipeline.open import split_sizes
 from avatar.pipeline.track import bar
 from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps
-from data_prep.avatar_track import LANDMARKS_FILE, TrackingInfo
-from data_prep.open import find_head, open_subject
+from data_prep.formats.avatar_track import LANDMARKS_FILE, TrackingInfo
+from data_prep.prepare.open import find_head, open_subject
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import as_tracks, find_embedding

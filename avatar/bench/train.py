@@ -30,7 +30,7 @@ from avatar.train.placed import moving_step
 from avatar.train.step import Judge, Objective, choose_perceptual
 from avatar.train.steps import WARM, Steps
 from avatar.types import Frame
-from data_prep.open import find_head, open_subject
+from data_prep.prepare.open import find_head, open_subject
 
 PRESETS = ("paper", "balanced", "fast", "best")
 FRAMES = 8  # training frames that take turns; all are decoded before the clock runs

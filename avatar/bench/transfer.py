@@ -42,7 +42,7 @@ from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
 from avatar.train.align import WITH_REFINEMENT
 from avatar.types import Camera, HeadParams
-from data_prep.open import open_subject
+from data_prep.prepare.open import open_subject
 
 TARGET_SEED, DRIVER_SEED = 1, 2
 NEUTRAL_BIAS = 0.15  # standard deviation of a tracked coefficient at rest

@@ -16,7 +16,7 @@ from avatar.head.assets import load_head_assets
 from avatar.train.cost import measure_cost
 from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
-from data_prep.open import find_head
+from data_prep.prepare.open import find_head
 
 
 def run_check(arguments: Namespace) -> int:

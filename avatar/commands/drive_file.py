@@ -9,7 +9,7 @@ from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
 from avatar.pipeline import OK
 from avatar.pipeline.open import source_of
-from data_prep.open import open_subject
+from data_prep.prepare.open import open_subject
 
 
 def run_drive_file(arguments: Namespace) -> int:

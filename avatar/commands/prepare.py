@@ -9,7 +9,7 @@ from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.open import source_of
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 
 def run_prepare(arguments: Namespace) -> int:

@@ -24,7 +24,7 @@ from avatar.train.align import WITH_REFINEMENT
 from avatar.train.cost import measure_cost
 from avatar.train.order import within_passes
 from avatar.train.step import choose_perceptual
-from data_prep.open import open_subject
+from data_prep.prepare.open import open_subject
 
 ROUNDS_FOLDER = "rounds"
 PLAN_FORMAT = 1

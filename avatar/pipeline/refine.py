@@ -16,7 +16,7 @@ from avatar.pipeline.plan import FIRST_PASSES
 from avatar.refine.record import frames_csv, sheet, summary
 from avatar.refine.refine import fingerprint, refine_subject
 from avatar.runs.run import Run
-from data_prep.refined import check_target, frame_numbers, write_folder
+from data_prep.formats.refined import check_target, frame_numbers, write_folder
 
 REFINED_FOLDER = "refined"
 MANY_PASSES = 2 * FIRST_PASSES

@@ -13,9 +13,9 @@ from avatar.files.names import safe_name
 from avatar.files.places import cache_folder, named_path
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
-from data_prep.avatar_track import recognise
-from data_prep.contents import find_damage, write_contents
-from data_prep.open import HEAD_VARIABLE
+from data_prep.formats.avatar_track import recognise
+from data_prep.prepare.contents import find_damage, write_contents
+from data_prep.prepare.open import HEAD_VARIABLE
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.inputs import tracking_key

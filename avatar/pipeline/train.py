@@ -27,7 +27,7 @@ from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.order import within_passes
 from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import leave_avatar, train
-from data_prep.open import open_subject
+from data_prep.prepare.open import open_subject
 
 # Adam's epsilon makes whole steps of gradients that are nothing but rounding.
 OTHER_ROUNDING = "pictures come out alike, not to the bit, and parameters that they hardly depend on may differ"

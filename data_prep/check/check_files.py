@@ -9,10 +9,10 @@ from pathlib import Path
 from avatar.data.images import IMAGE_SUFFIXES
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence, loss_severity
-from data_prep.frame_files import ALPHA, HEAD, IMAGE, describe_numbers, gaps
-from data_prep.frame_offset import RADIUS
-from data_prep.mask_values import judge_values, mask_kinds
-from data_prep.pairing import describe_reasons
+from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, describe_numbers, gaps
+from data_prep.prepare.frame_offset import RADIUS
+from data_prep.prepare.mask_values import judge_values, mask_kinds
+from data_prep.prepare.pairing import describe_reasons
 
 _SHOWN = 6  # file names in a sentence
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding
-from data_prep.inspect_images import composited_background
+from data_prep.prepare.inspect_images import composited_background
 
 # Neighbours differ by at least half of the clip's median difference in clips without repeats; an encoder that repeats a
 # frame leaves far less.

@@ -12,7 +12,7 @@ from avatar.files.pickles import load_torch_pickle
 from data_prep.check.clip import NOT_SOUGHT, Clip
 from data_prep.check.findings import Finding, from_sentence, grouped, loss_severity
 from data_prep.check.motion import suddenness
-from data_prep.frame_files import TRACKING, describe_numbers
+from data_prep.formats.frame_files import TRACKING, describe_numbers
 
 # A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
 # neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.

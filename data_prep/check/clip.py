@@ -18,16 +18,16 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.check.findings import frames_phrase
 from data_prep.check.view import View, look_at
-from data_prep.fit import Fit, MeshProjector, fit_of_masks
-from data_prep.formats import METRICAL_TRACKER, open_tracked_folder
-from data_prep.frame_files import IMAGE, TRACKING, FrameFiles
-from data_prep.frame_offset import OffsetEstimate, detect_offset
-from data_prep.mask_values import refuse_colours, with_labels
-from data_prep.masks import read_masks
-from data_prep.metrical_tracker import read_tracking
-from data_prep.misfit import Judgement, judge, sample
-from data_prep.tracked_folder import TrackedFolder
-from data_prep.tracking import FrameTrack, Tracking, fit_coefficients
+from data_prep.formats.detect import METRICAL_TRACKER, open_tracked_folder
+from data_prep.formats.frame_files import IMAGE, TRACKING, FrameFiles
+from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
+from data_prep.formats.metrical_tracker import read_tracking
+from data_prep.formats.tracked_folder import TrackedFolder
+from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
+from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
+from data_prep.prepare.mask_values import refuse_colours, with_labels
+from data_prep.prepare.masks import read_masks
+from data_prep.prepare.misfit import Judgement, judge, sample
 
 MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
 GIVEN, NOT_SOUGHT = "given with --frame-offset", "not looked for: images, tracking or head model are missing"

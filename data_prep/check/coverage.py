@@ -11,7 +11,7 @@ from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.motion import HeadAngles, head_angles
-from data_prep.tracked_folder import divide
+from data_prep.formats.tracked_folder import divide
 
 MIN_TEST_FRAMES = 2
 SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120

@@ -22,9 +22,9 @@ from data_prep.check.check_tracking import behind_camera, check_behind_camera, c
 from data_prep.check.clip import Clip, Progress, read_clip, silent
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
-from data_prep.frame_files import ALPHA, HEAD, TRACKING
-from data_prep.not_subjects import check_folder
-from data_prep.pairing import describe_reasons
+from data_prep.formats.frame_files import ALPHA, HEAD, TRACKING
+from data_prep.prepare.not_subjects import check_folder
+from data_prep.prepare.pairing import describe_reasons
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
 

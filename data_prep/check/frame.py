@@ -12,8 +12,8 @@ from avatar.data.subject import head_of_matte
 from avatar.types import Camera, Frame
 from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage
-from data_prep.masks import read_masks
-from data_prep.projection import head_params
+from data_prep.prepare.masks import read_masks
+from data_prep.prepare.projection import head_params
 
 
 def first_training_frame(clip: Clip, coverage: Coverage) -> tuple[Frame, Float[Tensor, " S"]]:

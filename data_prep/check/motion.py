@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from avatar.data.images import read_image
 from avatar.errors import UserError
 from data_prep.check.clip import Clip
-from data_prep.fit import Mesh, MeshProjector
-from data_prep.masks import read_masks
-from data_prep.projection import filled_lips
+from data_prep.prepare.mask_overlap import Mesh, MeshProjector
+from data_prep.prepare.masks import read_masks
+from data_prep.prepare.projection import filled_lips
 
 SHOWN = 8
 DRAWN_WIDTH = 560  # pixels; the mesh needs room for its lines

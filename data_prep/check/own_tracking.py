@@ -8,7 +8,7 @@ from pathlib import Path
 from avatar.errors import UserError
 from avatar.files.opening import read_bytes
 from avatar.html import Markup, data_table, element, section
-from data_prep.avatar_track import read_info, recognise
+from data_prep.formats.avatar_track import read_info, recognise
 
 OVERLAY = Path("overlay") / "overlay.mp4"
 MAX_EMBEDDED = 2**25  # bytes; a page of more than that opens slowly

@@ -14,11 +14,11 @@ from skimage.measure import label
 from avatar.data.images import read_bytes
 from avatar.data.subject import head_of_matte
 from avatar.errors import UserError
-from data_prep import face_parsing
-from data_prep.face_parsing import mask_of
-from data_prep.fit import measured_size
-from data_prep.frame_files import ALPHA, HEAD, IMAGE, PARSING
-from data_prep.projection import filled
+from data_prep.formats import face_parsing
+from data_prep.formats.face_parsing import mask_of
+from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, PARSING
+from data_prep.prepare.mask_overlap import measured_size
+from data_prep.prepare.projection import filled
 
 FAR = 0.05  # of the image width: further from the person than soft hair reaches
 _ON = 127

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from data_prep.projection import silhouette
+from data_prep.prepare.projection import silhouette
 
 SIDE = 256  # pixels of the picture that is divided; the division is enlarged
 _MARGIN_IN, _MARGIN_OUT = 7, 5  # pixels of SIDE by which the mesh may be wrong

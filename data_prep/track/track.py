@@ -20,7 +20,7 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
-from data_prep.avatar_track import (
+from data_prep.formats.avatar_track import (
     FRAMES,
     LANDMARKS_FILE,
     TrackingInfo,

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.head.assets import HeadAssets
-from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.formats.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
 from data_prep.track import plate, spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view

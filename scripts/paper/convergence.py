@@ -52,7 +52,7 @@ from avatar.train.order import frame_order
 from avatar.train.posed import PosedMeshes
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
-from data_prep.open import find_head, open_subject
+from data_prep.prepare.open import find_head, open_subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

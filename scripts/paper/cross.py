@@ -31,7 +31,7 @@ from avatar.motion.transfer import transfer_motion
 from avatar.pipeline.reenact import DEFAULT_CHOICES, check_same_head
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
-from data_prep.open import find_head, open_subject
+from data_prep.prepare.open import find_head, open_subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

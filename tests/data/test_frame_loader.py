@@ -15,7 +15,7 @@ from avatar.data.source import Source
 from avatar.data.subject import FramePixels, Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 ORDER = [3, 0, 0, 7, 3, 11, 1, 2, 3, 0, 5, 11]
 FRAME_BYTES = 64 * 64 * 6

@@ -19,7 +19,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import shutil
 from pathlib import Path
 
 from avatar.head.assets import load_head_assets
-from data_prep import avatar_track
-from data_prep.avatar_track import TrackingInfo, write_tracking
-from data_prep.metrical_tracker import read_tracking
+from data_prep.formats import avatar_track
+from data_prep.formats.avatar_track import TrackingInfo, write_tracking
+from data_prep.formats.metrical_tracker import read_tracking
 
 LOST = {5: "no face was found", 6: "no face was found"}
 

@@ -14,7 +14,7 @@ from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 FRAMES, SIZE, HEIGHT = 24, 64, 56
 PIXELS = 1e-3  # of the projected vertices; the parameters are float32

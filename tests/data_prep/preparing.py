@@ -12,7 +12,7 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 
 def prepare_folder(

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from avatar.types import IDENTITY_6D
-from data_prep.root_pose import rotation_matrix
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.formats.root_pose import rotation_matrix
 
 AHEAD = np.diag([1.0, -1.0, -1.0])  # the head looks along +z with y up, a camera sees y down
 

@@ -21,7 +21,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import track
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 
 def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_prep.fit import Mesh, measure_fit
+from data_prep.prepare.mask_overlap import Mesh, measure_fit
 
 SIZE = (40, 30)
 

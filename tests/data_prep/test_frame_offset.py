@@ -17,9 +17,9 @@ from avatar.data.images import read_mask
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
-from data_prep.frame_files import FrameFiles, find_frame_files
-from data_prep.frame_offset import OffsetEstimate, detect_offset
-from data_prep.metrical_tracker import FrameTrack, read_tracking
+from data_prep.formats.frame_files import FrameFiles, find_frame_files
+from data_prep.formats.metrical_tracker import FrameTrack, read_tracking
+from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 
 
 @lru_cache(maxsize=1)

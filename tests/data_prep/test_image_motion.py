@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_prep.image_motion import _sample
+from data_prep.prepare.image_motion import _sample
 
 
 def test_flow_is_read_where_the_pixels_have_their_centres() -> None:

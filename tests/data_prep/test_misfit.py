@@ -24,10 +24,10 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.check.folder import check_tracked_folder
-from data_prep.fit import Fit
-from data_prep.frame_files import FrameFiles
-from data_prep.misfit import judge
-from data_prep.prepare import prepare
+from data_prep.formats.frame_files import FrameFiles
+from data_prep.prepare.mask_overlap import Fit
+from data_prep.prepare.misfit import judge
+from data_prep.prepare.prepare import prepare
 
 LIPS = r"the tracked lips do not lie on the mouth masks \(overlap 0\.[0-3]\d+, \d+\.\d% of the head's size away\)"
 HEAD_LIES = r", although the head lies on its masks \(overlap 0\.[89]\d+\); "

@@ -17,8 +17,8 @@ from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
-from data_prep.prepare import prepare
-from data_prep.projection import filled_lips
+from data_prep.prepare.prepare import prepare
+from data_prep.prepare.projection import filled_lips
 
 
 def test_the_prepared_head_lies_on_the_masks(tmp_path: Path) -> None:

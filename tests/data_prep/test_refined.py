@@ -17,12 +17,12 @@ from avatar.data.source import Source
 from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from data_prep import refined
-from data_prep.avatar_track import read_info
 from data_prep.check.folder import check_tracked_folder
-from data_prep.formats import open_tracked_folder
-from data_prep.open import find_head, open_subject
-from data_prep.refined import GIVEN_FILE, REFINEMENT_FILE, check_target, frame_numbers, write_folder
+from data_prep.formats import refined
+from data_prep.formats.avatar_track import read_info
+from data_prep.formats.detect import open_tracked_folder
+from data_prep.formats.refined import GIVEN_FILE, REFINEMENT_FILE, check_target, frame_numbers, write_folder
+from data_prep.prepare.open import find_head, open_subject
 
 FRAMES = 20
 

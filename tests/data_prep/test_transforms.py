@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_prep.root_pose import rotation_matrix
-from data_prep.transforms import ListedFrame, camera_pose, pinhole, read_listings
+from data_prep.formats.root_pose import rotation_matrix
+from data_prep.formats.transforms import ListedFrame, camera_pose, pinhole, read_listings
 
 
 def test_validation_is_held_out_where_no_test_is(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 WIDTH, HEIGHT = 80, 64
 FX, FY = 200.0, 210.0

@@ -39,7 +39,7 @@ from avatar.runs.checkpoint import (
     save_checkpoint,
 )
 from avatar.runs.run import read_run_info, write_run_info
-from data_prep.prepare import prepare
+from data_prep.prepare.prepare import prepare
 
 DONE, REFUSED, KILLED, BROKEN = 0, 3, 9, 4
 # Audit events of calls that change files.

@@ -21,7 +21,7 @@ from avatar.losses.lpips import load_lpips
 from avatar.pipeline.plan import Plan
 from avatar.report.page import read_results
 from avatar.sweep.state import read_job, read_sweep
-from data_prep.metrical_tracker import read_tracking
+from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.track.footage.video import open_video
 
 ROOT = Path(__file__).resolve().parents[2]

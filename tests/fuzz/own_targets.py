@@ -19,7 +19,7 @@ from avatar.head.assets import load_head_assets
 from avatar.runs.avatar_file import AVATAR_FILE, read_portrait, write_portrait
 from avatar.runs.trained import load_avatar
 from avatar.sweep.spec import read_spec
-from data_prep import avatar_track
+from data_prep.formats import avatar_track
 from data_prep.track.faces.embedding import OFFICIAL_FILE, official_embedding
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, load_landmarks, save_landmarks
 

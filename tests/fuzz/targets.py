@@ -32,9 +32,9 @@ from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import read_drive, write_drive
 from avatar.runs.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info, write_run_info
-from data_prep.formats import open_tracked_folder
-from data_prep.metrical_tracker import read_tracking
-from data_prep.prepare import prepare
+from data_prep.formats.detect import open_tracked_folder
+from data_prep.formats.metrical_tracker import read_tracking
+from data_prep.prepare.prepare import prepare
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
+from data_prep.formats.frame_track import FrameTrack
 from data_prep.track.faces.detect import FaceDetector
 from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding, official_embedding
 from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
@@ -21,7 +22,6 @@ from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.progress import Progress
 from data_prep.track.quality import landmark_figures
-from data_prep.tracking import FrameTrack
 
 
 def fit_tracks(

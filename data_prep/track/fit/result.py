@@ -15,9 +15,9 @@ from avatar.files.atomic import write_atomically
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from data_prep.projection import project_head
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.projection import project_head
 from data_prep.track.faces.landmarks import Landmarks
-from data_prep.tracking import FrameTrack
 
 _FIELDS = ("R", "t", "jaw", "eyes", "eyelids", "neck", "expression")
 

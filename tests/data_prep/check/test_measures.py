@@ -13,7 +13,7 @@ from avatar.data.split import SplitSizes
 from data_prep.check.check_tracking import _camera
 from data_prep.check.coverage import Coverage, measure_coverage
 from data_prep.check.motion import head_angles, suddenness
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
 
 TRAIN, TEST = 20, 5
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from data_prep.avatar_track import TrackingInfo, write_tracking
 from data_prep.check import own_tracking
 from data_prep.check.own_tracking import tracking_sections
-from data_prep.metrical_tracker import read_tracking
+from data_prep.formats.avatar_track import TrackingInfo, write_tracking
+from data_prep.formats.metrical_tracker import read_tracking
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from small_runs import SMALL
 
 from avatar.commands import demo
 from avatar.runs.run import read_run_info
-from data_prep.avatar_track import read_info
+from data_prep.formats.avatar_track import read_info
 
 FRAMES = 30
 

@@ -14,7 +14,7 @@ from spoken_scene import DRIFT, NOISE, SIZE, Scene, drawn, spoken_scene
 from avatar.demo.render import RenderedFrame
 from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
-from data_prep.projection import project_head
+from data_prep.prepare.projection import project_head
 from data_prep.track.faces.landmark_groups import LIPS
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.camera import to_camera

@@ -15,7 +15,7 @@ from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer
 from avatar.errors import UserError
 from data_prep.check.overlay import draw_mesh, outline
-from data_prep.fit import Mesh
+from data_prep.prepare.mask_overlap import Mesh
 from data_prep.track.clothes import learn_colours
 from data_prep.track.faces.landmark_groups import OUTER_LIPS
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring

@@ -12,13 +12,13 @@ from heads import grid_head
 
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
+from data_prep.formats.frame_track import FrameTrack
 from data_prep.track import work
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.progress import silent
 from data_prep.track.stages import growing
 from data_prep.track.work import Work
-from data_prep.tracking import FrameTrack
 
 
 def test_a_stage_is_made_once_for_its_inputs(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from avatar.errors import UserError, refuse
 from avatar.files.pickles import UnsafeFileError, load_torch_pickle
 from avatar.types import IDENTITY_6D
-from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
 
 
 def read_tracking(

@@ -14,12 +14,12 @@ import numpy as np
 
 from avatar.data.images import read_bytes
 from avatar.head.model import HeadModel
-from data_prep.fit import MeshProjector, measured_size
-from data_prep.frame_files import ALPHA, HEAD, MOUTH, FrameFiles, describe_numbers
-from data_prep.mask_values import WHAT, place_of
-from data_prep.misfit import sample
-from data_prep.projection import silhouette
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles, describe_numbers
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.mask_overlap import MeshProjector, measured_size
+from data_prep.prepare.mask_values import WHAT, place_of
+from data_prep.prepare.misfit import sample
+from data_prep.prepare.projection import silhouette
 
 MAX_ON_HEAD, MIN_IN_CORNERS, MIN_COVERED = 0.25, 0.75, 0.35  # of an inverted mask, mean opacity; the last of all of it
 MIN_OPAQUE = 0.5  # of a matte, on the head mask; of a head mask, on the mesh

@@ -10,7 +10,7 @@ from pathlib import Path
 from avatar.data.manifest import MANIFEST_VERSION
 from avatar.files.names import safe_name
 from avatar.files.places import cache_folder
-from data_prep.frame_files import FrameFiles
+from data_prep.formats.frame_files import FrameFiles
 
 
 def default_location(files: FrameFiles, options: dict[str, object]) -> Path:

@@ -21,7 +21,7 @@ from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS
 from avatar.errors import UserError, refuse
 from avatar.files import opening
-from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
 
 SPLITS = ("train", "val", "test")
 MAX_BYTES = 2**28

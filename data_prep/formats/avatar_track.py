@@ -28,10 +28,10 @@ from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
-from data_prep.frame_files import FrameFiles, KindNames, find_numbered
-from data_prep.tracked_folder import TrackedFolder
-from data_prep.tracking import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
-from data_prep.transforms import read_json
+from data_prep.formats.frame_files import FrameFiles, KindNames, find_numbered
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.formats.tracked_folder import TrackedFolder
+from data_prep.formats.transforms import read_json
 
 NAME = "avatar-track"
 VERSION = 1

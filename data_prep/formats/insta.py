@@ -15,11 +15,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from avatar.errors import UserError
-from data_prep.face_parsing import decode_reds
-from data_prep.frame_files import FrameFiles, KindNames, transparent
-from data_prep.metrical_tracker import read_tracking
-from data_prep.tracked_folder import TrackedFolder, existing, listings_of, numbered
-from data_prep.transforms import ListedFrame, frame_rate
+from data_prep.formats.face_parsing import decode_reds
+from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
+from data_prep.formats.metrical_tracker import read_tracking
+from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, numbered
+from data_prep.formats.transforms import ListedFrame, frame_rate
 
 NAME = "INSTA"
 NAMES = KindNames("matted/", "seg_mask/", "seg_mask/", images="images/")

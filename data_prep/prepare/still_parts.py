@@ -9,7 +9,7 @@ import numpy as np
 
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.types import IDENTITY_6D
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
 
 FEWEST = 6  # frames
 STILL = 1e-4  # range over the clip, of coefficients and of rotation matrices' entries

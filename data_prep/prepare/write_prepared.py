@@ -14,7 +14,7 @@ from safetensors.numpy import save
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_manifest
 from avatar.errors import UserError
 from avatar.files.names import safe_name
-from data_prep.contents import find_damage, write_contents
+from data_prep.prepare.contents import find_damage, write_contents
 
 
 def is_current(target: Path, input_hash: str, is_chosen: bool, say: Callable[[str], object] = lambda _: None) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from avatar.data.images import decode_image, decode_values, read_bytes
 from avatar.errors import UserError
-from data_prep.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
+from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 
 SAMPLES = 16  # files of each kind
 LEAST_BRIGHT, FULL = 200, 250  # the largest value of a mask: below, it is none; below, it is said

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from avatar.head.model import HeadModel
-from data_prep.projection import filled_lips, project_head, region_faces, silhouette
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.projection import filled_lips, project_head, region_faces, silhouette
 
 MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distances are given in the frame's own pixels
 _ON = 127

@@ -17,12 +17,12 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
-from data_prep.frame_files import FrameFiles
-from data_prep.image_motion import motion_residuals
-from data_prep.masks import read_masks
-from data_prep.misfit import judge_sample
-from data_prep.projection import filled_lips, project_head, region_faces, silhouette
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_files import FrameFiles
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.image_motion import motion_residuals
+from data_prep.prepare.masks import read_masks
+from data_prep.prepare.misfit import judge_sample
+from data_prep.prepare.projection import filled_lips, project_head, region_faces, silhouette
 
 RADIUS = 4  # offsets tried on each side; the outermost ones only serve to see that the best is a minimum
 SAMPLED_FRAMES = 120

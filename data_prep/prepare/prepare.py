@@ -17,21 +17,21 @@ from avatar.errors import UserError, refuse
 from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from data_prep.cache import default_location, input_hash
-from data_prep.formats import open_tracked_folder
-from data_prep.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
-from data_prep.frame_offset import detect_offset
-from data_prep.inspect_images import Inspection, composited_background, inspect_images
-from data_prep.mask_polarity import polarity_problems
-from data_prep.mask_values import with_labels
-from data_prep.masks import derive_masks
-from data_prep.misfit import judge_sample
-from data_prep.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
-from data_prep.projection import region_faces
-from data_prep.still_parts import still_parts
-from data_prep.tracked_folder import TrackedFolder, divide
-from data_prep.tracking import Tracking, fit_coefficients
-from data_prep.write_prepared import is_current, write_prepared
+from data_prep.formats.detect import open_tracked_folder
+from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
+from data_prep.formats.frame_track import Tracking, fit_coefficients
+from data_prep.formats.tracked_folder import TrackedFolder, divide
+from data_prep.prepare.cache import default_location, input_hash
+from data_prep.prepare.frame_offset import detect_offset
+from data_prep.prepare.inspect_images import Inspection, composited_background, inspect_images
+from data_prep.prepare.mask_polarity import polarity_problems
+from data_prep.prepare.mask_values import with_labels
+from data_prep.prepare.masks import derive_masks
+from data_prep.prepare.misfit import judge_sample
+from data_prep.prepare.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
+from data_prep.prepare.projection import region_faces
+from data_prep.prepare.still_parts import still_parts
+from data_prep.prepare.write_prepared import is_current, write_prepared
 
 HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
 

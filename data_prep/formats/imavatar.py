@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from avatar.head.assets import HeadAssets
-from data_prep.face_parsing import decode_numbers
-from data_prep.frame_files import FrameFiles, KindNames, transparent
-from data_prep.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
-from data_prep.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
-from data_prep.tracking import BadFrame, FrameTrack, Tracking, nearest_rotation
-from data_prep.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate, read_frames
+from data_prep.formats.face_parsing import decode_numbers
+from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, nearest_rotation
+from data_prep.formats.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
+from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
+from data_prep.formats.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate, read_frames
 
 NAME = "IMavatar"
 NAMES = KindNames("mask/", "semantic/", "semantic/", images="image/", tracking="flame_params.json")

@@ -10,9 +10,9 @@ from avatar.data.refinement import Refinement
 from avatar.data.split import DEFAULT_SIZES, Split, SplitSizes, split_frames
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
-from data_prep.frame_files import FrameFiles
-from data_prep.tracking import Tracking
-from data_prep.transforms import ListedFrame
+from data_prep.formats.frame_files import FrameFiles
+from data_prep.formats.frame_track import Tracking
+from data_prep.formats.transforms import ListedFrame
 
 
 @dataclass(frozen=True)

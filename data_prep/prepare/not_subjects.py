@@ -10,8 +10,8 @@ from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE
 from avatar.errors import UserError
 from avatar.head.find import candidates
-from data_prep import avatar_track
-from data_prep.transforms import read_json
+from data_prep.formats import avatar_track
+from data_prep.formats.transforms import read_json
 
 _PARTS = ("imgs", "images", "image", "frames", "alpha", "parsing", "checkpoint", "flame_param")  # of tracked folders
 _LISTINGS = ("transforms*.json", "flame_params.json", "*/flame_params.json")

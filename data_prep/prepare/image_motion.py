@@ -14,8 +14,8 @@ import numpy as np
 
 from avatar.data.images import read_image
 from avatar.head.model import HeadModel
-from data_prep.projection import project_head
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.projection import project_head
 
 _EYELID_MOVES = 0.5  # of the largest displacement of the eyelid's blendshape
 

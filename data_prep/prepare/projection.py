@@ -9,7 +9,7 @@ import torch
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
 from avatar.types import Camera, HeadParams
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_track import FrameTrack
 
 
 def head_params(track: FrameTrack) -> HeadParams:

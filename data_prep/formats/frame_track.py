@@ -11,7 +11,7 @@ import numpy as np
 
 from avatar.errors import UserError, refuse
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
-from data_prep.identity import MAX_CHANGE, compare_identities
+from data_prep.formats.identity import MAX_CHANGE, compare_identities
 
 ROTATION_TOLERANCE = 1e-2  # float16 and rounding; larger errors are not a rotation
 INTRINSICS_NOTE, INTRINSICS_ERROR = 1e-3, 5e-2  # relative change of fx, fy, cx, cy within a clip

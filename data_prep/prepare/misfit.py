@@ -24,10 +24,10 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
-from data_prep.fit import Fit, MeshProjector, fit_of_masks
-from data_prep.frame_files import FrameFiles
-from data_prep.masks import read_masks
-from data_prep.tracking import FrameTrack
+from data_prep.formats.frame_files import FrameFiles
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
+from data_prep.prepare.masks import read_masks
 
 MIN_HEAD = 0.3  # IoU with the head mask; a head that is moved by half its width has 0.33
 MIN_ON_MATTE = 0.5  # of the head; a matte holds clothes too, so that there is no telling its IoU

@@ -29,11 +29,11 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.names import shortened
 from avatar.files.opening import is_there
-from data_prep import avatar_track
-from data_prep.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
-from data_prep.tracked_folder import TrackedFolder
-from data_prep.tracking import FrameTrack, Tracking
-from data_prep.transforms import read_json
+from data_prep.formats import avatar_track
+from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
+from data_prep.formats.frame_track import FrameTrack, Tracking
+from data_prep.formats.tracked_folder import TrackedFolder
+from data_prep.formats.transforms import read_json
 
 REFINEMENT_FILE, GIVEN_FILE = "refinement.json", "given.npz"
 HEAD_MODEL = "head_model"

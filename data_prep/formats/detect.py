@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep import avatar_track, imavatar, insta, refined, vhap
-from data_prep.frame_files import find_frame_files
-from data_prep.metrical_tracker import read_tracking
-from data_prep.tracked_folder import TrackedFolder, matte_notes
-from data_prep.transforms import ListedFrame, read_listings
+from data_prep.formats import avatar_track, imavatar, insta, refined, vhap
+from data_prep.formats.frame_files import find_frame_files
+from data_prep.formats.metrical_tracker import read_tracking
+from data_prep.formats.tracked_folder import TrackedFolder, matte_notes
+from data_prep.formats.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
 _LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}

@@ -12,8 +12,8 @@ import numpy as np
 
 from avatar.data.images import decode_image, read_bytes, read_image
 from avatar.errors import UserError
-from data_prep.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
-from data_prep.mask_values import judge_values, mask_kinds, refuse_colours
+from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
+from data_prep.prepare.mask_values import judge_values, mask_kinds, refuse_colours
 
 _SAMPLES = 16
 _ONE = {ALPHA: "alpha", HEAD: "head mask", MOUTH: "mouth mask", PARSING: "face parsing"}

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar.errors import UserError
-from data_prep.frame_files import FrameFiles, describe_numbers, gaps
-from data_prep.frame_offset import RADIUS
-from data_prep.inspect_images import Inspection
-from data_prep.tracking import Tracking
+from data_prep.formats.frame_files import FrameFiles, describe_numbers, gaps
+from data_prep.formats.frame_track import Tracking
+from data_prep.prepare.frame_offset import RADIUS
+from data_prep.prepare.inspect_images import Inspection
 
 _REASONS_SHOWN = 5
 

@@ -22,11 +22,11 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
-from data_prep.frame_files import FrameFiles, KindNames, transparent
-from data_prep.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
-from data_prep.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
-from data_prep.tracking import BadFrame, FrameTrack, Tracking, vector
-from data_prep.transforms import (
+from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, vector
+from data_prep.formats.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
+from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
+from data_prep.formats.transforms import (
     OPENCV_FROM_OPENGL,
     ListedFrame,
     camera_pose,

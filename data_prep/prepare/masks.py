@@ -11,10 +11,10 @@ import numpy as np
 from avatar.data.images import read_bytes
 from avatar.data.manifest import Manifest
 from avatar.head.model import HeadModel
-from data_prep.face_parsing import HEAD, MOUTH, mask_of
-from data_prep.frame_files import FrameFiles
-from data_prep.projection import filled_lips, project_head, region_faces
-from data_prep.tracking import Tracking
+from data_prep.formats.face_parsing import HEAD, MOUTH, mask_of
+from data_prep.formats.frame_files import FrameFiles
+from data_prep.formats.frame_track import Tracking
+from data_prep.prepare.projection import filled_lips, project_head, region_faces
 
 
 def read_masks(files: FrameFiles, number: int) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -1,0 +1,1 @@
+"""Tracked folders as other programs write them: one file a program; `detect` tells them apart."""
