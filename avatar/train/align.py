@@ -5,9 +5,9 @@ loss and m the frame's moves in units of a tracker's errors,
 
     m <- m - r A^-1 (s dL/dm + m)
 
-A is the curvature of refinement (`avatar.tracking`), which all frames share, with the prior's 1 on its diagonal; s turns the
-loss into refinement's misfit; the rate r falls from `trainer.align_rate` to LAST_RATE of it. The mean move of the head poses
-is subtracted after every pass, because held-out frames and drivers keep their tracking. Where the gain is below LEAST_GAIN,
+A is the curvature of refinement (`avatar.tracking`), shared by all frames, plus the prior's identity; s turns the loss into
+refinement's misfit; the rate r falls from `trainer.align_rate` to LAST_RATE of it. The mean move of the head poses is
+subtracted after every pass, because held-out frames and drivers keep their tracking. Where the gain is below LEAST_GAIN,
 the given tracking is used again.
 
 Left out is how a rotation of the head changes the colours that depend on the view: at most 0.24 units in six frames, whose
