@@ -2,7 +2,7 @@
 
     python scripts/draw_mouth.py RUN [RUN ...] docs/teeth.png [--head HEAD] [--size 1024]
 
-docs/teeth.png has a run with model.teeth=false above one of the default (docs/best.md).
+docs/teeth.png has a run with model.teeth=false above one of the default (docs/bench/recipe_results.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python scripts/draw_rigidity.py RUN docs/rigidity.png --frames 820 930 [--head HEAD] [--size 256]
 
-Blue keeps with the skin, red with the skull (docs/best.md).
+Blue keeps with the skin, red with the skull (docs/bench/recipe_results.md).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What docs/view.md says: sizes, speed and likeness of an avatar's page in headless Chromium, and of the viewer's pictures.
+"""Measure an exported page in headless Chromium, and the viewer's pictures (docs/bench/view_results.md).
 
 python scripts/measure_page.py RUN [--head PATH]      needs Chromium, and playwright from the extra [test]
 """

@@ -1,4 +1,4 @@
-"""What docs/view.md says of an exported page that a camera drives: latency, rate, and likeness to `avatar view --webcam`.
+"""Measure an exported page that a camera drives: latency, rate, likeness to the webcam (docs/bench/view_results.md).
 
 python scripts/measure_page_camera.py RUN VIDEO [--head PATH] [--seconds 20] [--renderer wasm]
 

@@ -1,4 +1,4 @@
-"""What docs/view.md says of `avatar view RUN --stream PORT`: how long after a packet is sent the avatar's picture is there.
+"""Measure `avatar view RUN --stream PORT`: latency from packet to picture (docs/bench/view_results.md).
 
 python scripts/measure_stream.py RUN [--head PATH] [--rate 60] [--seconds 8]
 

@@ -1,4 +1,4 @@
-"""What docs/view.md says of `avatar view RUN --webcam`: latency and rate on a video that is played at its own rate.
+"""Measure `avatar view RUN --webcam`: latency and rate on a video (docs/bench/view_results.md).
 
 python scripts/measure_webcam.py RUN VIDEO [--head PATH] [--browser]     --browser: with the page open in headless Chromium
 

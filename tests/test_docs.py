@@ -1,7 +1,8 @@
-"""Every command that the documentation shows must parse, and every file that it links to must exist."""
+"""The documentation's commands parse, its links and the pages that the code names exist, and its pages stay short."""
 
 from __future__ import annotations
 
+import csv
 import re
 import shlex
 from pathlib import Path
@@ -32,6 +33,7 @@ COMMANDS = (
 )
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+LINKING = sorted([*PAGES, *(ROOT / "docs" / "bench").glob("*.md")])
 
 
 def commands(page: Path) -> list[str]:
@@ -57,11 +59,44 @@ def test_documented_commands_parse(page: Path) -> None:
             load_config(getattr(arguments, "overrides", []))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", LINKING, ids=lambda p: p.name)
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
-        if not target.startswith("http"):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    for target, _, anchor in re.findall(r"\]\(([^)#]*)(#([^)]*))?\)", page.read_text(encoding="utf-8")):
+        if target.startswith("http"):
+            continue
+        file = page.parent / target if target else page
+        assert file.exists(), f"{page.name} links to {target}"
+        assert not anchor or anchor in anchors(file), f"{page.name} links to {target}#{anchor}"
+
+
+def anchors(page: Path) -> set[str]:
+    """What a page's headings are linked by."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    for folder in ("avatar", "data_prep", "scripts", "configs"):
+        for file in (ROOT / folder).rglob("*"):
+            if file.suffix in {".py", ".h", ".cpp", ".yaml", ".sh", ".js"}:
+                for name in re.findall(r"docs/[\w/]+\.(?:md|csv)", file.read_text(encoding="utf-8")):
+                    assert (ROOT / name).exists(), f"{file.relative_to(ROOT)} names {name}"
+
+
+def test_pages_stay_short() -> None:
+    words = {page.name: len(page.read_text(encoding="utf-8").split()) for page in PAGES}
+    assert words["README.md"] <= 500 and words["recipe.md"] <= 400
+    assert sum(words.values()) - words["README.md"] <= 7000, words
+
+
+def test_experiments_have_figures_that_can_be_read() -> None:
+    with (ROOT / "docs" / "experiments.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file, strict=True))
+    assert list(rows[0]) == ["change", "data", "seeds", "dpsnr", "dssim", "dlpips", "kept", "command"]
+    for row in rows:
+        assert row["change"] and row["kept"] in ("yes", "no", ""), row
+        for name in ("dpsnr", "dssim", "dlpips"):
+            assert re.fullmatch(r"([+-]\d+\.\d+|0(\.0+)?)?", row[name]), row
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

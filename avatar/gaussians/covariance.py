@@ -8,7 +8,7 @@ Cholesky factor L of their covariance, Sigma = L L^T. Then
 Source: HyperGaussians (CVPR 2026), section 3, the conditioning before the inverse covariance trick; supplement,
 "Parameterization" (diagonal through exp). It is there to be compared with: Sigma_bb, n x n, is built and factorised for
 every Gaussian, so the time grows with n^3 and the parameters with (m + n)^2. Float32 loses figures where Sigma is badly
-conditioned (docs/hypergaussians.md).
+conditioned (docs/bench/kernels.md).
 
 Gaussians lie last, so that each step of a factorisation is one operation on contiguous rows of all of them.
 """

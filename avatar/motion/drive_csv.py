@@ -71,7 +71,7 @@ def _from_columns(
     if not coefficients:
         raise UserError(
             f"{path} has no column expression_0, expression_1, ... nor one of the head model's names (its columns: "
-            f"{_some(table.header)}); see docs/transfer.md"
+            f"{_some(table.header)}); see docs/reenact.md"
         )
     expression = np.zeros((len(table), max(coefficients) + 1))
     for index, name in coefficients.items():
@@ -112,7 +112,7 @@ def _from_arkit(
         )
         raise UserError(
             f"{path} holds ARKit's blendshapes, and {known}: put {NAMES_FILE} beside the model file, with the name of each "
-            "coefficient or ARKit's weights (docs/transfer.md)"
+            "coefficient or ARKit's weights (docs/reenact.md)"
         )
     if unmapped:
         shown = _some([own[shape] for shape in unmapped])

@@ -1,4 +1,4 @@
-"""Drive files: motion for an avatar from any tracker, as .npz or .csv; docs/transfer.md is their definition.
+"""Drive files: motion for an avatar from any tracker, as .npz or .csv; docs/reenact.md is their definition.
 
 An .npz holds, for T frames (only `expression` is required; what is missing is at rest):
 
@@ -50,9 +50,7 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     arrays = read_drive_csv(path, assets.num_expressions, assets.names, say) if is_csv else load_npz(path)
     unknown = sorted(set(arrays) - set(KEYS))
     if "expression" not in arrays:
-        raise UserError(
-            f"{path} holds no expression (it holds {', '.join(unknown) or 'nothing'}); see docs/transfer.md"
-        )
+        raise UserError(f"{path} holds no expression (it holds {', '.join(unknown) or 'nothing'}); see docs/reenact.md")
     if unknown:
         say(f"Note: {path.name} also holds {', '.join(unknown)}, which a drive file does not have; left unread")
     fingerprint = _text(path, arrays, "head")

@@ -212,7 +212,7 @@ def _uncertainty(run: Run) -> list[Markup]:
         return []
     caption = (
         "sigmoid(2.5 u) of each Gaussian on the UV map: bright is a large conditional variance; half-way at the start. It "
-        "does not predict the error (docs/paper.md)"
+        "does not predict the error (docs/method.md)"
     )
     return [section("Uncertainty", element("div", picture(image, caption, format="png"), class_="gallery wide"))]
 

@@ -1,7 +1,7 @@
 """Expression frames as they come over a socket: JSON, OSC messages, Live Link Face's packets. All of it is foreign input.
 
 JSON, one object a line: `expression` (a list of coefficients, or an object of names or numbers), `jaw` [3], `eyes` [6],
-`eyelids` [2] as in drive files (docs/transfer.md), or `blendshapes`, an object of ARKit's names and their values.
+`eyelids` [2] as in drive files (docs/reenact.md), or `blendshapes`, an object of ARKit's names and their values.
 
 OSC over UDP: /VMC/Ext/Blend/Val NAME VALUE and /VMC/Ext/Blend/Apply (the VMC protocol), or an address that ends in the name
 of one of ARKit's blendshapes, with its value. What is not sent keeps its value.

@@ -20,7 +20,7 @@ from data_prep.track.look import Look
 from data_prep.track.progress import Progress
 from data_prep.track.spill import despilled
 
-# JPEG without subsampled colours: see docs/data.md for its size and error beside PNG's.
+# JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
 _AHEAD = 4  # frames that wait for a worker

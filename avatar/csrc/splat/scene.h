@@ -73,7 +73,7 @@ struct Pair {
 // `weight` = dL/dalpha * alpha / opacity, summed over pixels; the others are its moments in (u, v).
 enum Moment { kWeight, kU, kUU, kV, kUV, kVV, kRed, kGreen, kBlue, kMoments };
 
-// Pixels. Larger tiles repeat less work for a splat; the pixels of one still fit in L1. docs/splatter.md has measurements.
+// Pixels. Larger tiles repeat less work for a splat; the pixels of one still fit in L1. docs/bench/splat.md has timings.
 constexpr int kTileWidth = 32, kTileHeight = 32, kTilePixels = kTileWidth * kTileHeight;
 
 // The tiles that meet the region. They lie where those of the whole image do, so that a pixel gets the same bits in any

@@ -39,7 +39,7 @@ IRIS_WEIGHT = 4.0
 PAIR_WEIGHT = 2.0
 IDENTITIES = 100  # coefficients that are fitted; the others add less than landmarks can tell
 # The clip tells as much about the identity as this many independent frames: landmarks err alike in all frames, and near
-# each other alike. With 1 the face comes out too deep and nods too small (docs/tried.md).
+# each other alike. With 1 the face comes out too deep and nods too small (docs/experiments.csv).
 CLIP_WORTH = 0.1
 KEY_FRAMES = 120
 IDENTITY_ITERATIONS, MOTION_ITERATIONS = 15, 12
