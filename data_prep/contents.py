@@ -42,4 +42,4 @@ def _files(folder: Path) -> dict[str, Path]:
 
 def _hash(path: Path) -> str:
     with open_file(path, None) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
