@@ -1,7 +1,6 @@
 """`avatar track`: from a video to a tracked folder, in stages that an interruption does not undo.
 
-upright  by how much the pictures are turned; given mattes are judged by some pictures' faces
-look     every picture's faces; one person, one shot, a regular grid of times
+look     by how much the pictures are turned, every picture's faces; one person, one shot, a regular grid of times
 frames   the crop of every picture with the face
 matte    the person against the background
 despilled  the frames again, where the background's colours have run into the person
@@ -31,14 +30,14 @@ from data_prep.avatar_track import (
     write_tracking,
 )
 from data_prep.frame_files import describe_numbers
-from data_prep.track.faces.landmarks import save_landmarks
+from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Footage, View, check_span
 from data_prep.track.footage.turned import turned
 from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, matte_network, tracking_key
-from data_prep.track.look import Look
+from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.own_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 from data_prep.track.progress import Progress, silent
 from data_prep.track.quality import judge
@@ -51,7 +50,7 @@ SPILL = (
 )
 TURNED = "the pictures are turned by {} degrees clockwise, {}"
 WITHOUT = "the mattes leave out most of the face in frames {}"
-UPRIGHT = "upright"  # a stage
+LYING, GIVEN = "since the head lies in them (--rotate 0 leaves them)", "as --rotate says"
 
 
 def track(
@@ -90,13 +89,10 @@ def track(
     for note in mattes.notes if mattes else ():
         say(f"note: {note}")
     with growing(out) as stages, _interruptible(out, say):
-        turn = _turn(stages, choices, footage, mattes, seen | {"matte": options["matte"]})
-        footage, mattes, seen = turned(footage, turn), mattes and mattes.turned(turn), seen | {"turned": turn}
-        turn_notes = (TURNED.format(turn, _why_turned(choices)),) if turn else ()
-        for note in turn_notes:
-            say(f"note: {note}")
+        seen |= {"matte": options["matte"], "rotate": choices.rotate}
+        turn, look = _look(stages, choices, footage, mattes, seen, progress)
+        footage, mattes = turned(footage, turn), mattes and mattes.turned(turn)
         work = Work(stages, footage, choices, head, progress)
-        look = work.look(seen)
         for note in look.notes:
             say(f"note: {note}")
         view, focal = work.view_and_focal(look)
@@ -111,7 +107,7 @@ def track(
         )
         for note in outline_notes:
             say(f"note: {note}")
-        notes = (*footage.notes, *(mattes.notes if mattes else ()), *turn_notes, *look.notes, *outline_notes)
+        notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
         fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
         overlaps = work.masks(landmarks, fit)
         work.overlay(fit, look)
@@ -142,30 +138,41 @@ def track(
         )
         write_tracking(stages.folder, info, fit.tracks)
         if spill:
-            stages.finish(out, (UPRIGHT, "look", "fit"), {DESPILLED: FRAMES}, seal)
+            stages.finish(out, ("look", "fit"), {DESPILLED: FRAMES}, seal)
         else:
-            stages.finish(out, (UPRIGHT, "look", "fit", DESPILLED), seal=seal)
+            stages.finish(out, ("look", "fit", DESPILLED), seal=seal)
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
 
 
-def _turn(stages: Stages, choices: Choices, footage: Footage, mattes: OwnMattes | None, inputs: dict[str, Any]) -> int:
-    """Degrees by which the pictures are turned clockwise. Raises UserError for mattes that do not show the person."""
-    if choices.rotate is not None and mattes is None:
-        return choices.rotate
+def _look(
+    stages: Stages,
+    choices: Choices,
+    footage: Footage,
+    mattes: OwnMattes | None,
+    inputs: dict[str, Any],
+    progress: Progress,
+) -> tuple[int, Look]:
+    """By how many degrees the pictures are turned clockwise, and the first look at them then.
 
-    def make(_: Path) -> dict[str, Any]:
-        pictures = [picture.image for picture in sample_pictures(footage, choices.span)]
-        found = find_upright_by_landmarks(pictures, choices.rotate)
-        if mattes is not None:
-            refuse_mattes_of_others(mattes.turned(found.turn), choices.span, found.faces)
-        return {"turn": found.turn}
+    Raises UserError for mattes that do not show the person.
+    """
 
-    return stages.run(UPRIGHT, inputs | {"span": list(choices.span), "rotate": choices.rotate}, make)[0]["turn"]
+    def make(folder: Path) -> dict[str, Any]:
+        turn = choices.rotate
+        if turn is None or mattes is not None:
+            pictures = [picture.image for picture in sample_pictures(footage, choices.span)]
+            turn, faces = find_upright_by_landmarks(pictures, choices.rotate)
+            if mattes is not None:
+                refuse_mattes_of_others(mattes.turned(turn), choices.span, faces)
+        look = look_at(turned(footage, turn), choices.span, progress)
+        if turn:
+            look.notes.insert(0, TURNED.format(turn, LYING if choices.rotate is None else GIVEN))
+        save_landmarks(folder / LANDMARKS_FILE, look.landmarks)
+        return to_json(look) | {"turn": turn}
 
-
-def _why_turned(choices: Choices) -> str:
-    return "since the head lies in them (--rotate 0 leaves them)" if choices.rotate is None else "as --rotate says"
+    raw, _ = stages.run("look", inputs | {"span": list(choices.span)}, make)
+    return raw["turn"], from_json(raw, load_landmarks(stages.folder / "look" / LANDMARKS_FILE))
 
 
 def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, float, float]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from avatar.errors import UserError
 from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
 from data_prep.track.footage.turned import TURNS, turn_image
@@ -36,7 +37,10 @@ class Upright(NamedTuple):
 def sample_pictures(
     footage: Footage, span: Span, view: View | None = None, count: int = SAMPLES
 ) -> Iterator[TimedPicture]:
-    """Some pictures from all over the span, made smaller, or as `view` says."""
+    """Some pictures from all over the span, made smaller, or as `view` says; without those that cannot be read.
+
+    Whoever reads all of them hears why, and where.
+    """
     view = view or whole(footage.width, footage.height, LONGEST)
     if footage.duration is None:
         yield from islice(footage.read(view, span, lambda _: None), 0, _APART * count, _APART)
@@ -52,6 +56,8 @@ def sample_pictures(
 def _first(pictures: Iterator[TimedPicture]) -> TimedPicture | None:
     try:
         return next(pictures, None)
+    except UserError:
+        return None
     finally:
         pictures.close()  # type: ignore[attr-defined]  # ends the decoder
 

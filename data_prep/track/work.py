@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.head.assets import HeadAssets
-from data_prep.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.track import plate, spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
-from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
+from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.fitting import fit_tracks
 from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
@@ -31,7 +31,7 @@ from data_prep.track.frames import (
     write_masks,
 )
 from data_prep.track.inputs import head_inputs
-from data_prep.track.look import Look, from_json, look_at, to_json
+from data_prep.track.look import Look
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matte import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
@@ -72,17 +72,6 @@ class Work:
         self._progress = progress
         self._folder = stages.folder
         self._faces = head.faces.numpy()
-
-    def look(self, seen: dict[str, Any]) -> Look:
-        span = self._choices.span
-
-        def make(folder: Path) -> dict[str, Any]:
-            look = look_at(self._footage, span, self._progress)
-            save_landmarks(folder / LANDMARKS_FILE, look.landmarks)
-            return to_json(look)
-
-        raw, _ = self._stages.run("look", seen | {"span": list(span)}, make)
-        return from_json(raw, load_landmarks(self._folder / "look" / LANDMARKS_FILE))
 
     def view_and_focal(self, look: Look) -> tuple[View, Focal]:
         points = look.landmarks.points[look.landmarks.detected]

@@ -171,7 +171,7 @@ def test_mattes_without_the_person_are_refused_before_any_stage(
     def never(*_: object) -> None:
         raise AssertionError("a stage is made first")
 
-    monkeypatch.setattr("data_prep.track.work.look_at", never)
+    monkeypatch.setattr("data_prep.track.track.look_at", never)
     make, sentence = REFUSED[kind]
     with pytest.raises(UserError) as caught:
         tracked(tmp_path, video, make(tmp_path))

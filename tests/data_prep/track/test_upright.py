@@ -186,7 +186,7 @@ def test_another_turn_makes_the_stages_again(with_marks: None, tmp_path: Path, m
         frame = cv2.imread(str(stages / "frames" / "00000.jpg"))[..., ::-1]
         assert np.abs(frame.astype(int) - turn_image(picture(), rotate or 0)).mean() < 1
         keys.append(json.loads((stages / "look" / ".stage.json").read_text())["key"])
-    assert keys[0] == keys[1] != keys[2]
+    assert len(set(keys)) == 3
 
 
 def test_the_option_as_it_is_typed(capsys: pytest.CaptureFixture[str]) -> None:
