@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,8 @@ def leave(
         print(line)
     machine = describe_machine()
     files = {"Figures": folder / f"{name}.json", "Table": folder / f"{name}.md"}
-    write_atomically(files["Figures"], (json.dumps({"machine": machine, **content}, indent=1) + "\n").encode())
+    figures = _with_null({"machine": machine, **content})
+    write_atomically(files["Figures"], (json.dumps(figures, indent=1, allow_nan=False) + "\n").encode())
     write_atomically(files["Table"], as_page(name, table, machine).encode())
     if draw is not None:
         files["Plot"] = folder / f"{name}.png"
@@ -37,6 +39,15 @@ def leave(
     print()
     for label, path in files.items():
         print(f"{label:8} {path}")
+
+
+def _with_null(value: Any) -> Any:
+    """The value with null for each number that is not finite: a measure that nobody took."""
+    if isinstance(value, dict):
+        return {key: _with_null(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_with_null(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def as_page(name: str, table: Sequence[str], machine: Mapping[str, Any]) -> str:

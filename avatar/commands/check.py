@@ -36,7 +36,7 @@ def run_check(arguments: Namespace) -> int:
         ignore_misfit=arguments.ignore_misfit,
         progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False, disable=total == 0),
     )
-    print(json.dumps(outcome.to_dict(), indent=1) if arguments.json else as_text(outcome))
+    print(json.dumps(outcome.to_dict(), indent=1, allow_nan=False) if arguments.json else as_text(outcome))
     if arguments.out is not None:
         from data_prep.check.page import write_page
 

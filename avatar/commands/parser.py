@@ -37,13 +37,28 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     add_head(track)
     track.add_argument("--out", type=Path, required=True, metavar="SUBJECT", help="the tracked folder to write")
     lens = track.add_mutually_exclusive_group()
-    lens.add_argument("--focal", type=float, metavar="PX", help="focal length in pixels of the video, if known")
-    lens.add_argument("--fov", type=float, metavar="DEG", help="field of view across the video's width, if known")
-    track.add_argument("--crop", default="auto", metavar="auto|none|X,Y,W,H", help="what is kept (default: the head)")
+    lens.add_argument("--focal", type=float, metavar="PX", help="focal length in pixels of the turned video, if known")
+    lens.add_argument(
+        "--fov", type=float, metavar="DEG", help="field of view across the turned video's width, if known"
+    )
+    track.add_argument(
+        "--rotate",
+        type=int,
+        choices=(0, 90, 180, 270),
+        help="degrees clockwise by which the pictures and mattes are turned before all else (default: as the face lies)",
+    )
+    track.add_argument(
+        "--crop",
+        default="auto",
+        metavar="auto|none|X,Y,W,H",
+        help="what is kept of the turned picture (default: the head)",
+    )
     track.add_argument("--size", type=int, metavar="S", help="longer side of the frames in pixels (default: 512)")
     track.add_argument("--start", type=float, metavar="S", help="seconds, of the part of the video that is used")
     track.add_argument("--end", type=float, metavar="S", help="seconds")
-    track.add_argument("--matte", type=Path, metavar="DIR", help="your own mattes: a folder or a video of all pictures")
+    track.add_argument(
+        "--matte", type=Path, metavar="DIR", help="your own mattes: a folder or a video of all pictures, as filmed"
+    )
 
     train = commands.add_parser("train", help="train an avatar on a tracked video folder, or on a video")
     train.add_argument(

@@ -24,6 +24,7 @@ def run_track(arguments: Namespace) -> int:
         focal=arguments.focal,
         field_of_view=arguments.fov,
         matte=arguments.matte,
+        rotate=arguments.rotate,
     )
     track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=bar)
     print(f"Look at  {arguments.out / 'overlay'}")

@@ -104,6 +104,8 @@ def moved_plan_source(run: Path, source: Source, arguments: Namespace) -> Source
     folder, head = arguments.folder, arguments.head
     if folder is not None and folder.resolve() != source.folder and source.folder.is_dir():
         raise UserError(f"{run} began on {source.folder}, not on {folder}: leave it out to resume")
+    if folder is None and not source.folder.is_dir():
+        raise UserError(f"{source.folder}, on which {run} began, is gone: avatar train NEW_PLACE --resume --out {run}")
     source = source if folder is None else at_new_place(source, folder.resolve())
     return source if head is None else replace(source, head=head)
 

@@ -64,7 +64,7 @@ class Manifest:
     labels: dict[str, int] = field(default_factory=dict)  # of masks that are label images: what is read as 255
 
     def to_json(self) -> str:
-        return json.dumps({"version": MANIFEST_VERSION, **asdict(self)}, indent=1)
+        return json.dumps({"version": MANIFEST_VERSION, **asdict(self)}, indent=1, allow_nan=False)
 
 
 def read_manifest(prepared: Path) -> Manifest:

@@ -69,7 +69,7 @@ def write_head_model(folder: Path, head: DemoHead) -> None:
     lines += ["f " + " ".join(f"{v}/{vt}" for v, vt in face) for face in corners]
     (folder / "head_template.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
     names = {"names": head.expression_names, "arkit": _both_sides(_ARKIT)}
-    (folder / NAMES_FILE).write_text(json.dumps(names, indent=1) + "\n", encoding="utf-8")
+    (folder / NAMES_FILE).write_text(json.dumps(names, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _both_sides(weights: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:

@@ -35,7 +35,7 @@ def read_earlier(folder: Path, facts: Mapping[str, Any], asked: Collection[str])
     """What RUN/eval holds by other protocols than those `asked` for, of the avatar and frames that `facts` describe."""
     try:
         earlier = read_json(folder / "results.json")
-        if _identity(earlier) != _identity(json.loads(json.dumps(facts))):
+        if _identity(earlier) != _identity(json.loads(json.dumps(facts, allow_nan=False))):
             return Earlier({}, None)
         others = {
             name: entry for name, entry in earlier["protocols"].items() if name not in asked and NAME.fullmatch(name)

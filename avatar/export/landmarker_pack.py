@@ -47,7 +47,7 @@ def make_pack() -> bytes:
 
 def encode_pack(files: Mapping[str, bytes], version: str = TASKS_VISION_VERSION) -> bytes:
     packed = {name: base64.b64encode(gzip.compress(data, 9, mtime=0)).decode() for name, data in files.items()}
-    content = json.dumps({"version": version, "files": packed}, separators=(",", ":"))
+    content = json.dumps({"version": version, "files": packed}, separators=(",", ":"), allow_nan=False)
     return f"/* {NOTICE}\n\n{apache_licence()}*/\navatarLandmarker({content});\n".encode()
 
 

@@ -91,7 +91,7 @@ def encode_avatar(trained: TrainedAvatar, precision: Precision = "small") -> Web
     for name, values in motion_arrays(trained, drawing).items():
         add(name, values)
     header = {**describe(trained, drawing), "precision": precision, "arrays": entries}
-    text = json.dumps(header, separators=(",", ":")).encode()
+    text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     raw = b"".join((FORMAT.encode(), len(text).to_bytes(4, "little"), text, *blocks))
     return WebFile(gzip.compress(raw, 9, mtime=0), len(raw), drawing)

@@ -45,8 +45,8 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
         "licence": html.escape(licence_of(SKINNING)),
         "style": read("page.css"),
         "script": f"(() => {{\n{bundle(PAGE_MODULES)}\n}})();",
-        "worker": script_text(json.dumps(bundle(WORKER_MODULES))),
-        "watcher": script_text(json.dumps(bundle(WATCHER_MODULES))),
+        "worker": script_text(json.dumps(bundle(WORKER_MODULES), allow_nan=False)),
+        "watcher": script_text(json.dumps(bundle(WATCHER_MODULES), allow_nan=False)),
         "module": base64.b64encode((WEB / "avatar.wasm").read_bytes()).decode(),
         "data": base64.b64encode(encoded.data).decode(),
     }

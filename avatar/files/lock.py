@@ -70,7 +70,7 @@ def _acquire(path: Path) -> int:
                 os.close(file)
                 continue
         os.truncate(file, 0)
-        os.write(file, json.dumps({"process": os.getpid(), "machine": platform.node()}).encode())
+        os.write(file, json.dumps({"process": os.getpid(), "machine": platform.node()}, allow_nan=False).encode())
         return file
 
 

@@ -119,7 +119,7 @@ def _numbers(path: Path, arrays: Mapping[str, np.ndarray], key: str, shape: tupl
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise UserError(f"{path}: {key} has shape {list(array.shape)}, expected [{wanted}]")
-    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below, and needs no warning before that
+    with np.errstate(invalid="ignore", over="ignore"):  # refused below, and needs no warning before that
         bad = np.argwhere(~(np.abs(array.astype(np.float64)) <= LARGEST))
     if len(bad):
         index = tuple(bad[0].tolist())

@@ -65,7 +65,7 @@ class Plan:
             "round_iterations": self.round_iterations,
             "spent": self.spent,
         }
-        write_atomically(plan_file(run), json.dumps(content, indent=1).encode())
+        write_atomically(plan_file(run), json.dumps(content, indent=1, allow_nan=False).encode())
 
     @classmethod
     def load(cls, run: Path) -> Plan:

@@ -102,7 +102,7 @@ def write_portrait(path: Path, portrait: Portrait, licence: str | None = None) -
         "expression_names": portrait.names.to_dict(),
         "head_licence": licence,
     }
-    write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(header)}))
+    write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(header, allow_nan=False)}))
 
 
 def read_portrait(path: Path) -> Portrait:

@@ -53,7 +53,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
     meta = {"format": CHECKPOINT_FORMAT, "step": checkpoint.step, **checkpoint.meta}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()}
     path = folder / f"step_{checkpoint.step:08d}.safetensors"
-    write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(meta)}))
+    write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(meta, allow_nan=False)}))
     for old in list_checkpoints(folder)[:-keep]:
         with suppress(OSError):  # an old checkpoint too many is no reason to stop a run
             old.unlink()

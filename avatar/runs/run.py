@@ -112,7 +112,7 @@ def refuse_trained(path: Path) -> None:
 
 
 def write_run_info(run: Path, info: Mapping[str, Any]) -> None:
-    write_atomically(run / RUN_FILE, json.dumps({"format": RUN_FORMAT, **info}, indent=2).encode())
+    write_atomically(run / RUN_FILE, json.dumps({"format": RUN_FORMAT, **info}, indent=2, allow_nan=False).encode())
 
 
 def read_run_info(run: Path) -> RunInfo:

@@ -202,8 +202,8 @@ def _variants(path: Path, raw: Mapping[str, Any]) -> dict[str, list[str]]:
 
 def _plain(path: Path, key: Any, value: Any) -> str:
     try:
-        return json.dumps(value) if isinstance(value, (bool, list, type(None))) else str(value)
-    except TypeError as error:  # a date in a list
+        return json.dumps(value, allow_nan=False) if isinstance(value, (bool, list, type(None))) else str(value)
+    except (TypeError, ValueError) as error:  # a date in a list, or .nan
         raise UserError(f"{path}: product.{key} holds what no override can be ({error})") from None
 
 
@@ -252,5 +252,5 @@ def _number(path: Path, raw: Mapping[str, Any], key: str, default: float, low: f
 def _folder_name(subject: str, variant: str, seed: int) -> str:
     """Readable, and never the same for two jobs."""
     readable = re.sub(r"[^0-9A-Za-z.=-]+", "_", f"{subject}-{variant}")[:80]
-    digest = hashlib.sha256(json.dumps([subject, variant]).encode()).hexdigest()[:6]
+    digest = hashlib.sha256(json.dumps([subject, variant], allow_nan=False).encode()).hexdigest()[:6]
     return f"{readable}-{digest}-seed{seed}"

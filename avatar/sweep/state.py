@@ -55,7 +55,9 @@ def write_sweep(folder: Path, spec: Spec) -> None:
                 f"{folder} holds a sweep in which {job.name} is something else; choose another --out, or delete it"
             )
         if job.name not in known:
-            write_atomically(folder / "jobs" / job.name / "job.json", json.dumps(job.to_dict(), indent=1).encode())
+            write_atomically(
+                folder / "jobs" / job.name / "job.json", json.dumps(job.to_dict(), indent=1, allow_nan=False).encode()
+            )
     names = list(dict.fromkeys([*known, *(job.name for job in spec.jobs)]))
     content = {
         "format": SWEEP_FORMAT,
@@ -63,7 +65,7 @@ def write_sweep(folder: Path, spec: Spec) -> None:
         "resources": asdict(spec.resources),
         "retries": spec.retries,
     }
-    write_atomically(folder / SWEEP_FILE, json.dumps(content, indent=1).encode())
+    write_atomically(folder / SWEEP_FILE, json.dumps(content, indent=1, allow_nan=False).encode())
 
 
 def read_sweep(folder: Path) -> Spec:
@@ -114,7 +116,7 @@ def stored_state(folder: Path) -> State:
 
 
 def write_state(folder: Path, state: State) -> None:
-    write_atomically(folder / "state.json", json.dumps(asdict(state)).encode())
+    write_atomically(folder / "state.json", json.dumps(asdict(state), allow_nan=False).encode())
 
 
 def beat(folder: Path, computed: int) -> None:

@@ -23,7 +23,7 @@ def encode_line(params: HeadParams) -> bytes:
     eyes = rotation_matrix_to_axis_angle(matrix_from_6d(params.eyes.reshape(2, 6))).reshape(-1)
     arrays = {"expression": params.expression, "jaw": jaw, "eyes": eyes, "eyelids": params.eyelids}
     values = {name: [round(value, DIGITS) for value in array.tolist()] for name, array in arrays.items()}
-    return json.dumps(values, separators=(",", ":")).encode() + b"\n"
+    return json.dumps(values, separators=(",", ":"), allow_nan=False).encode() + b"\n"
 
 
 def send(
@@ -45,7 +45,7 @@ def send(
     try:
         with socket.create_connection((host, port), timeout=10) as connection:
             if token is not None:
-                connection.sendall(json.dumps({"token": token}).encode() + b"\n")
+                connection.sendall(json.dumps({"token": token}, allow_nan=False).encode() + b"\n")
             for params in frames():
                 wait(max(begin + sent / drive.fps - time.monotonic(), 0.0))
                 connection.sendall(encode_line(params))

@@ -165,8 +165,8 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
             ("mouth", "lips to mouth mask, median, pixels"),
         ):
             values = np.array([getattr(fit, name) for fit in clip.fits.values()])
-            if np.isfinite(values).any():
-                found[title] = round(float(np.nanmedian(values)), 3)
+            if (finite := values[np.isfinite(values)]).size:
+                found[title] = round(float(np.median(finite)), 3)
     lost = left_out(clip)
     found["frames left out"] = describe_reasons(lost, clip.name) if lost else 0
     if coverage is not None:

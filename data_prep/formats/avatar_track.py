@@ -138,7 +138,7 @@ def write_tracking(folder: Path, info: TrackingInfo, tracks: Mapping[int, FrameT
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     write_atomically(folder / TRACKS_FILE, buffer.getvalue())
     content = {"format": NAME, "version": VERSION} | asdict(info)
-    write_atomically(folder / INFO_FILE, (json.dumps(content, indent=1) + "\n").encode())
+    write_atomically(folder / INFO_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_tracks(folder: Path, name: str, complain: Callable[[str], object]) -> Tracking:

@@ -119,7 +119,7 @@ def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
         raise BadFrame(f"{name} is not numbers") from None
     if array.dtype.kind not in "iuf":
         raise BadFrame(f"{name} is not numbers")
-    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below, and needs no warning before that
+    with np.errstate(invalid="ignore", over="ignore"):  # refused below, and needs no warning before that
         values = array.astype(np.float64).ravel()
     if count is not None and len(values) != count:
         raise BadFrame(f"{name} has {len(values)} values, not {count}")
@@ -158,6 +158,8 @@ def _check_camera(
             f"{paths[n].name} has fx fy cx cy = {' '.join(f'{v:.2f}' for v in frames[n].intrinsics)}"
             for n in (first_number, worst_number)
         )
+        focals = [frame.intrinsics[0] for frame in frames.values()]
+        both += f"; fx goes from {min(focals):.2f} to {max(focals):.2f}"
         if worst > INTRINSICS_ERROR:
             complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
         else:

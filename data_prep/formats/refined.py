@@ -107,7 +107,7 @@ def write_folder(
         (building / avatar_track.TRACKS_FILE).rename(building / GIVEN_FILE)
         avatar_track.write_tracking(building, info, _frame_tracks(subject, tracks))
         content = {"version": VERSION, "refinement": refinement.to_dict(), "division": _division(subject)}
-        (building / REFINEMENT_FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        (building / REFINEMENT_FILE).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         for name, data in extras.items():
             (building / name).write_bytes(data)
         building.chmod(0o755)

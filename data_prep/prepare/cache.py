@@ -15,12 +15,14 @@ from data_prep.formats.frame_files import FrameFiles
 
 def default_location(files: FrameFiles, options: dict[str, object]) -> Path:
     tracking = next(iter(files.tracking.values())).parent
-    key = hashlib.sha256(json.dumps([str(files.folder), str(tracking), options]).encode()).hexdigest()[:12]
+    key = hashlib.sha256(json.dumps([str(files.folder), str(tracking), options], allow_nan=False).encode()).hexdigest()[
+        :12
+    ]
     return cache_folder() / "subjects" / f"{safe_name(files.folder.name)}-{key}"
 
 
 def input_hash(files: FrameFiles, options: Mapping[str, object]) -> str:
-    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), dict(options)]).encode())
+    digest = hashlib.sha256(json.dumps([MANIFEST_VERSION, str(files.folder), dict(options)], allow_nan=False).encode())
     for kind, found in files.of_kind().items():
         for number, path in found.items():
             digest.update(f"{kind} {number} {path} {_stamp(path)}\n".encode(errors="surrogateescape"))

@@ -7,7 +7,7 @@ they are read as 0 and 255; anything else that is not a mask is refused.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def with_labels(files: FrameFiles) -> tuple[FrameFiles, list[str]]:
     labels, notes = {}, []
     for kind, paths in mask_kinds(files).items():
         values = _values_of_some(paths)
-        label = _only_label(values)
+        label = only_label(values)
         if label is not None:
             labels[kind] = label
             notes.append(f"the {WHAT[kind]} in {place_of(paths)} are label images: {label} is read as 255")
@@ -51,10 +51,14 @@ def refuse_colours(files: FrameFiles) -> None:
     for kind, paths in mask_kinds(files).items():
         for path in _some(paths):
             if kind not in files.labels and _is_coloured(path):
-                raise UserError(
-                    f"{path} is a picture in colour, not one of the {WHAT[kind]}: make masks of 0 and 255, or PNGs whose "
-                    "transparency is the mask"
-                )
+                raise UserError(coloured_sentence(str(path), WHAT[kind]))
+
+
+def coloured_sentence(place: str, masks: str) -> str:
+    return (
+        f"{place} is a picture in colour, not one of the {masks}: make masks of 0 and 255, or PNGs whose transparency is "
+        "the mask"
+    )
 
 
 def judge_values(kind: str, paths: Mapping[int, Path], darkest: int, brightest: int) -> tuple[str | None, str | None]:
@@ -63,10 +67,17 @@ def judge_values(kind: str, paths: Mapping[int, Path], darkest: int, brightest: 
     masks = f"the {WHAT[kind]} in {place_of(paths)}"
     if brightest == 0 and kind == MOUTH:
         return None, f"{masks} are all black: the mouth gets no weight of its own"
+    return judge_range(masks, darkest, brightest, lambda: _values_of_some(paths))
+
+
+def judge_range(
+    masks: str, darkest: int, brightest: int, values: Callable[[], Iterable[set[int]]]
+) -> tuple[str | None, str | None]:
+    """The same of masks that must show somebody; `values` are those of some of them."""
     if brightest == 0:
         return f"{masks} are all black: nobody is in them; make them again", None
     if brightest < LEAST_BRIGHT:
-        found = sorted(set().union(*_values_of_some(paths)))
+        found = sorted(set().union(*values()))
         shown = ", ".join(map(str, found[:_SHOWN])) + (" ..." if len(found) > _SHOWN else "")
         return (
             f"{masks} reach only {brightest} of 255 (values {shown}): what they show would be transparent; make the person "
@@ -79,7 +90,7 @@ def judge_values(kind: str, paths: Mapping[int, Path], darkest: int, brightest: 
     return None, None
 
 
-def _only_label(values: Iterable[set[int]]) -> int | None:
+def only_label(values: Iterable[set[int]]) -> int | None:
     """The one value below 255 that all files hold besides 0, if there is no other."""
     found = set().union(*values)
     others = found - {0}
@@ -98,10 +109,13 @@ def _values_of_some(paths: Mapping[int, Path]) -> list[set[int]]:
 
 def _is_coloured(path: Path) -> bool:
     try:
-        pixels = decode_image(read_bytes(path), path)
-        values = decode_values(read_bytes(path), path)
+        return is_coloured(decode_image(read_bytes(path), path), decode_values(read_bytes(path), path))
     except UserError:
         return False
+
+
+def is_coloured(pixels: np.ndarray, values: np.ndarray) -> bool:
+    """Whether a file [H, W, 3] whose `values` [H, W] would be its mask is a picture in colour."""
     luminance = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     if np.abs(values.astype(np.int16) - luminance).max() > _ROUNDED:
         return False  # the mask is its transparency, or a palette's indices
@@ -110,9 +124,12 @@ def _is_coloured(path: Path) -> bool:
 
 
 def _some(paths: Mapping[int, Path]) -> Iterator[Path]:
-    numbers = list(paths)
-    for i in np.unique(np.linspace(0, len(numbers) - 1, min(SAMPLES, len(numbers))).round().astype(int)):
-        yield paths[numbers[i]]
+    yield from sampled(list(paths.values()))
+
+
+def sampled(files: Sequence[Path]) -> list[Path]:
+    places = np.unique(np.linspace(0, len(files) - 1, min(SAMPLES, len(files))).round().astype(int))
+    return [files[i] for i in places.tolist()]
 
 
 def place_of(paths: Mapping[int, Path]) -> Path:

@@ -14,15 +14,18 @@ from jaxtyping import UInt8
 
 from avatar.data.images import read_image, read_mask
 from avatar.errors import UserError
+from data_prep.formats.frame_files import describe_numbers
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.look import Look
+from data_prep.track.own_mattes import OPAQUE, OwnMattes, share_on
 from data_prep.track.progress import Progress
 from data_prep.track.spill import despilled
 
 # JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
+MAX_WITHOUT = 0.1  # of the frames may have a given matte that leaves out the face
 _AHEAD = 4  # frames that wait for a worker
 Made = TypeVar("Made")
 
@@ -79,31 +82,40 @@ def in_view(landmarks: Landmarks, view: View) -> Landmarks:
 
 def write_frames(folder: Path, footage: Footage, view: View, span: Span, look: Look, progress: Progress) -> None:
     """The view of every picture with the face, by frame number, as JPEG."""
-    for number, picture in _chosen(footage, view, span, look, progress, "writing frames"):
+    pictures = footage.read(view, span, lambda _: None)
+    for number, picture in _chosen(pictures, footage.path, look, progress, "writing frames"):
         write_image(frame_file(folder, number), cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR), JPEG)
 
 
 def write_given_mattes(
-    folder: Path, mattes: Footage, view: View, span: Span, look: Look, size: tuple[int, int], progress: Progress
-) -> None:
-    """The user's own mattes, a video or pictures like the footage's. Raises UserError where they do not belong to it."""
-    if (mattes.width, mattes.height) != size:
+    folder: Path, mattes: OwnMattes, view: View, span: Span, look: Look, progress: Progress
+) -> list[int]:
+    """The user's own mattes; returns the frames in which they leave out most of the face. Raises UserError where these are
+    many, and where the mattes are not of all pictures."""
+    points = in_view(look.landmarks, view).points
+    without = []
+    pictures = mattes.read(view, span)
+    for number, picture in _chosen(pictures, mattes.footage.path, look, progress, "writing mattes"):
+        write_image(mask_file(folder, number), picture.image, [])
+        if share_on(points[number, :, :2], picture.image)[0] < OPAQUE:
+            without.append(number)
+    total = int(look.landmarks.detected.sum())
+    if len(without) > MAX_WITHOUT * total:
         raise UserError(
-            f"the mattes in {mattes.path} are {mattes.width}x{mattes.height} pixels, the video {size[0]}x{size[1]}; make "
-            "them of the video's own pictures"
+            f"the mattes in {mattes.footage.path} leave out most of the face in {len(without)} of {total} frames "
+            f"({describe_numbers(without)}); make them again of the video's own pictures"
         )
-    for number, picture in _chosen(mattes, view, span, look, progress, "writing mattes"):
-        write_image(mask_file(folder, number), cv2.cvtColor(picture.image, cv2.COLOR_RGB2GRAY), [])
+    return without
 
 
 def _chosen(
-    footage: Footage, view: View, span: Span, look: Look, progress: Progress, title: str
+    pictures: Iterator[TimedPicture], path: Path, look: Look, progress: Progress, title: str
 ) -> Iterator[tuple[int, TimedPicture]]:
     """The pictures that belong to the frames with a face, with the frames' numbers."""
     wanted = {int(look.pictures[number]): int(number) for number in np.flatnonzero(look.landmarks.detected)}
     steps = iter(progress(range(len(wanted)), len(wanted), title))
     count, last = 0, max(wanted)
-    for n, picture in enumerate(footage.read(view, span, lambda _: None)):
+    for n, picture in enumerate(pictures):
         count = n + 1
         if n in wanted:
             next(steps, None)
@@ -113,8 +125,8 @@ def _chosen(
     next(steps, None)
     if count <= last or (look.is_whole and count != look.read):
         raise UserError(
-            f"{footage.path} gives {count} pictures where {look.read} were expected: mattes must be of every picture of "
-            "the video, and the video must not change meanwhile"
+            f"{path} gives {count} pictures where {look.read} were expected: mattes must be of every picture of the video, "
+            "and the video must not change meanwhile"
         )
 
 

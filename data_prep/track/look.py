@@ -13,7 +13,7 @@ from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.faces.person import follow_one
 from data_prep.track.footage.cuts import CutFinder, Shot
-from data_prep.track.footage.source import Footage, Span, check_span, stride, whole
+from data_prep.track.footage.source import Footage, Span, stride, whole
 from data_prep.track.footage.timing import regular_timing
 from data_prep.track.progress import Progress
 
@@ -39,7 +39,6 @@ class Look:
 
 def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
     """Find one person's face in the clip's longest shot. Raises UserError, with what to do, where there is none."""
-    check_span(span, footage.duration)
     notes: list[str] = []
     view = whole(footage.width, footage.height, LOOKED_AT)
     scale = np.array([footage.width / view.width, footage.height / view.height, footage.width / view.width], np.float32)

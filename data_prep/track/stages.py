@@ -47,8 +47,8 @@ class Stages:
             for stale in (place, partial):
                 shutil.rmtree(stale, ignore_errors=True)
             partial.mkdir(parents=True)
-            result = json.loads(json.dumps(make(partial)))
-            (partial / RECORD).write_text(json.dumps({"key": key, "result": result}), encoding="utf-8")
+            result = json.loads(json.dumps(make(partial), allow_nan=False))
+            (partial / RECORD).write_text(json.dumps({"key": key, "result": result}, allow_nan=False), encoding="utf-8")
             partial.rename(place)
         except OSError as error:
             raise UserError(
@@ -98,7 +98,7 @@ def growing(target: Path) -> Iterator[Stages]:
 
 
 def hash_of(values: Any) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(values, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def _read_record(path: Path) -> dict[str, Any] | None:

@@ -1,6 +1,6 @@
 """`avatar track`: from a video to a tracked folder, in stages that an interruption does not undo.
 
-look     every picture's faces; one person, one shot, a regular grid of times
+look     by how much the pictures are turned, every picture's faces; one person, one shot, a regular grid of times
 frames   the crop of every picture with the face
 matte    the person against the background
 despilled  the frames again, where the background's colours have run into the person
@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,23 +29,28 @@ from data_prep.formats.avatar_track import (
     recognise,
     write_tracking,
 )
-from data_prep.track.faces.landmarks import save_landmarks
+from data_prep.formats.frame_files import describe_numbers
+from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.footage.pictures import open_footage
-from data_prep.track.footage.source import Footage, View
-from data_prep.track.frames import (
-    in_view,
-)
+from data_prep.track.footage.source import Footage, View, check_span
+from data_prep.track.footage.turned import turned
+from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, matte_network, tracking_key
-from data_prep.track.look import Look
+from data_prep.track.look import Look, from_json, look_at, to_json
+from data_prep.track.own_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 from data_prep.track.progress import Progress, silent
 from data_prep.track.quality import judge
-from data_prep.track.stages import growing
+from data_prep.track.stages import Stages, growing
+from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
 from data_prep.track.work import DESPILLED, Choices, Work
 
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
 )
+TURNED = "the pictures are turned by {} degrees clockwise, {}"
+WITHOUT = "the mattes leave out most of the face in frames {}"
+LYING, GIVEN = "since the head lies in them (--rotate 0 leaves them)", "as --rotate says"
 
 
 def track(
@@ -71,7 +77,7 @@ def track(
         say(f"note: {note}")
     for note in head.notes:
         say(f"note: {note}")
-    mattes = None if choices.matte is None else open_footage(choices.matte)
+    check_span(choices.span, footage.duration)
     network, options, seen = matte_network(), choices.to_json(), look_inputs(footage)
     key = tracking_key(footage, options, head_path, head)
     if out.exists() and not _is_empty(out):
@@ -79,20 +85,29 @@ def track(
             say(f"{out} holds this tracking already")
             return known
         raise UserError(f"{out} exists and is not this tracking: choose another --out, or remove it first")
+    mattes = None if choices.matte is None else open_mattes(choices.matte, footage)
+    for note in mattes.notes if mattes else ():
+        say(f"note: {note}")
     with growing(out) as stages, _interruptible(out, say):
+        seen |= {"matte": options["matte"], "rotate": choices.rotate}
+        turn, look = _look(stages, choices, footage, mattes, seen, progress)
+        footage, mattes = turned(footage, turn), mattes and mattes.turned(turn)
         work = Work(stages, footage, choices, head, progress)
-        look = work.look(seen)
         for note in look.notes:
             say(f"note: {note}")
         view, focal = work.view_and_focal(look)
         say(f"focal length {focal.pixels:.0f} pixels of the video, {focal.source}" + _crop_words(view, footage))
         landmarks = in_view(look.landmarks, view)
         frames_key = work.frames(look, view, [seen, options])
-        matte_key = work.mattes(look, view, mattes, network, frames_key, options)
+        without, matte_key = work.mattes(look, view, mattes, network, frames_key, options)
         spill = work.despill(landmarks, [frames_key, matte_key])
-        notes = (*footage.notes, *look.notes, *([SPILL.format(spill)] if spill else []))
-        if spill:
-            say(f"note: {notes[-1]}")
+        outline_notes = (
+            *([WITHOUT.format(describe_numbers(without))] if without else []),
+            *([SPILL.format(spill)] if spill else []),
+        )
+        for note in outline_notes:
+            say(f"note: {note}")
+        notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
         fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
         overlaps = work.masks(landmarks, fit)
         work.overlay(fit, look)
@@ -109,7 +124,14 @@ def track(
             focal_is_assumed=focal.is_assumed,
             head_path=str(head_path.resolve()),
             head_fingerprint=head.fingerprint,
-            source={"video": video.name, "sha256": footage.content_hash(), "key": key, "box": list(view.box)} | options,
+            source={
+                "video": video.name,
+                "sha256": footage.content_hash(),
+                "key": key,
+                "turned": turn,
+                "box": list(view.box),
+            }
+            | options,
             left_out=_left_out(look),
             notes=notes,
             quality=quality.to_json(),
@@ -121,6 +143,36 @@ def track(
             stages.finish(out, ("look", "fit", DESPILLED), seal=seal)
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
+
+
+def _look(
+    stages: Stages,
+    choices: Choices,
+    footage: Footage,
+    mattes: OwnMattes | None,
+    inputs: dict[str, Any],
+    progress: Progress,
+) -> tuple[int, Look]:
+    """By how many degrees the pictures are turned clockwise, and the first look at them then.
+
+    Raises UserError for mattes that do not show the person.
+    """
+
+    def make(folder: Path) -> dict[str, Any]:
+        turn = choices.rotate
+        if turn is None or mattes is not None:
+            pictures = [picture.image for picture in sample_pictures(footage, choices.span)]
+            turn, faces = find_upright_by_landmarks(pictures, choices.rotate)
+            if mattes is not None:
+                refuse_mattes_of_others(mattes.turned(turn), choices.span, faces)
+        look = look_at(turned(footage, turn), choices.span, progress)
+        if turn:
+            look.notes.insert(0, TURNED.format(turn, LYING if choices.rotate is None else GIVEN))
+        save_landmarks(folder / LANDMARKS_FILE, look.landmarks)
+        return to_json(look) | {"turn": turn}
+
+    raw, _ = stages.run("look", inputs | {"span": list(choices.span)}, make)
+    return raw["turn"], from_json(raw, load_landmarks(stages.folder / "look" / LANDMARKS_FILE))
 
 
 def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, float, float]:

@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.head.assets import HeadAssets
-from data_prep.formats.avatar_track import FRAMES, HEAD, LANDMARKS_FILE, MATTE, MOUTH, TRACKS_FILE
+from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.track import plate, spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
-from data_prep.track.faces.landmarks import Landmarks, load_landmarks, save_landmarks
+from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.fitting import fit_tracks
 from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
@@ -31,11 +31,12 @@ from data_prep.track.frames import (
     write_masks,
 )
 from data_prep.track.inputs import head_inputs
-from data_prep.track.look import Look, from_json, look_at, to_json
+from data_prep.track.look import Look
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matte import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.overlay import FrameParts, write_overlay
+from data_prep.track.own_mattes import OwnMattes
 from data_prep.track.progress import Progress
 from data_prep.track.stages import Stages
 
@@ -52,12 +53,13 @@ class Choices:
     focal: float | None = None  # pixels of the video
     field_of_view: float | None = None  # degrees across the video's width
     matte: Path | None = None  # the user's own: a folder or a video of all pictures
+    rotate: int | None = None  # degrees clockwise by which the pictures are turned first; None: as the faces ask for
 
     def to_json(self) -> dict[str, Any]:
         crop = self.crop if isinstance(self.crop, str) else list(self.crop)
         matte = None if self.matte is None else open_footage(self.matte).content_hash()
         return {"crop": crop, "size": self.size, "span": list(self.span), "focal": self.focal,
-                "field_of_view": self.field_of_view, "matte": matte}  # fmt: skip
+                "field_of_view": self.field_of_view, "matte": matte, "rotate": self.rotate}  # fmt: skip
 
 
 class Work:
@@ -70,17 +72,6 @@ class Work:
         self._progress = progress
         self._folder = stages.folder
         self._faces = head.faces.numpy()
-
-    def look(self, seen: dict[str, Any]) -> Look:
-        span = self._choices.span
-
-        def make(folder: Path) -> dict[str, Any]:
-            look = look_at(self._footage, span, self._progress)
-            save_landmarks(folder / LANDMARKS_FILE, look.landmarks)
-            return to_json(look)
-
-        raw, _ = self._stages.run("look", seen | {"span": list(span)}, make)
-        return from_json(raw, load_landmarks(self._folder / "look" / LANDMARKS_FILE))
 
     def view_and_focal(self, look: Look) -> tuple[View, Focal]:
         points = look.landmarks.points[look.landmarks.detected]
@@ -97,15 +88,15 @@ class Work:
         return self._stages.run(FRAMES, {"of": inputs, "view": [*view.box, view.width, view.height]}, make)[1]
 
     def mattes(
-        self, look: Look, view: View, given: Footage | None, network: str, frames_key: str, options: dict[str, Any]
-    ) -> str:
+        self, look: Look, view: View, given: OwnMattes | None, network: str, frames_key: str, options: dict[str, Any]
+    ) -> tuple[list[int], str]:
+        """Returns the frames in which given mattes leave out the face, and the stage's key."""
         numbers = _numbers(look.landmarks)
 
         def make(folder: Path) -> dict[str, Any]:
             if given is not None:
-                size = self._footage.width, self._footage.height
-                write_given_mattes(folder, given, view, self._choices.span, look, size, self._progress)
-                return {}
+                span = self._choices.span
+                return {"without_face": write_given_mattes(folder, given, view, span, look, self._progress)}
             images = FrameImages(self._folder / FRAMES, numbers)
             points = in_view(look.landmarks, view).points[:, :, :2]
             rows = {number: row for row, number in enumerate(numbers)}
@@ -125,9 +116,11 @@ class Work:
                 return sharpened(*by_network(number), points[number], behind)
 
             write_masks(folder, numbers, one, self._progress, "making mattes")
-            return {}
+            return {"without_face": []}
 
-        return self._stages.run(MATTE, {"frames": frames_key, "network": network, "given": options["matte"]}, make)[1]
+        inputs = {"frames": frames_key, "network": network, "given": options["matte"]}
+        result, key = self._stages.run(MATTE, inputs, make)
+        return result["without_face"], key
 
     def despill(self, landmarks: Landmarks, inputs: list[Any]) -> int:
         """Writes the frames without the background's colours on the person, where they reach in so far that it can be seen;

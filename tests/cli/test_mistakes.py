@@ -27,7 +27,7 @@ MISTAKES = {
     "no such video": (["train", "{tmp}/nothing.mp4"], "nothing.mp4: there is no such file or folder"),
     "no such folder to prepare": (["prepare", "{tmp}/nothing"], "nothing: there is no such file or folder"),
     "no such video as driver": (["reenact", "{run}", "{tmp}/x.mp4"], "x.mp4: there is no such file or folder"),
-    "no such sweep": (["sweep", "{tmp}/x.yaml"], "x.yaml cannot be read (No such file or directory)"),
+    "no such sweep": (["sweep", "{tmp}/x.yaml"], "x.yaml does not exist"),
     "a folder of runs": (["view", "{run}/.."], "holds {run}/../run"),
     "eval of a folder of runs": (["eval", "{run}/.."], "holds {run}/../run"),
     "nothing to train on": (["train", "{tmp}"], "{tmp} is empty; docs/data.md says what belongs to a tracked folder"),

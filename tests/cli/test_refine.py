@@ -246,7 +246,9 @@ def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, m
         avatar("train", before, "--out", run, "--frame-offset", 1, "--refine", 1, *QUICK, status=130)
     after.parent.mkdir()
     before.rename(after)
-    assert "give the tracked video folder" in avatar("train", "--resume", "--out", run, status=1)
+    assert f"is gone: avatar train NEW_PLACE --resume --out {run}" in avatar(
+        "train", "--resume", "--out", run, status=1
+    )
     output = avatar("train", after, "--resume", "--out", run)
     assert "going on after 1 of 14 frames" in output and "10/10" in output
     assert (run / "rounds" / "1" / "someone" / "tracking.npz").is_file()

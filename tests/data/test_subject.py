@@ -192,5 +192,5 @@ def test_frames_outside(index: int, prepared: Path) -> None:
     for ask in (subject.frame, subject.camera, subject.params):
         with pytest.raises(IndexError, match=f"frame {index} of subject subject, which has frames 0 to 9"):
             ask(index)
-    with pytest.raises(ValueError, match="size must be at least 1 pixel, got 0"):
+    with pytest.raises(ValueError, match="size must be at least 1 pixel.* got 0"):
         subject.frame(0, size=0)

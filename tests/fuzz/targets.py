@@ -108,7 +108,7 @@ def make_targets(place: Path) -> dict[str, Target]:
     def in_frame(data: bytes) -> bytes:
         return with_member(frame, "data.pkl", data)
 
-    named = replace(head, names=ExpressionNames(("smile_left", "smile_right")))
+    named = replace(head, names=ExpressionNames(("mouthSmileLeft", "smile_right")))
     write_drive(place / "drive.npz", subject_drive(Subject.open(prepared), None), head.fingerprint)
     drive = (place / "drive.npz").read_bytes()
 

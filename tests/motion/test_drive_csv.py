@@ -112,6 +112,7 @@ RATES: dict[str, tuple[Rows, float, str]] = {
         30.0,
         "time, seconds",
     ),
+    "negative times": (columns("time,expression_0", [[(i - 60) / 25, 0] for i in range(50)]), 25.0, "time, seconds"),
     "rounded to milliseconds": (
         columns("time,expression_0", [[f"{i / 30:.3f}", 0] for i in range(99)]),
         30.0,
@@ -175,6 +176,11 @@ REFUSED: dict[str, tuple[bytes, str]] = {
         "columns time and timestamp_ms give 25 and 50",
     ),
     "times beyond any": (csv(times(-1e308, 0, 1e308)), "time is '-1e+308'"),
+    "a time that is none": (csv(times(0, "nan", 0.08)), "line 3: time is 'nan'"),
+    "an endless time": (csv(times(0, 0.04, "inf")), "line 4: time is 'inf'"),
+    "the first time is none": (csv(times("nan", 0.04, 0.08)), "line 2: time is 'nan'"),
+    "times that fall": (csv(times(0.08, 0.04, 0)), "column time must rise"),
+    "negative times that fall": (csv(times(0, -0.04, -0.08)), "column time must rise"),
     "times too close": (csv(times(0, 5e-324, 1e-323)), "column time rises by"),
     "times of no length": (
         csv(columns("time_s,expression_0", [[0, 0], [5e-324, 0], [1e-323, 0]])),

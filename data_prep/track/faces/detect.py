@@ -71,6 +71,10 @@ class FaceDetector:
         faces = self._in_window(image, (0, 0, image.shape[1], image.shape[0]))
         return faces[0] if faces else None
 
+    def anywhere(self, image: UInt8[np.ndarray, "H W 3"]) -> Face | None:
+        """The same, of a picture whose face may be small."""
+        return self.largest(image) or next(iter(self._in_parts(image)), None)
+
     def find(self, image: UInt8[np.ndarray, "H W 3"]) -> list[Face]:
         """The faces of a picture, the largest first; a small one is looked for around its last place and in parts."""
         height, width = image.shape[:2]

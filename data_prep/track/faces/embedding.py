@@ -80,7 +80,7 @@ def checked_embedding(
     for name, values, count in (("a landmark", landmarks, NUM_MESH), ("a triangle", triangles, len(faces))):
         if values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= count:
             raise UserError(f"{path} names {name} that does not exist (there are {count}); remove or replace it")
-    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below, and needs no warning before that
+    with np.errstate(invalid="ignore", over="ignore"):  # refused below, and needs no warning before that
         weights = barycentric.reshape(L, 3).astype(np.float64)
     if not np.isfinite(weights).all() or np.abs(weights.sum(1) - 1).max() > 1e-2:
         raise UserError(f"{path} holds barycentric weights that do not sum to one; remove or replace it")

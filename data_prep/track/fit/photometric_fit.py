@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.fit.camera import Pinhole, to_camera
@@ -74,6 +75,8 @@ def fit_pictures(
     on_mouth = _near_lips(assets, start, points)
     terms = (_quieter(start.term), start.priors, start.smoothness)
     first = skin.weights(motion)
+    for chosen in (is_held, ~is_held):
+        _refuse_unseen(first[:, chosen])
     weights = first
     levels = [blur for blur in BLURS for _ in range(ROUNDS)]
     blurred, compared, seen, last = None, None, None, None
@@ -165,8 +168,17 @@ def _quieter(term: LandmarkTerm) -> LandmarkTerm:
     return replace(term, weights=term.weights * share, pair_weights=term.pair_weights * FEATURE_SHARE)
 
 
+def _refuse_unseen(weights: Float[Tensor, "T N"]) -> None:
+    if not (weights > 0).any():
+        raise UserError(
+            "the mattes show nothing of the face in any frame, so that its pictures cannot be fitted to: look at the "
+            "video, or give mattes of the person with --matte"
+        )
+
+
 def _psnr(values: Float[Tensor, "T N"], weights: Float[Tensor, "T N"], basis: Float[Tensor, "N B"]) -> float:
     """Of the median point's grey values, in 0 to 1, against its texture in each frame's light, in dB."""
+    _refuse_unseen(weights)
     wanted = lit_texture(values, weights, basis).values(basis)
     error = _mean_squares(values - wanted, weights)[weights.sum(0) > 0].median()
     return float(-10.0 * torch.log10(error.clamp(min=1e-12)))

@@ -15,7 +15,7 @@ import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES, has_transparency, read_bytes, read_image
 from avatar.errors import UserError
-from data_prep.track.footage.source import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque
+from data_prep.track.footage.source import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque, stride
 from data_prep.track.footage.timing import DEFAULT_FPS
 from data_prep.track.footage.video import open_video
 
@@ -24,28 +24,40 @@ _TRACKED = {"imgs", "images", "image", "frames", "checkpoint", "flame_param"}  #
 _EXIF, _FOCAL_IN_35MM_FILM = 0x8769, 0xA405  # EXIF 2.3, tags of the sub-directory and of the value
 
 
+def read_picture(file: Path) -> tuple[np.ndarray, bool]:
+    """A picture, and whether it has transparent parts, which are laid over grey."""
+    image = read_image(file)
+    data = read_bytes(file)
+    if not has_transparency(data):
+        return image, False
+    four = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if four is None or four.ndim != 3 or four.shape[2] != 4 or four.dtype != np.uint8 or four[..., 3].min() == 255:
+        return image, False
+    return opaque(np.dstack((image, four[..., 3]))), True
+
+
 @dataclass(frozen=True)
 class PictureFolder:
-    """Implements `Footage`; the pictures are taken in the order of their numbers, 25 a second."""
+    """Implements `Footage`; the pictures are taken in the order of their numbers, `rate` a second."""
 
     path: Path
     files: tuple[Path, ...]
     width: int
     height: int
-    rate: float | None
-    duration: float | None
+    rate: float
+    duration: float
     equivalent_focal: float | None
     notes: tuple[str, ...]
+    decode: Callable[[Path], tuple[np.ndarray, bool]] = read_picture
     _hash: list[str] = field(default_factory=list, compare=False)
 
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         """Raises UserError for pictures of another size and for files that cannot be decoded."""
         was_transparent = False
-        for n, file in enumerate(self.files):
-            time = n / DEFAULT_FPS
-            if time < span.start - 1e-6 or (span.end is not None and time >= span.end):
-                continue
-            image, is_transparent = _read(file)
+        times = [(n / self.rate, file) for n, file in enumerate(self.files)]
+        inside = [(t, f) for t, f in times if t >= span.start - 1e-6 and (span.end is None or t < span.end)]
+        for time, file in inside[:: stride(self.rate)]:
+            image, is_transparent = self.decode(file)
             was_transparent |= is_transparent
             if image.shape[:2] != (self.height, self.width):
                 raise UserError(
@@ -63,18 +75,6 @@ class PictureFolder:
                 digest.update(file.name.encode(errors="surrogateescape") + b"\0" + read_bytes(file))
             self._hash.append(digest.hexdigest())
         return self._hash[0]
-
-
-def _read(file: Path) -> tuple[np.ndarray, bool]:
-    """A picture, and whether it has transparent parts, which are laid over grey."""
-    image = read_image(file)
-    data = read_bytes(file)
-    if not has_transparency(data):
-        return image, False
-    four = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if four is None or four.ndim != 3 or four.shape[2] != 4 or four.dtype != np.uint8 or four[..., 3].min() == 255:
-        return image, False
-    return opaque(np.dstack((image, four[..., 3]))), True
 
 
 def resampled(image: np.ndarray, view: View) -> np.ndarray:

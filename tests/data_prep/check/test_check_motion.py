@@ -127,10 +127,24 @@ def test_a_frame_with_another_identity_is_left_out(folder: Path, tmp_path: Path)
     assert [f.frames for f in checked(folder).findings if f.check == "tracking"] == [("00007",)]
 
 
-def test_a_lens_that_changes_a_little_is_said(folder: Path) -> None:
+def test_a_lens_that_changes_a_little_is_said(folder: Path, tmp_path: Path) -> None:
+    edit_frame(8, opencv__K=set_K(0.98))(folder)
     edit_frame(9, opencv__K=set_K(1.01))(folder)
     (finding,) = found(folder, "tracking-changes")
-    assert finding.severity == "warning" and "the intrinsics change a little within the clip" in finding.problem
+    _, said = prepare_folder(folder, tmp_path / "out", frame_offset=1)
+    assert finding.severity == "warning" and any(finding.problem in line for line in said)
+    assert "the intrinsics change a little within the clip" in finding.problem
+    assert "fx goes from 175.62 to 180.99" in finding.problem
+
+
+def test_several_focal_lengths_in_one_folder_are_an_error_with_their_range(folder: Path, tmp_path: Path) -> None:
+    """As where frames of two recordings were put together."""
+    for n in range(6, 12):
+        edit_frame(n, opencv__K=set_K(1.5 if n < 9 else 2.0))(folder)
+    (finding,) = (f for f in checked(folder).findings if "intrinsics change within the clip" in f.problem)
+    assert finding.severity == "error" and "fx goes from 179.20 to 358.40" in finding.problem
+    with pytest.raises(UserError, match="fx goes from 179.20 to 358.40"):
+        prepare_folder(folder, tmp_path / "out", frame_offset=1)
 
 
 @pytest.mark.parametrize(("degrees", "is_told"), [(90, True), (-90, True), (180, True), (61, True), (45, False)])

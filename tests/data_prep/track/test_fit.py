@@ -12,6 +12,7 @@ import torch
 from spoken_scene import DRIFT, NOISE, SIZE, Scene, drawn, spoken_scene
 
 from avatar.demo.render import RenderedFrame
+from avatar.errors import UserError
 from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.prepare.projection import project_head
@@ -93,6 +94,14 @@ def test_pictures_that_say_nothing_are_not_believed(scene: Fitted) -> None:
     noise = pictures_of(scene, lambda image: rng.integers(0, 256, image.shape).astype(np.uint8))
     done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *noise, silent)
     assert not done.is_taken and done.motion is scene.fit.motion
+
+
+def test_mattes_without_the_face_are_refused_and_no_figure_is_made_of_nothing(scene: Fitted) -> None:
+    images, mattes = pictures_of(scene)
+    with pytest.raises(UserError, match="the mattes show nothing of the face"):
+        fit_pictures(
+            scene.seen.assets, scene.fit, scene.seen.camera, images, lambda row: np.zeros_like(mattes(row)), silent
+        )
 
 
 def test_points_that_do_not_keep_their_colour_count_little() -> None:

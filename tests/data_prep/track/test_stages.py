@@ -105,11 +105,15 @@ def test_a_fit_is_made_again_for_another_lens_head_or_picture(tmp_path: Path, mo
     points, scores = np.zeros((1, NUM_POINTS, 3), np.float32), np.zeros((1, len(BLENDSHAPES)), np.float32)
     landmarks = Landmarks(points, scores, np.ones(1, bool), (64, 64), 25.0)
     footage, head = SimpleNamespace(), grid_head()
+    (tmp_path / "head.npz").touch()  # what lies beside it is in the key too
     with growing(tmp_path / "out") as stages:
 
         def fit(lens: float = 500.0, which: HeadAssets = head, pictures: str = "key of the frames") -> None:
             own = Work(stages, footage, work.Choices(), which, silent)  # type: ignore[arg-type]
-            assert own.fit(landmarks, (lens, lens, 32.0, 32.0), tmp_path, [pictures]).tracks[0].intrinsics[0] == lens
+            assert (
+                own.fit(landmarks, (lens, lens, 32.0, 32.0), tmp_path / "head.npz", [pictures]).tracks[0].intrinsics[0]
+                == lens
+            )
 
         fit()
         fit()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from tracked_folder import write_head_model
@@ -88,7 +90,8 @@ def test_a_better_matte_network_makes_another(head: Path, tmp_path: Path, monkey
 @pytest.mark.parametrize(
     "choices",
     [Choices(crop=Box(0, 0, 64, 64)), Choices(crop="none"), Choices(size=99), Choices(span=Span(1.0)),
-     Choices(span=Span(0.0, 1.0)), Choices(focal=500.0), Choices(field_of_view=40.0)],
+     Choices(span=Span(0.0, 1.0)), Choices(focal=500.0), Choices(field_of_view=40.0), Choices(rotate=0),
+     Choices(rotate=90)],
 )  # fmt: skip
 def test_every_choice_makes_another(choices: Choices, head: Path) -> None:
     assert key(head, choices) != key(head)
@@ -101,6 +104,42 @@ def test_another_video_landmarker_or_version_makes_another(head: Path, monkeypat
         patch.setattr(inputs, "FACE_LANDMARKER", FACE_LANDMARKER._replace(sha256="0"))
         assert key(head) != before
     monkeypatch.setattr(inputs, "STAGES_VERSION", 0)
+    assert key(head) != before
+
+
+def test_every_option_of_a_tracking_is_in_its_key(head: Path) -> None:
+    """Whatever is added to the choices."""
+    told = Choices().to_json()
+    assert told.keys() == {field.name for field in fields(Choices)}
+
+
+def test_a_landmark_that_lies_elsewhere_makes_another(head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no embedding lies beside the head model, its recipe counts."""
+    before = key(head)
+    monkeypatch.setattr(inputs, "RECIPE", 0)
+    assert key(head) != before
+
+
+def test_a_matte_that_changes_makes_another(head: Path, tmp_path: Path) -> None:
+    (tmp_path / "mattes").mkdir()
+    keys = set()
+    for value in (255, 255, 200):
+        cv2.imwrite(str(tmp_path / "mattes" / "0.png"), np.full((64, 64), value, np.uint8))
+        keys.add(key(head, Choices(matte=tmp_path / "mattes")))
+    (tmp_path / "mattes" / "1.png").write_bytes((tmp_path / "mattes" / "0.png").read_bytes())
+    keys.add(key(head, Choices(matte=tmp_path / "mattes")))
+    assert len(keys) == 3
+
+
+@pytest.mark.parametrize("name", ["masks.npz", "l_eyelid.npy"])
+def test_another_file_of_the_head_model_makes_another(name: str, head: Path) -> None:
+    before = key(head)
+    path = head / name
+    if name == "masks.npz":
+        (head / "FLAME_masks.pkl").unlink()
+        np.savez(path, lips=np.arange(3))
+    else:
+        np.save(path, np.load(path) + 0.001)
     assert key(head) != before
 
 

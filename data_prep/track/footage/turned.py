@@ -1,0 +1,76 @@
+"""Footage whose pictures are turned by quarters, as a video that was filmed on its side has to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from data_prep.track.footage.source import Box, Footage, Span, TimedPicture, View
+
+TURNS = (0, 90, 180, 270)  # degrees clockwise
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Implements `Footage`. Views are of the turned pictures."""
+
+    footage: Footage
+    degrees: int  # of TURNS, not 0
+
+    @property
+    def path(self) -> Path:
+        return self.footage.path
+
+    @property
+    def width(self) -> int:
+        return self.footage.height if self.degrees % 180 else self.footage.width
+
+    @property
+    def height(self) -> int:
+        return self.footage.width if self.degrees % 180 else self.footage.height
+
+    @property
+    def rate(self) -> float | None:
+        return self.footage.rate
+
+    @property
+    def duration(self) -> float | None:
+        return self.footage.duration
+
+    @property
+    def equivalent_focal(self) -> float | None:
+        return self.footage.equivalent_focal
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.footage.notes
+
+    def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
+        for picture in self.footage.read(self._before(view), span, complain):
+            yield TimedPicture(picture.time, turn_image(picture.image, self.degrees))
+
+    def content_hash(self) -> str:
+        return self.footage.content_hash()
+
+    def _before(self, view: View) -> View:
+        """The same part of the pictures before they are turned."""
+        x, y, width, height = view.box
+        if self.degrees == 180:
+            return View(Box(self.width - x - width, self.height - y - height, width, height), view.width, view.height)
+        if self.degrees == 90:
+            return View(Box(y, self.width - x - width, height, width), view.height, view.width)
+        return View(Box(self.height - y - height, x, height, width), view.height, view.width)
+
+
+def turned(footage: Footage, degrees: int) -> Footage:
+    """The footage with its pictures turned clockwise by a multiple of 90 degrees."""
+    return Turned(footage, degrees) if degrees else footage
+
+
+def turn_image(image: UInt8[np.ndarray, "H W *C"], degrees: int) -> np.ndarray:
+    """The image turned clockwise by a multiple of 90 degrees."""
+    return np.ascontiguousarray(np.rot90(image, -(degrees // 90)))

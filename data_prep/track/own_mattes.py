@@ -1,0 +1,148 @@
+"""The mattes that a person gives for a video: a folder or a video of all its pictures, checked before anything is made.
+
+Label images with one value besides 0 are understood, as in tracked folders (`mask_values`). What does not show the person
+is refused with the figure that says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from avatar.data.images import decode_image, decode_mask, decode_values, read_bytes
+from avatar.errors import UserError
+from data_prep.prepare.mask_values import coloured_sentence, is_coloured, judge_range, only_label, sampled
+from data_prep.track.faces.detect import Face
+from data_prep.track.footage.pictures import PictureFolder, open_footage, resampled
+from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
+from data_prep.track.footage.timing import DEFAULT_FPS
+from data_prep.track.footage.turned import turned
+from data_prep.track.upright import LONGEST, sample_pictures
+
+OPAQUE = 0.5  # of the face: less is not the person's matte
+_SAMPLES = 16  # pictures of a video of mattes
+
+
+@dataclass(frozen=True)
+class OwnMattes:
+    footage: Footage
+    notes: tuple[str, ...] = ()
+    label: int | None = None  # the value of a video of label images that stands for the person
+
+    def turned(self, degrees: int) -> OwnMattes:
+        return replace(self, footage=turned(self.footage, degrees))
+
+    def read(self, view: View, span: Span) -> Iterator[TimedPicture]:
+        """The mattes, uint8 [H, W], in the order of their times."""
+        # Labels are not numbers to take means of: they are read at their own size.
+        first = view if self.label is None else whole(self.footage.width, self.footage.height)
+        for time, image in self.footage.read(first, span, lambda _: None):
+            matte = self.values(image, time)
+            yield TimedPicture(time, matte if first is view else resampled(matte, view))
+
+    def values(self, image: UInt8[np.ndarray, "H W 3"], time: float) -> UInt8[np.ndarray, "H W"]:
+        """0 to 255, of a picture of the footage."""
+        grey = _grey(image)
+        if self.label is None:
+            return grey
+        is_person = grey == self.label
+        strange = grey[~is_person & (grey != 0)]
+        if len(strange):
+            raise UserError(
+                f"{self.footage.path} holds the value {strange[0]} beside 0 and {self.label}, at {time:.2f} s; make all "
+                "mattes alike"
+            )
+        return np.where(is_person, np.uint8(255), np.uint8(0))
+
+
+def open_mattes(path: Path, video: Footage) -> OwnMattes:
+    """Raises UserError for what cannot be the mattes of the video's pictures."""
+    footage = open_footage(path)
+    if (footage.width, footage.height) != (video.width, video.height):
+        raise UserError(
+            f"the mattes in {path} are {footage.width}x{footage.height} pixels, the video {video.width}x{video.height}; "
+            "make them of the video's own pictures"
+        )
+    found = [set(np.unique(each).tolist()) for each in _values_of_some(footage)]
+    if not found:
+        raise UserError(f"none of the pictures in {path} can be decoded; make the mattes again")
+    label = only_label(found)
+    notes = [] if label is None else [f"the mattes in {path} are label images: {label} is read as 255"]
+    if label is None:
+        darkest, brightest = min(map(min, found)), max(map(max, found))
+        problem, note = judge_range(f"the mattes in {path}", darkest, brightest, lambda: found)
+        if darkest == brightest > 0:
+            problem = f"the mattes in {path} are {darkest} of 255 everywhere: they cut nobody out; leave --matte out"
+        if problem is not None:
+            raise UserError(problem)
+        notes += [note] if note else []
+    if isinstance(footage, PictureFolder):
+        rate = video.rate or DEFAULT_FPS
+        as_masks = replace(footage, decode=_mask_reader(label), rate=rate, duration=len(footage.files) / rate)
+        return OwnMattes(as_masks, tuple(notes))
+    return OwnMattes(footage, tuple(notes), label)
+
+
+def refuse_mattes_of_others(mattes: OwnMattes, span: Span, faces: Sequence[Face | None]) -> None:
+    """Raises UserError where the mattes do not show the faces of the video's sampled pictures (see `sample_pictures`).
+
+    A head hardly moves by its own size, so that the times need not agree exactly.
+    """
+    footage = mattes.footage
+    size, small = whole(footage.width, footage.height), whole(footage.width, footage.height, LONGEST)
+    shares = []
+    for face, (time, image) in zip(faces, sample_pictures(footage, span, size), strict=False):
+        if face is not None:
+            shares.append(share_on(face.points[:, :2], resampled(mattes.values(image, time), small)))
+    if not shares:
+        return
+    on_face, beside = np.median(np.array(shares), axis=0)
+    if on_face < OPAQUE:
+        what = "inverted" if beside > OPAQUE else "not of this person"
+        raise UserError(
+            f"the mattes in {footage.path} are {what}: {on_face:.0%} of the face and {beside:.0%} of the rest of the "
+            f"picture are on them, in the median of {len(shares)} pictures; make the person white (255) and all else "
+            "black (0), in the video's own pictures as they were filmed"
+        )
+
+
+def share_on(points: Float[np.ndarray, "L 2"], matte: UInt8[np.ndarray, "H W"]) -> tuple[float, float]:
+    """How opaque, 0 to 1, a matte is on the face with these landmarks, and beside it."""
+    outline = cv2.convexHull(np.clip(points, -(2**13), 2**13).astype(np.int32))
+    inside = cv2.fillConvexPoly(np.zeros(matte.shape, np.uint8), outline, 1) > 0
+    if inside.all() or not inside.any():
+        return float(matte.mean() / 255), float(matte.mean() / 255)
+    return float(matte[inside].mean() / 255), float(matte[~inside].mean() / 255)
+
+
+def _mask_reader(label: int | None) -> Callable[[Path], tuple[np.ndarray, bool]]:
+    def read(file: Path) -> tuple[np.ndarray, bool]:
+        return cv2.cvtColor(decode_mask(read_bytes(file), file, label), cv2.COLOR_GRAY2RGB), False
+
+    return read
+
+
+def _values_of_some(footage: Footage) -> Iterator[UInt8[np.ndarray, "H W"]]:
+    """Raises UserError where they are pictures in colour."""
+    if isinstance(footage, PictureFolder):
+        for file in sampled(footage.files):
+            data = read_bytes(file)
+            values = decode_values(data, file)
+            if is_coloured(decode_image(data, file), values):
+                raise UserError(coloured_sentence(str(file), "mattes"))
+            yield values
+        return
+    for picture in sample_pictures(footage, Span(), whole(footage.width, footage.height), _SAMPLES):
+        values = _grey(picture.image)
+        if is_coloured(picture.image, values):
+            raise UserError(coloured_sentence(f"{footage.path} at {picture.time:.2f} s", "mattes"))
+        yield values
+
+
+def _grey(image: np.ndarray) -> UInt8[np.ndarray, "H W"]:
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -1,0 +1,30 @@
+"""Tracking without MediaPipe and without a fit, for what comes before it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from marked_face import MarkDetector
+
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.track import track as tracking
+from data_prep.track.fit.result import Clip, Fit
+from data_prep.track.quality import Quality
+
+
+@pytest.fixture
+def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of tracking but the fit and what needs models."""
+
+    def fitted(clip: Clip, *_: object) -> Fit:
+        values = {"expression": 2, "jaw": 6, "eyes": 12, "eyelids": 2, "neck": 6, "t": 3, "shape": 2}
+        one = {name: np.zeros(count) for name, count in values.items()}
+        made = FrameTrack(**one, R=np.eye(3), intrinsics=np.array(clip.intrinsics), size=clip.landmarks.size)
+        return Fit(dict.fromkeys(np.flatnonzero(clip.landmarks.detected).tolist(), made), {})
+
+    for module in ("upright", "look"):
+        monkeypatch.setattr(f"data_prep.track.{module}.FaceDetector", MarkDetector)
+    monkeypatch.setattr("data_prep.track.work.fit_tracks", fitted)
+    monkeypatch.setattr(tracking.Work, "masks", lambda *_: [1.0])
+    monkeypatch.setattr(tracking.Work, "overlay", lambda *_: None)
+    monkeypatch.setattr(tracking, "judge", lambda *_: Quality((), (), ""))
