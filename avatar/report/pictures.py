@@ -29,7 +29,7 @@ def frame_panels(run: Run) -> list[tuple[str, np.ndarray]]:
     background = torch.tensor(run.config.data.background)
     renderer = Renderer(run.avatar, background)
     panels = []
-    with FrameLoader(subject, run.config.data.size, workers=run.config.data.workers) as loader:
+    with FrameLoader(subject, run.config.data.size) as loader:
         for frame in loader.frames(chosen):
             render = renderer.render(frame.params, frame.camera).image.clamp(0, 1).cpu()
             image = panel(Pair(render, frame.composite(background)))

@@ -172,7 +172,7 @@ class Alignment:
 
     def placed(self, step: int, frame: Frame, row: Row) -> Seen:
         """The frame where `row` has it, in a step with the colours of step `step`."""
-        degree = sh_degree(step, self._trainer, self._likeness.avatar.config.sh_degree)
+        degree = sh_degree(step)
         values = self._freedom_of(row).values(0, row.moves)
         placed = place(frame, values, HeadPose(row.R, row.t), self._likeness.centre, degree)
         return Seen(placed.frame, self._likeness.vertices(placed.frame.params), placed, row)
@@ -258,7 +258,7 @@ class Alignment:
 
     def _measure(self, step: int, loader: FrameLoader) -> None:
         self.measured += 1
-        mean = self._inquiry.curvature(step, loader, self._moves, SAMPLES, self._trainer.mouth_weight)
+        mean = self._inquiry.curvature(step, loader, self._moves, SAMPLES)
         if mean is None:
             self._is_over = True
             return

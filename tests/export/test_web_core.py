@@ -28,7 +28,6 @@ MODELS = {
     "grid": ("model=hypergaussians",),
     "no grid": ("model=hypergaussians", "model.latent_grid=null"),
     "no HyperGaussians": ("model=flashavatar",),
-    "no view dependence": ("model.sh_degree=0",),
     "covariance": ("model=covariance",),
     "detail": ("model.uv_detail=2",),
     "rigidity": ("model.rigidity=true",),
