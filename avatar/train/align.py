@@ -54,10 +54,9 @@ def make_alignment(
 ) -> Alignment | None:
     """For a run that begins, or goes on from the tensors of a checkpoint; None where it moves no tracking.
 
-    Neither does one whose checkpoint knows of no moves: an earlier version began it, on a GPU. Raises UserError for tensors
-    that are not of these frames.
+    Raises UserError for tensors that are not of these frames.
     """
-    if config.trainer.align_rate == 0 or (saved is not None and f"{_PREFIX}moves" not in saved):
+    if config.trainer.align_rate == 0:
         return None
     alignment = Alignment(avatar, subject, config)
     if saved is not None:
