@@ -38,7 +38,9 @@ def counting() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def counts(counting: ModuleType) -> dict[str, Counter[str]]:
-    return counting.count_all(grid_head(), 32, 64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("avatar.train.step.SH_INTERVAL", 500)  # as outside of the tests
+        return counting.count_all(grid_head(), 32, 64)
 
 
 def test_a_fast_step_and_a_frame_launch_little(counts: dict[str, Counter[str]]) -> None:

@@ -42,7 +42,7 @@ STILL = (*TINY, "trainer.align_rate=0")
 
 
 def trained(
-    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int
+    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int, degree_every: int = 7
 ) -> tuple[Checkpoint, Steps, list[float]]:
     """The last checkpoint, what made the steps, and the loss of each."""
     config = small_config(*overrides)
@@ -61,7 +61,7 @@ def trained(
             return outcome
 
     with monkeypatch.context() as patch:
-        patch.setattr(step_module, "SH_INTERVAL", 7)
+        patch.setattr(step_module, "SH_INTERVAL", degree_every)
         patch.setattr(trainer_module, "Steps", Noting)
         patch.setattr(steps_module, "WARM", warm)
         term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
@@ -144,8 +144,10 @@ def test_a_script_without_todays_room_is_written_anew(
     monkeypatch.setattr(Capacities, "known", growing)
     monkeypatch.setattr(steps_module, "Replay", counting)
     monkeypatch.setattr(step_module, "PERCEPTUAL_START", 1.0)
-    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *STILL, "trainer.iterations=7", warm=1)
-    assert found.step == 7 and steps.replayed == 6
+    found, steps, _ = trained(
+        tracked_folder, tmp_path / "run", monkeypatch, *STILL, "trainer.iterations=12", warm=1, degree_every=99
+    )
+    assert found.step == 12 and steps.replayed == 11
     assert written == [4096, 8192]
     assert expected.step == 20
 
