@@ -33,8 +33,7 @@ def splat_forward(
     threads: int,
     image: Tensor,
     alpha: Tensor,
-    counts: Tensor | None = None,  # int64 [16], the fields of avatar.splat.Counters
-    everywhere: bool = False,
+    everywhere: bool = False,  # for tests: look for every splat at every pixel
 ) -> Drawing | None: ...
 def splat_backward(
     drawing: Drawing,

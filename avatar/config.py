@@ -1,7 +1,8 @@
-"""The configuration: YAML files under configs/ and `key=value` overrides in, typed dataclasses out.
+"""The configuration. Every key is declared here once: its type, default, range and meaning.
 
-Hydra composes; defaults and what the keys mean stand in the YAML files, the dataclasses below are the schema: an unknown
-key, a wrong type or a value outside its range is refused with a sentence that names the key and the nearest one.
+The defaults are the default recipe. The YAML files of configs/model/ and configs/experiment/ hold what differs from it;
+Hydra composes them. An unknown key, a wrong type or a value out of range is refused with a sentence that names the key
+and the nearest one.
 """
 
 from __future__ import annotations
@@ -9,176 +10,121 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from avatar.config_values import (
-    cause,
-    check_choice,
-    check_device,
-    check_range,
-    checked_value,
-    config_dir,
-    shown,
-    typed_value,
-)
+from avatar.config_values import Range, cause, check_device, checked_value, config_dir, meaning_of, shown, typed_value
 from avatar.data.background import Colour
 from avatar.errors import UserError
+
+MAX_OVERRIDE = 1000  # characters; a message quotes the override
+MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
+PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
+STEPS, WEIGHT, SHARE, RATE = Range(1, MOST_STEPS), Range(0, 10**6), Range(0, 1), Range(0, 10)
 
 
 @dataclass
 class DataConfig:
     """How the prepared subject is read."""
 
-    size: int | None
-    background: Colour
-    train_frames: int | None
-    test_frames: int | None
-    cache_mb: int
-    workers: int
+    size: Annotated[int | None, Range(16, 8192), "width of the training images in pixels; null: the video's"] = None
+    background: Annotated[Colour, "colour behind the head: a name, #RRGGBB or [r,g,b]"] = (1.0, 1.0, 1.0)
+    test_frames: Annotated[
+        int | None, STEPS, "frames held out at the end; null: 500, or 20% of a clip under 2,500 frames"
+    ] = None
 
 
 @dataclass
 class ModelConfig:
     """The avatar's architecture; the checkpoint holds it, and it cannot change afterwards."""
 
-    name: str
-    uv_size: int
-    latent_dim: int
-    latent_grid: int | None
-    mlp_width: int
-    mlp_layers: int
-    frequencies: int
-    sh_degree: int
-    initial_opacity: float
-    uv_detail: int
-    rigidity: bool = False  # avatars that lack it were made without
-    blur: float = 0.3  # with which those that lack it were trained
-    facing: bool = False
-    teeth: bool = False
+    name: Annotated[
+        Literal["hypergaussians", "flashavatar", "covariance", "ndgs", "splattingavatar", "monogaussianavatar"],
+        "the method; model=NAME sets it",
+    ] = "hypergaussians"
+    uv_size: Annotated[int, Range(2, 2048), "texels a side of the UV raster; one Gaussian per covered texel"] = 128
+    uv_detail: Annotated[int, Range(1, 8), "how many times finer the raster is around mouth and eyes"] = 2
+    latent_dim: Annotated[int, Range(1, 4096), "n, dimensions of the latent"] = 8
+    latent_grid: Annotated[
+        int | None, Range(1, 2048), "cells a side of the UV grid that latents are interpolated from; null: no grid"
+    ] = 8
+    mlp_width: Annotated[int, Range(1, 65536), "neurons per hidden layer of the deformation network"] = 128
+    mlp_layers: Annotated[int, Range(1, 1000), "hidden layers of the deformation network"] = 6
+    initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6), "opacity of every Gaussian before training"] = 0.3
+    blur: Annotated[float, Range(0, 100), "pixels^2 added to both variances of a projected Gaussian"] = 0.05
+    rigidity: Annotated[bool, "learn how far each Gaussian moves with the skull instead of the skin"] = True
+    facing: Annotated[bool, "give the network the head's rotation relative to the camera"] = True
+    teeth: Annotated[bool, "add two rows of Gaussians behind the lips that move with skull and jaw"] = True
 
 
 @dataclass
 class LearningRates:
-    """Adam's learning rate of each group of parameters."""
+    """Adam's learning rates of the Gaussians; `train/optim.py` has those that do not vary."""
 
-    sh_dc: float
-    sh_rest: float
-    opacity: float
-    scale: float
-    rotation: float
-    mlp: float
-    hyper: float
+    sh_dc: Annotated[float, RATE, "base colour"] = 1.0e-2
+    sh_rest: Annotated[float, RATE, "view-dependent colour"] = 2.5e-3
+    scale: Annotated[float, RATE, "logarithm of the scale"] = 2.0e-2
+    rotation: Annotated[float, RATE, "base quaternion"] = 4.0e-3
 
 
 @dataclass
 class TrainerConfig:
     """The optimisation."""
 
-    iterations: int
-    passes: int | None
-    seed: int
-    learning_rates: LearningRates
-    lr_warmup: int
-    lr_final: float
-    adam_eps: float
-    initial_colours: str
-    sh_interval: int
-    huber_delta: float
-    mouth_weight: float
-    perceptual: str
-    perceptual_weight: float
-    dssim_weight: float
-    dssim_early: float
-    perceptual_start: float
-    lpips_net: str
-    lpips_every: int
-    lpips_region: str
-    log_every: int
-    preview_every: int
-    checkpoint_every: int
-    keep_checkpoints: int
-    stray_share: float = 0.0  # runs that lack it were made without, as those that lack one of the next
-    align_rate: float = 0.0
-    condition_noise: float = 0.0
+    iterations: Annotated[int, STEPS, "optimizer steps, one random training frame each"] = 4000
+    passes: Annotated[int | None, STEPS, "most passes over the training frames; null: no limit"] = 10
+    seed: Annotated[int, Range(0, 2**31 - 1), "seed of the initial weights and of the order of frames"] = 0
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+    lr_decay: Annotated[bool, "warm up, then decay all learning rates along half a cosine; false: constant"] = True
+    initial_colours: Annotated[
+        Literal["grey", "frames"], "grey, or frames: the mean colour that training frames show at each Gaussian"
+    ] = "frames"
+    perceptual: Annotated[
+        Literal["auto", "lpips", "dssim", "none"], "perceptual loss; auto: LPIPS if its weights are there, else D-SSIM"
+    ] = "auto"
+    lpips_net: Annotated[Literal["vgg", "alex", "squeeze"], "backbone of the LPIPS loss: vgg, alex or squeeze"] = (
+        "squeeze"
+    )
+    sparse_lpips: Annotated[bool, "LPIPS of the head's box in every tenth step; false: of the frame in every step"] = (
+        True
+    )
+    dssim_weight: Annotated[float, WEIGHT, "weight of D-SSIM in steps where it replaces LPIPS"] = 0.2
+    dssim_early: Annotated[float, WEIGHT, "weight of D-SSIM before the perceptual loss begins"] = 0.1
+    stray_share: Annotated[
+        float, SHARE, "Gaussians whose rendered coverage lies less than this share on the head are pruned; 0: none"
+    ] = 0.05
+    align_rate: Annotated[
+        float, SHARE, "share of a Gauss-Newton step that moves a frame's tracking in its training step; 0: fixed"
+    ] = 0.25
+    condition_noise: Annotated[
+        float, SHARE, "noise on the network's input, as a share of each coefficient's standard deviation"
+    ] = 0.2
+    checkpoint_every: Annotated[int, STEPS, "steps between checkpoints, each with a preview image"] = 500
+    keep_checkpoints: Annotated[int, Range(1, 10**6), "how many of the newest checkpoints are kept"] = 3
 
 
 @dataclass
 class Config:
     """Everything that decides the result of a training run, apart from its input."""
 
-    data: DataConfig
-    model: ModelConfig
-    trainer: TrainerConfig
-    device: str
+    data: DataConfig = field(default_factory=DataConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    device: Annotated[str, "cpu, cuda, cuda:N; auto: a GPU that passes its test, else the CPU"] = "auto"
 
     def to_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 
 
-MAX_OVERRIDE = 1000  # characters; a message quotes the override
-MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
-PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
-
-CHOICES: dict[str, tuple[str, ...]] = {
-    "model.name": ("hypergaussians", "flashavatar", "covariance", "ndgs", "splattingavatar", "monogaussianavatar"),
-    "trainer.perceptual": ("auto", "lpips", "dssim", "none"),
-    "trainer.lpips_net": ("vgg", "alex", "squeeze"),
-    "trainer.lpips_region": ("frame", "head"),
-    "trainer.initial_colours": ("grey", "frames"),
-}
-RANGES: dict[str, tuple[float, float]] = {
-    "data.size": (16, 8192),
-    "data.train_frames": (1, MOST_STEPS),
-    "data.test_frames": (1, MOST_STEPS),
-    "data.cache_mb": (1, 2**20),
-    "data.workers": (1, 64),
-    "model.uv_size": (2, 2048),
-    "model.uv_detail": (1, 8),
-    "model.latent_dim": (1, 4096),
-    "model.latent_grid": (1, 2048),
-    "model.mlp_width": (1, 65536),
-    "model.mlp_layers": (1, 1000),
-    "model.frequencies": (0, 30),
-    "model.sh_degree": (0, 3),
-    "model.initial_opacity": (1e-6, 1 - 1e-6),
-    "model.blur": (0, 100),
-    "trainer.iterations": (1, MOST_STEPS),
-    "trainer.passes": (1, MOST_STEPS),
-    "trainer.seed": (0, 2**31 - 1),
-    "trainer.lr_warmup": (0, MOST_STEPS),
-    "trainer.adam_eps": (1e-20, 1),  # float32 has no squares of gradients below 1e-21: less would not bound their steps
-    "trainer.sh_interval": (1, MOST_STEPS),
-    "trainer.huber_delta": (1e-6, 1000),
-    "trainer.mouth_weight": (0, 10**6),
-    "trainer.perceptual_weight": (0, 10**6),
-    "trainer.dssim_weight": (0, 10**6),
-    "trainer.dssim_early": (0, 10**6),
-    "trainer.lpips_every": (1, MOST_STEPS),
-    "trainer.log_every": (1, MOST_STEPS),
-    "trainer.preview_every": (1, MOST_STEPS),
-    "trainer.checkpoint_every": (1, MOST_STEPS),
-    "trainer.keep_checkpoints": (1, 10**6),
-}
-_SHARES = "lr_final", "perceptual_start", "stray_share", "align_rate", "condition_noise"
-RANGES |= {f"trainer.{name}": (0, 1) for name in _SHARES}
-RANGES |= {f"trainer.learning_rates.{f.name}": (0.0, 10.0) for f in dataclasses.fields(LearningRates)}
-
-
 def load_config(overrides: Sequence[str] = ()) -> Config:
-    """Compose configs/config.yaml with `key=value` or `group=option` overrides, later ones winning.
+    """The default recipe with `group=option` and `key=value` overrides, keys after groups, later ones winning.
 
-    `trainer.iterations` without `trainer.passes` lifts a preset's limit of passes over the frames.
+    `trainer.iterations` without `trainer.passes` lifts the limit of passes over the frames.
     Raises UserError for an unknown key or option, a wrong type or a value out of range.
     """
-    values: dict[str, Any] = OmegaConf.to_container(_composed(overrides), resolve=True)  # type: ignore[assignment]
+    files, _ = _composed(overrides)
+    values = _merged(Config().to_dict(), files)
     given = dict(override.split("=", 1) for override in overrides if override.partition("=")[0] not in _groups())
     for key, text in given.items():
         *sections, name = key.split(".")
@@ -189,13 +135,19 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
 
 
 def chosen_options(overrides: Sequence[str] = ()) -> dict[str, str]:
-    """The option of each group, such as {"model": "hypergaussians", "preset": "fast"}; raises as `load_config` does."""
-    choices = _composed(overrides, hydra=True).hydra.runtime.choices
-    return {group: option for group, option in choices.items() if group in _groups()}
+    """The option of each group, such as {"model": "hypergaussians", "experiment": "none"}; raises as `load_config` does."""
+    _, choices = _composed(overrides)
+    return {group: choices[group] or "none" for group in sorted(_groups(), reverse=True)}
 
 
-def _composed(overrides: Sequence[str], hydra: bool = False) -> DictConfig:
-    """The files of configs/ with the chosen options; what else is overridden has only been checked for its key."""
+def _composed(overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str | None]]:
+    """What the files of the chosen options say, and these options; other overrides have only been checked for their key."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
     if long := next((override for override in overrides if len(override) > MAX_OVERRIDE), None):
         raise UserError(f"the override {long[:60]}... has {len(long)} characters; no value of a key needs that many")
     _check_overrides(overrides)
@@ -203,23 +155,31 @@ def _composed(overrides: Sequence[str], hydra: bool = False) -> DictConfig:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            return compose("config", overrides=chosen, return_hydra_config=hydra)
+            composed = compose("config", overrides=chosen, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"the configuration cannot be composed: {cause(error)}") from None
+    choices = dict(composed.hydra.runtime.choices)
+    values = OmegaConf.to_container(composed)
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items() if key != "hydra"}, choices
+
+
+def _merged(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Nested dictionaries with some values changed."""
+    merged = dict(values)
+    for key, change in changes.items():
+        known = values.get(key)
+        merged[key] = _merged(known, change) if isinstance(known, dict) and isinstance(change, dict) else change
+    return merged
 
 
 def config_from_dict(values: dict[str, Any]) -> Config:
-    """A checked Config from nested dictionaries, as a checkpoint or a composed YAML holds them.
+    """A checked Config from nested dictionaries, as a checkpoint holds them.
 
     Raises UserError for keys that are missing or unknown, wrong types and values out of range.
     """
     config = _section(values, Config, "")
     assert isinstance(config, Config)
-    flat = flatten(config.to_dict())
-    for key, choices in CHOICES.items():
-        check_choice(key, flat[key], choices)
-    for key, (low, high) in RANGES.items():
-        check_range(key, flat[key], low, high)
     check_device(config.device)
     return config
 
@@ -228,16 +188,15 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
     """The dataclass `schema` of a dictionary; `prefix` is what its keys are called by."""
     if not isinstance(values, dict):
         raise UserError(f"the configuration has {shown(values)} where the keys {prefix}* should be")
-    kinds = get_type_hints(schema)
+    kinds = get_type_hints(schema, include_extras=True)
     if unknown := [key for key in values if key not in kinds]:
         raise _no_such_key(f"{prefix}{unknown[0]}")
-    values = {f.name: f.default for f in dataclasses.fields(schema) if f.default is not dataclasses.MISSING} | values
     if missing := [key for key in kinds if key not in values]:
         raise UserError(f"the configuration lacks {prefix}{missing[0]}")
     return schema(
         **{
             name: _section(values[name], kind, f"{prefix}{name}.")
-            if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+            if dataclasses.is_dataclass(kind) and isinstance(kind, type)
             else checked_value(f"{prefix}{name}", values[name], kind)
             for name, kind in kinds.items()
         }
@@ -245,7 +204,7 @@ def _section(values: Any, schema: type, prefix: str) -> Any:
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
-    groups, keys = _groups(), _known_keys()
+    groups, keys = _groups(), declared_keys()
     for override in overrides:
         key, separator, value = override.partition("=")
         if not separator or not key:
@@ -269,19 +228,19 @@ def _groups() -> dict[str, list[str]]:
     return {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in folders}
 
 
-def _known_keys(schema: type = Config, prefix: str = "") -> list[str]:
-    keys: list[str] = []
-    for name, kind in get_type_hints(schema).items():
-        keys += (
-            _known_keys(kind, f"{prefix}{name}.")
-            if isinstance(kind, type) and dataclasses.is_dataclass(kind)
-            else [f"{prefix}{name}"]
-        )
+def declared_keys(schema: type = Config, prefix: str = "") -> dict[str, str]:
+    """Every key, as it is written in overrides, and what it means."""
+    keys: dict[str, str] = {}
+    for name, kind in get_type_hints(schema, include_extras=True).items():
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            keys |= declared_keys(kind, f"{prefix}{name}.")
+        else:
+            keys[f"{prefix}{name}"] = meaning_of(kind)
     return keys
 
 
 def _nearest_hint(key: str, groups: Sequence[str] = ()) -> str:
-    known = [*_known_keys(), *groups]
+    known = [*declared_keys(), *groups]
     by_last = {name.rsplit(".", 1)[-1]: name for name in known}
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     near = near or [by_last[m] for m in difflib.get_close_matches(key.rsplit(".", 1)[-1], list(by_last), n=1)]
@@ -289,7 +248,7 @@ def _nearest_hint(key: str, groups: Sequence[str] = ()) -> str:
 
 
 def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dictionaries as one, with keys as they are written in overrides: `trainer.learning_rates.mlp`."""
+    """Nested dictionaries as one, with keys as they are written in overrides: `trainer.learning_rates.scale`."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import types
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
 from avatar.errors import UserError
@@ -13,6 +13,13 @@ from avatar.errors import UserError
 DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
 _CONSTANTS = {"null": None, "~": None, "true": True, "false": False}
 _KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word", bool: "true or false"}
+
+
+class Range(NamedTuple):
+    """The values that a key may have, both ends included."""
+
+    low: float
+    high: float
 
 
 def config_dir() -> Path:
@@ -39,18 +46,35 @@ def typed_value(text: str) -> int | float | bool | str | None:
     return word
 
 
-def checked_value(key: str, value: Any, kind: Any) -> Any:
-    """`value` as the type annotation `kind` of a field of the configuration wants it.
+def checked_value(key: str, value: Any, declared: Any) -> Any:
+    """`value` as the annotation of a field of the configuration declares it: its type, its range or its choices.
 
     A number without a fraction counts as whole however it is written (1e3). Raises UserError with what is expected.
     """
+    kind, *others = get_args(declared) if get_origin(declared) is Annotated else (declared,)
+    checked = _of_type(key, value, kind)
+    for limits in (other for other in others if isinstance(other, Range)):
+        _check_range(key, checked, limits)
+    return checked
+
+
+def meaning_of(declared: Any) -> str:
+    """The sentence of a field's annotation."""
+    return next((other for other in get_args(declared) if isinstance(other, str)), "")
+
+
+def _of_type(key: str, value: Any, kind: Any) -> Any:
     options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     wanted = next(option for option in options if option is not types.NoneType)
     if value is None and types.NoneType in options:
         return None
     if get_origin(wanted) is tuple:
         return checked_colour(key, value)
+    choices: tuple[str, ...] = get_args(wanted) if get_origin(wanted) is Literal else ()
+    wanted = str if choices else wanted
     if isinstance(value, wanted) and isinstance(value, bool) == (wanted is bool):
+        if choices and value not in choices:
+            raise UserError(f"{key}={shown(value)} is not one of {', '.join(choices)}")
         return value
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         return float(max(min(value, 10**300), -(10**300)))  # beyond that there is no float; every range refuses it
@@ -67,15 +91,11 @@ def checked_colour(key: str, value: Any) -> Colour:
         raise UserError(f"{key}={shown(value)} is not valid: it must be {COLOUR_WORDS}") from None
 
 
-def check_choice(key: str, value: Any, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise UserError(f"{key}={shown(value)} is not one of {', '.join(choices)}")
-
-
-def check_range(key: str, value: float | None, low: float, high: float) -> None:
-    """Raise UserError where `value` is not from `low` to `high`; NaN never is."""
-    if value is not None and not low <= value <= high:
-        raise UserError(f"{key}={shown(value)} is out of range: it must be from {shown(low)} to {shown(high)}")
+def _check_range(key: str, value: float | None, limits: Range) -> None:
+    """Raise UserError where `value` is out of range; NaN always is."""
+    if value is not None and not limits.low <= value <= limits.high:
+        ends = f"from {shown(limits.low)} to {shown(limits.high)}"
+        raise UserError(f"{key}={shown(value)} is out of range: it must be {ends}")
 
 
 def check_device(name: str) -> None:

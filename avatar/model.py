@@ -31,6 +31,7 @@ from avatar.splat import splat
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
+SH_DEGREE = 3  # of the view-dependent colour
 WITH_LATENTS = ("hypergaussians", "covariance", "ndgs")
 
 
@@ -73,12 +74,12 @@ class Avatar(nn.Module):
         if has_latents and config.latent_grid is not None:
             self.grid = latent_grid(mesh, self.embedding.texels, neutral, config.latent_grid)
         places = neutral if self.grid is None else self.grid.places
-        self.register_buffer("code", positional_encoding(places, config.frequencies), persistent=False)
+        self.register_buffer("code", positional_encoding(places), persistent=False)
 
         self.deformation: DeformationMLP | None = None
         if config.name != "splattingavatar":
             self.deformation = DeformationMLP(
-                code_size=encoded_size(config.frequencies),
+                code_size=encoded_size(),
                 condition_size=assets.num_expressions + CONDITION_EXTRAS + (VALUES if config.facing else 0),
                 out_size=config.latent_dim if has_latents else 10,
                 width=config.mlp_width,
@@ -107,9 +108,8 @@ class Avatar(nn.Module):
         self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(N, 1))
         initial_opacity = torch.logit(torch.tensor(config.initial_opacity))
         self.opacity_logits = nn.Parameter(initial_opacity.repeat(N))
-        coefficients = (config.sh_degree + 1) ** 2
         self.sh_dc = nn.Parameter(torch.zeros(N, 1, 3))
-        self.sh_rest = nn.Parameter(torch.zeros(N, coefficients - 1, 3))
+        self.sh_rest = nn.Parameter(torch.zeros(N, (SH_DEGREE + 1) ** 2 - 1, 3))
         self._pose: PoseTensors | None = None  # for posing on a GPU
         self.register_load_state_dict_post_hook(_check_loaded)
 
@@ -183,7 +183,7 @@ class Avatar(nn.Module):
         if self.mesh_points is None or self.count is None:
             return
         vertices = self.mesh.neutral_vertices().to(self.code.device)
-        self.code = positional_encoding(self.mesh_points.points(vertices).detach(), self.config.frequencies)
+        self.code = positional_encoding(self.mesh_points.points(vertices).detach())
 
     def check_points(self) -> None:
         """After parameters were loaded. Raises ValueError for points that cannot be there."""

@@ -118,7 +118,7 @@ def rehearse(assets: HeadAssets) -> list[Variant]:
 
     term = PerceptualTerm("dssim", Weighted(dssim, 0.05))
     with watched(note), fixed_capacity(PAIRS):
-        for overrides in (("preset=fast",), ("preset=paper",), ("model=flashavatar",)):
+        for overrides in ((), ("experiment=paper",), ("model=flashavatar",)):
             rehearsal = Rehearsal(assets, 128, 512, overrides)
             rehearsal.step(term, late=True)
             rehearsal.rendered()

@@ -41,7 +41,7 @@ from avatar.tracking.freedom import find_freedom
 from avatar.train.ahead import Guard
 from avatar.train.align import Alignment
 from avatar.train.optim import make_optimizer
-from avatar.train.step import Objective, PerceptualTerm, Weighted, training_step
+from avatar.train.step import SPARSE_EVERY, Objective, PerceptualTerm, Weighted, training_step
 from avatar.types import IDENTITY_6D, Frame, HeadParams
 
 META = torch.device("meta")
@@ -95,7 +95,7 @@ def counting() -> Iterator[Counter[str]]:
 
 
 class Rehearsal:
-    """An avatar of the preset `fast`, with one frame; on the meta device, or on one that computes."""
+    """An avatar of the default recipe, with one frame; on the meta device, or on one that computes."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class Rehearsal:
 
     def number(self, late: bool) -> int:
         """Of a step in the second half, or in the first."""
-        return self.trainer.iterations - self.trainer.lpips_every if late else self.trainer.iterations // 4
+        return self.trainer.iterations - SPARSE_EVERY if late else self.trainer.iterations // 4
 
     def moving(self, perceptual: PerceptualTerm) -> Counter[str]:
         """What a step launches that moves its frame's tracking."""
@@ -200,7 +200,7 @@ def count_all(assets: HeadAssets, uv_size: int, size: int) -> dict[str, Counter[
         "step, first half": rehearsal.step(PerceptualTerm("dssim", stand_in), late=False),
         "step with D-SSIM": rehearsal.step(PerceptualTerm("dssim", stand_in), late=True),
         "step with LPIPS (each tenth of the second half)": rehearsal.step(
-            PerceptualTerm("lpips", lpips, rehearsal.trainer.lpips_every, stand_in), late=True
+            PerceptualTerm("lpips", lpips, SPARSE_EVERY, stand_in), late=True
         ),
         "step that moves its frame": rehearsal.moving(PerceptualTerm("dssim", stand_in)),
         "rendered frame": rehearsal.rendered(),

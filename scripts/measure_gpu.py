@@ -2,7 +2,7 @@
 
     python scripts/measure_gpu.py [--out docs/bench] [--size 512] [--splats 14876] [--uv-size 128] [--repeats 50]
 
-Writes OUT/gpu.md and ends with status 1 where a check fails. `first_gpu_session.sh` runs it with all other checks. With
+Writes OUT/gpu.md and ends with status 1 where a check fails. `gpu_session.sh` runs it with all other checks. With
 TRITON_INTERPRET=1 and small numbers it runs, slowly, without a GPU, for its own test; the times then mean nothing.
 """
 

@@ -25,6 +25,15 @@ def shared_dir() -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _short_training() -> Iterator[None]:
+    """Within the dozen steps of a training in a test, colours reach their full degree and curves get their points."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("avatar.train.step.SH_INTERVAL", 3)
+        patch.setattr("avatar.train.log.LOG_EVERY", 2)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Prepared subjects and weights of the person who runs the tests stay out of them."""
     with pytest.MonkeyPatch.context() as patch:

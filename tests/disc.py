@@ -130,7 +130,7 @@ class BlobRenderer:
 
 
 def make_run(path: Path, subject: Subject) -> Any:
-    data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0), cache_mb=16, workers=1)
+    data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0))
     config = SimpleNamespace(data=data, to_dict=lambda: {"data": {"size": None}})
     return SimpleNamespace(
         path=path, config=config, avatar=Blob(), subject=subject, step=1500, trained=SimpleNamespace(perceptual="dssim")

@@ -25,10 +25,7 @@ SMALL = (
     "model.mlp_width=24",
     "model.mlp_layers=2",
     "trainer.iterations=12",
-    "trainer.sh_interval=3",
     "trainer.checkpoint_every=4",
-    "trainer.preview_every=6",
-    "trainer.log_every=2",
 )
 QUICK = (*SMALL, "trainer.iterations=16")
 

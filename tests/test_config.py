@@ -1,28 +1,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, is_dataclass
+from typing import get_args, get_type_hints
 
 import pytest
 import torch
+from command_line import avatar
 
-from avatar.config import RANGES, config_dir, config_from_dict, flatten, load_config
+from avatar.config import Config, config_from_dict, declared_keys, flatten, load_config
+from avatar.config_values import Range
 from avatar.errors import UserError
 from avatar.gaussians.deformation import DeformationMLP
+from avatar.gaussians.encoding import FREQUENCIES
+from avatar.model import SH_DEGREE
+from avatar.train import optim
+from avatar.train.step import perceptual_start
 
 
-@pytest.mark.parametrize("overrides", [["preset=paper"], ["experiment=paper"]])
-def test_the_papers_recipe(overrides: list[str]) -> None:
-    config = load_config(overrides)
+def test_the_papers_recipe() -> None:
+    config = load_config(["experiment=paper"])
     assert (config.model.latent_grid, config.trainer.initial_colours) == (None, "grey")
-    assert (config.trainer.lr_warmup, config.trainer.lr_final) == (0, 1.0)
-    assert (config.trainer.lpips_every, config.trainer.lpips_region) == (1, "frame")
+    assert (config.trainer.lr_decay, config.trainer.sparse_lpips, config.trainer.lpips_net) == (False, False, "vgg")
     assert (config.model.name, config.model.latent_dim, config.model.uv_size) == ("hypergaussians", 8, 128)
-    assert (config.model.mlp_width, config.model.mlp_layers, config.model.frequencies) == (256, 6, 8)
+    assert (config.model.mlp_width, config.model.mlp_layers, FREQUENCIES, SH_DEGREE) == (256, 6, 8, 3)
     rates = config.trainer.learning_rates
-    assert (rates.sh_dc, rates.sh_rest, rates.opacity) == (2.5e-3, 2.5e-3 / 20, 0.05)
-    assert (rates.scale, rates.rotation, rates.mlp, rates.hyper) == (5e-3, 1e-3, 1e-4, 1e-4)
-    assert (config.trainer.iterations, config.trainer.perceptual_start, config.trainer.lpips_net) == (30000, 0.5, "vgg")
+    assert (rates.sh_dc, rates.sh_rest, optim.OPACITY_RATE) == (2.5e-3, 2.5e-3 / 20, 0.05)
+    assert (rates.scale, rates.rotation, optim.NETWORK_RATE, optim.HYPER_RATE) == (5e-3, 1e-3, 1e-4, 1e-4)
+    assert (config.trainer.iterations, perceptual_start(config.trainer)) == (30000, 15000)
     assert config.data.background == (1.0, 1.0, 1.0)
 
 
@@ -53,38 +59,43 @@ def test_the_papers_networks_have_the_papers_sizes(width: int, layers: int, publ
     assert (f"{count // 1000}K" if count < 1e6 else f"{count / 1e6:.1f}M") == published
 
 
-def test_the_default_is_the_best_preset_of_the_papers_model() -> None:
-    config, paper = load_config(), load_config(["preset=paper"])
-    assert config == load_config(["preset=best"]) == load_config(["experiment=best"])
-    assert config.model.latent_grid == 8 and config.trainer.initial_colours == "frames"
-    assert (config.model.latent_dim, config.model.uv_size) == (paper.model.latent_dim, paper.model.uv_size)
-    assert load_config(["preset=fast", "model.latent_grid=null"]).model.latent_grid is None
-
-
-def test_the_best_recipe_is_the_fast_one_with_its_kept_ingredients() -> None:
-    ours, fast = flatten(load_config().to_dict()), flatten(load_config(["preset=fast"]).to_dict())
-    assert {key: value for key, value in ours.items() if value != fast[key]} == {
-        "model.latent_grid": 8,
-        "model.uv_detail": 2,
-        "model.rigidity": True,
-        "model.blur": 0.05,
-        "model.facing": True,
-        "model.teeth": True,
-        "trainer.iterations": 4000,
-        "trainer.passes": 10,
-        "trainer.dssim_early": 0.1,
-        "trainer.dssim_weight": 0.2,
-        "trainer.stray_share": 0.05,
-        "trainer.align_rate": 0.25,
-        "trainer.condition_noise": 0.2,
-        "trainer.learning_rates.sh_dc": 1.0e-2,
-        "trainer.learning_rates.sh_rest": 2.5e-3,
-        "trainer.learning_rates.scale": 2.0e-2,
-        "trainer.learning_rates.rotation": 4.0e-3,
+def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
+    ours, paper = flatten(load_config().to_dict()), flatten(load_config(["experiment=paper"]).to_dict())
+    assert {key: (ours[key], paper[key]) for key in ours if ours[key] != paper[key]} == {
+        "data.size": (None, 512),
+        "model.uv_detail": (2, 1),
+        "model.latent_grid": (8, None),
+        "model.mlp_width": (128, 256),
+        "model.initial_opacity": (0.3, 0.1),
+        "model.blur": (0.05, 0.3),
+        "model.rigidity": (True, False),
+        "model.facing": (True, False),
+        "model.teeth": (True, False),
+        "trainer.iterations": (4000, 30000),
+        "trainer.passes": (10, None),
+        "trainer.learning_rates.sh_dc": (1e-2, 2.5e-3),
+        "trainer.learning_rates.sh_rest": (2.5e-3, 1.25e-4),
+        "trainer.learning_rates.scale": (2e-2, 5e-3),
+        "trainer.learning_rates.rotation": (4e-3, 1e-3),
+        "trainer.lr_decay": (True, False),
+        "trainer.initial_colours": ("frames", "grey"),
+        "trainer.perceptual": ("auto", "lpips"),
+        "trainer.lpips_net": ("squeeze", "vgg"),
+        "trainer.sparse_lpips": (True, False),
+        "trainer.dssim_weight": (0.2, 0.05),
+        "trainer.dssim_early": (0.1, 0.0),
+        "trainer.stray_share": (0.05, 0.0),
+        "trainer.align_rate": (0.25, 0.0),
+        "trainer.condition_noise": (0.2, 0.0),
     }
 
 
-def test_who_says_how_many_steps_means_them() -> None:
+def test_default_recipe_is_the_defaults_of_the_dataclasses() -> None:
+    assert load_config() == Config() == load_config(["model=hypergaussians"])
+    assert load_config(["experiment=paper", "model.latent_grid=8"]).model.latent_grid == 8
+
+
+def test_iterations_lift_the_limit_of_passes() -> None:
     assert load_config().trainer.passes == 10
     assert load_config(["trainer.iterations=7000"]).trainer.passes is None
     assert load_config(["trainer.iterations=7000", "trainer.passes=3"]).trainer.passes == 3
@@ -121,15 +132,15 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("data.size=big", "data.size=big is not valid: it must be a whole number, or null"),
         ("trainer.iterations=0", "trainer.iterations=0 is out of range: it must be from 1 to 99999999"),
         ("trainer.iterations=99999999999", "trainer.iterations=99999999999 is out of range"),
-        ("trainer.adam_eps=0", "trainer.adam_eps=0 is out of range: it must be from 1e-20 to 1"),
-        ("trainer.adam_eps=tiny", "trainer.adam_eps=tiny is not valid: it must be a number"),
-        ("trainer.mouth_weight=inf", "trainer.mouth_weight=inf is out of range: it must be from 0 to 1000000"),
-        ("trainer.huber_delta=1e400", "trainer.huber_delta=inf is out of range"),
-        (f"trainer.huber_delta={10**400}", "trainer.huber_delta=1e+300 is out of range"),
+        ("model.initial_opacity=0", "model.initial_opacity=0 is out of range: it must be from 1e-06 to 0.999999"),
+        ("model.initial_opacity=low", "model.initial_opacity=low is not valid: it must be a number"),
+        ("trainer.dssim_weight=inf", "trainer.dssim_weight=inf is out of range: it must be from 0 to 1000000"),
+        ("trainer.dssim_weight=1e400", "trainer.dssim_weight=inf is out of range"),
+        (f"trainer.dssim_weight={10**400}", "trainer.dssim_weight=1e+300 is out of range"),
         ("trainer.perceptual=vgg", "trainer.perceptual=vgg is not one of auto, lpips, dssim, none"),
         ("trainer.perceptual=null", "trainer.perceptual=null is not valid: it must be a word"),
-        ("trainer.learning_rates.mlp=-1", "trainer.learning_rates.mlp=-1 is out of range: it must be from 0 to 10"),
-        ("trainer.learning_rates.mlp=nan", "trainer.learning_rates.mlp=nan is out of range"),
+        ("trainer.learning_rates.scale=-1", "trainer.learning_rates.scale=-1 is out of range: it must be from 0 to 10"),
+        ("trainer.learning_rates.scale=nan", "trainer.learning_rates.scale=nan is out of range"),
         ("model.latent_dim=0", "model.latent_dim=0 is out of range"),
         ("data.background=[1,2,3]", "three numbers from 0 to 1"),
         ("data.background=[1,2]", "data.background=[1,2] is not valid: it must be a colour: white, black,"),
@@ -137,6 +148,8 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("data.background=#ff00", "data.background=#ff00 is not valid: it must be a colour"),
         ("data.background=", "data.background= is not valid: it must be a colour"),
         ("data.background=null", "data.background=null is not valid: it must be a colour"),
+        ("preset=fast", "no configuration key 'preset'"),
+        ("experiment=papr", "configs/experiment/ has demo, mlp_256x40, mlp_512x11, paper"),
         ("device=gpu", "device=gpu is not one of auto, cpu, cuda, cuda:N"),
         ("protocol=strict", "no configuration key 'protocol'"),
         ("trainer.learning_rates=1", "no configuration key 'trainer.learning_rates'"),
@@ -149,11 +162,27 @@ def test_a_wrong_override_gets_a_sentence(override: str, message: str) -> None:
     assert message in str(caught.value)
 
 
-def test_no_range_is_without_end() -> None:
-    """What is accepted is what can work: checkpoints are named with eight digits, Adam divides by its epsilon."""
-    assert all(-math.inf < low < high < math.inf for low, high in RANGES.values())
-    numbers = {key for key, value in flatten(load_config().to_dict()).items() if type(value) in (int, float)}
-    assert numbers <= RANGES.keys()
+def declarations(schema: type = Config) -> Iterator[tuple[type, tuple[object, ...]]]:
+    """The type of every key, and what else its annotation says."""
+    for kind in get_type_hints(schema, include_extras=True).values():
+        if is_dataclass(kind):
+            yield from declarations(kind)  # type: ignore[arg-type]
+        else:
+            yield get_args(kind)[0], get_args(kind)[1:]
+
+
+def test_every_number_has_a_range_with_both_ends() -> None:
+    """What is accepted is what can work: checkpoints are named with eight digits."""
+    numbers = [others for kind, others in declarations() if kind in (int, float, int | None)]
+    ranges = [other for others in numbers for other in others if isinstance(other, Range)]
+    assert len(ranges) == len(numbers) > 20
+    assert all(-math.inf < limits.low < limits.high < math.inf for limits in ranges)
+
+
+def test_every_key_says_in_the_help_of_train_what_it_does() -> None:
+    keys, text = declared_keys(), avatar("train", "--help")
+    assert keys.keys() == flatten(load_config().to_dict()).keys() and len(keys) <= 35
+    assert all(meaning and f"{key}: {meaning} (default: " in text for key, meaning in keys.items())
 
 
 @pytest.mark.parametrize(
@@ -178,7 +207,7 @@ def test_a_background_may_be_written_as_people_write_colours(written: str, colou
         ("trainer.iterations=1e3", "trainer.iterations", 1000),
         ("trainer.iterations='5'", "trainer.iterations", 5),
         ("trainer.seed=010", "trainer.seed", 10),
-        ("trainer.lr_final=1", "trainer.lr_final", 1.0),
+        ("trainer.align_rate=1", "trainer.align_rate", 1.0),
         ("data.size=null", "data.size", None),
         ("data.size=~", "data.size", None),
         ("trainer.perceptual=none", "trainer.perceptual", "none"),
@@ -194,6 +223,7 @@ def test_a_value_is_read_as_it_is_meant(override: str, key: str, value: object) 
     [
         (lambda values: values.pop("model"), "the configuration lacks model"),
         (lambda values: values["trainer"].pop("seed"), "the configuration lacks trainer.seed"),
+        (lambda values: values["model"].pop("teeth"), "the configuration lacks model.teeth"),
         (
             lambda values: values["trainer"].update(sed=1),
             "no configuration key 'trainer.sed'; the nearest is 'trainer.se",
@@ -210,28 +240,7 @@ def test_a_recorded_configuration_that_is_damaged_gets_a_sentence(damage, messag
     assert message in str(caught.value)
 
 
-def test_every_key_in_the_yaml_files_has_a_comment() -> None:
-    for file in sorted(config_dir().glob("*/*.yaml")):
-        others = file.parent.name == "model" and file.stem != "hypergaussians"
-        if others or file.parent.name in ("experiment", "preset", "protocol"):
-            continue
-        for line in file.read_text().splitlines():
-            assert line.startswith(("#", "name: hyper")) or " # " in line, f"{file.name}: {line}"
-
-
 def test_a_key_of_any_length_is_answered_in_a_short_sentence() -> None:
     with pytest.raises(UserError) as refused:
         config_from_dict({**asdict(load_config()), "x" * 20_000: 1})
     assert "there is no configuration key 'xxx" in str(refused.value) and len(str(refused.value)) < 300
-
-
-def test_a_configuration_of_an_earlier_version_means_what_it_meant() -> None:
-    values = load_config().to_dict()
-    assert values["trainer"].pop("stray_share") > 0 and values["model"].pop("rigidity")
-    assert values["model"].pop("facing") and values["model"].pop("blur") < 0.3 and values["model"].pop("teeth")
-    earlier = [
-        "trainer.stray_share=0",
-        *(f"model.{key}=false" for key in ("rigidity", "facing", "teeth")),
-        "model.blur=0.3",
-    ]
-    assert config_from_dict(values) == load_config(earlier)

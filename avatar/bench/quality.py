@@ -24,6 +24,7 @@ from avatar.pipeline.open import open_run
 from avatar.render import Renderer
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run
+from avatar.train.step import perceptual_start
 from avatar.types import Frame
 
 
@@ -106,7 +107,7 @@ def time_steps(learners: Sequence[Trainee], repeats: int) -> list[tuple[Time, Ti
 
 def minutes_of(learner: Trainee, step: int, early: Time, late: Time) -> float:
     trainer = learner.config.trainer
-    before = min(step, round(trainer.perceptual_start * trainer.iterations))
+    before = min(step, perceptual_start(trainer))
     return (before * early.median + (step - before) * late.median) / 60_000
 
 

@@ -75,7 +75,7 @@ class Row:
 def run(request: Request) -> None:
     (folder,) = request.inputs
     config = load_config(
-        [*WITH_REFINEMENT, *(QUICK if request.quick else ()), "trainer.preview_every=1000000", *request.overrides]
+        [*WITH_REFINEMENT, *(QUICK if request.quick else ()), "trainer.checkpoint_every=1000000", *request.overrides]
     )
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     rows = measure(source, config, request.out)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
 from typing import Any
 
 from avatar.bench import Request
-from avatar.bench.floor import measured_copy_bandwidth, measured_flops
-from avatar.bench.machine import available_simd
 from avatar.bench.results import leave
 from avatar.bench.splat import Row, all_variants, measure
 from avatar.bench.splat_gpu import ON_GPU, gpu_backends
 from avatar.bench.splat_plot import total, write_plot
-from avatar.bench.splat_work import Work, floors, work_of
+from avatar.bench.splat_work import peak_memory
 from avatar.splat.scenes import HEAD_SPLATS
 
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
@@ -37,23 +36,18 @@ def run(request: Request) -> None:
         variants, repeats, validation_size = all_variants(sizes, counts, all_threads=request.full), 21, 512
     variants = [variant for variant in variants if variant.backend not in is_left_out]
     rows = measure(variants, repeats=repeats, validation_size=validation_size)
-    works = [
-        work_of(*scene, with_memory=not request.quick)
-        for scene in dict.fromkeys((row.variant.count, row.variant.size) for row in rows)
-    ]
-    lines = [*table(rows), *work_table(rows, works), others_line()]
-    leave(request.out, "bench_splat", lines, as_json(rows, works), lambda path: write_plot(rows, path))
+    is_measured = sys.platform == "linux" and not request.quick
+    scenes = dict.fromkeys((row.variant.count, row.variant.size) for row in rows) if is_measured else ()
+    memory = {scene: peak_memory(*scene) for scene in scenes}
+    lines = [*table(rows), *(memory_table(memory) if memory else ()), others_line()]
+    leave(request.out, "bench_splat", lines, as_json(rows, memory), lambda path: write_plot(rows, path))
 
 
-def as_json(rows: Sequence[Row], works: Sequence[Work]) -> dict[str, Any]:
-    """All figures, with the machine that they belong to; milliseconds, bytes, and operations and bytes a second."""
-    threads = sorted({row.variant.threads for row in rows})
+def as_json(rows: Sequence[Row], memory: Mapping[tuple[int, int], int]) -> dict[str, Any]:
+    """All figures; milliseconds and bytes."""
     return {
-        "limits": [
-            {"threads": t, "operations": measured_flops(t), "bytes": measured_copy_bandwidth(t)} for t in threads
-        ],
         "rows": [asdict(row) for row in rows],
-        "work": [asdict(work) | {"floors": {t: floors(work, t) for t in threads}} for work in works],
+        "memory": [{"count": count, "size": size, "bytes": found} for (count, size), found in memory.items()],
         "other_splatters": installed_splatters(),
     }
 
@@ -94,34 +88,7 @@ def table(rows: Iterable[Row]) -> list[str]:
     return lines
 
 
-def work_table(rows: Sequence[Row], works: Sequence[Work]) -> list[str]:
-    """What every scene asks for, and which part of the time of the fastest kernel the machine's own limits explain.
-
-    Pairs are of a splat and a tile: by the exact ellipse, and by a square of three standard deviations.
-    """
-    fastest = available_simd()[-1]
-    best = [row for row in rows if row.variant.simd == fastest and row.variant.has_usual_cutoffs]
-    lines = [
-        "",
-        f"{'splats':>7} {'size':>5} {'pairs':>9} {'by 3 sigma':>10} {'evaluated':>11} {'composited':>11} {'memory MB':>9} "
-        f"{'threads':>7} {'floor ms':>13} {'reached':>13}",
-    ]
-    for work in works:
-        n = work.counters
-        memory = "-" if work.memory is None else f"{work.memory / 1e6:.1f}"
-        for row in (r for r in best if (r.variant.count, r.variant.size) == (work.count, work.size)):
-            limits = floors(work, row.variant.threads)
-            times = row.timing.forward.median, row.timing.backward.median
-            floor_cell = " + ".join(f"{limit:.1f}" for limit in limits)
-            reached = " + ".join(f"{limit / time:.0%}" for limit, time in zip(limits, times, strict=True))
-            lines.append(
-                f"{work.count:7,} {work.size:5} {n['pairs']:9,} {n['pairs_in_squares']:10,} {n['pixels_evaluated']:11,} "
-                f"{n['pixels_composited']:11,} {memory:>9} {row.variant.threads:7} {floor_cell:>13} "
-                f"{reached:>13}"
-            )
-    for threads in sorted({row.variant.threads for row in best}):
-        rates = measured_flops(threads) / 1e9, measured_copy_bandwidth(threads) / 1e9
-        lines.append(
-            f"The floor, threads {threads}: {rates[0]:.1f} GFLOP/s of a matrix product, {rates[1]:.1f} GB/s of a copy"
-        )
-    return lines
+def memory_table(memory: Mapping[tuple[int, int], int]) -> list[str]:
+    """Of a forward and backward pass, whatever the instruction set and the number of threads."""
+    lines = ["", f"{'splats':>7} {'size':>5} {'memory MB':>9}"]
+    return [*lines, *(f"{count:7,} {size:5} {found / 1e6:9.1f}" for (count, size), found in memory.items())]

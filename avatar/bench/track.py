@@ -94,7 +94,7 @@ def run(request: Request) -> None:
         [
             *WITH_REFINEMENT,
             *(() if request.inputs and not request.quick else of_demo),
-            "trainer.preview_every=1000000",
+            "trainer.checkpoint_every=1000000",
             *(("model.uv_size=24", "model.mlp_width=24") if request.quick else ()),
             *request.overrides,
         ]

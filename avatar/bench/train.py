@@ -1,4 +1,4 @@
-"""Time of a training step on a tracked folder, whole and by stage, for every preset: `avatar bench train FOLDER`."""
+"""Time of a training step, whole and by stage, of the paper's recipe and the default one: `avatar bench train FOLDER`."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from avatar.tracking.likeness import Likeness
 from avatar.train.ahead import Guard
 from avatar.train.optim import make_optimizer
 from avatar.train.placed import moving_step
-from avatar.train.step import Judge, Objective, choose_perceptual
+from avatar.train.step import Judge, Objective, choose_perceptual, perceptual_start
 from avatar.train.steps import WARM, Steps
 from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
 
-PRESETS = ("paper", "balanced", "fast", "best")
+RECIPES = {"paper": ("experiment=paper", "data.size=null", "trainer.perceptual=auto"), "default": ()}
 FRAMES = 8  # training frames that take turns; all are decoded before the clock runs
 ONCE_A_FRAME = ("skinning",)  # done once for each frame of a training, not in every step
 QUICK = ("model.uv_size=20", "data.size=48", "model.mlp_width=16")
@@ -40,10 +40,10 @@ QUICK = ("model.uv_size=20", "data.size=48", "model.mlp_width=16")
 
 @dataclass(frozen=True)
 class Row:
-    """One preset. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged. Stages and their
+    """One recipe. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged. Stages and their
     floors are the CPU's: a GPU's step is not cut."""
 
-    preset: str
+    recipe: str
     gaussians: int
     places: int  # at which the network is evaluated
     parameters: int
@@ -75,37 +75,37 @@ class Trainee:
 
 
 def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:
-    """Time all presets in turns on the same frames. Raises UserError as `avatar train` does."""
+    """Time both recipes in turns on the same frames. Raises UserError as `avatar train` does."""
     folder, overrides = request.inputs[0], [*(QUICK if request.quick else ()), *request.overrides]
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     subject, assets = open_subject(source, split_sizes(load_config(overrides)), say)
     trainees = {}
-    for preset in PRESETS:
-        config = load_config([f"preset={preset}", *overrides])
+    for recipe, own in RECIPES.items():
+        config = load_config([*own, *overrides])
         torch.manual_seed(config.trainer.seed)
         avatar = Avatar(assets, subject.identity, config.model)
         with torch.no_grad():  # opacities as after training: what is drawn decides what drawing costs
             avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
         avatar.to(torch.device(request.device))
-        trainees[preset] = trainee(avatar, subject, config, say if preset == PRESETS[0] else silent)
+        trainees[recipe] = trainee(avatar, subject, config, say if recipe == "paper" else silent)
     steps: dict[tuple[str, bool], Callable[[], object]] = {}
-    for preset, learner in trainees.items():
+    for recipe, learner in trainees.items():
         for late in (False, True):
-            steps[preset, late] = lambda learner=learner, late=late: run_steps(learner, late)
+            steps[recipe, late] = lambda learner=learner, late=late: run_steps(learner, late)
     with own_stream(torch.device(request.device)):
         times = paired_medians(steps, repeats, warm_up=WARM + 1)
     return [
         Row(
-            preset,
+            recipe,
             len(learner.avatar),
             len(learner.avatar.code),
             sum(p.numel() for p in learner.avatar.parameters()),
-            times[preset, False],
-            per_step(times[preset, True], steps_at_once(learner)),
+            times[recipe, False],
+            per_step(times[recipe, True], steps_at_once(learner)),
             {} if on_gpu(learner.avatar.code) else stages(learner, subject, repeats),
             {} if on_gpu(learner.avatar.code) else floors(learner.avatar),
         )
-        for preset, learner in trainees.items()
+        for recipe, learner in trainees.items()
     ]
 
 
@@ -133,7 +133,7 @@ def trainee(
 
 
 def silent(_: str) -> None:
-    """What was said for the first preset holds for the others."""
+    """What was said for one recipe holds for the other."""
 
 
 def steps_at_once(learner: Trainee) -> int:
@@ -151,7 +151,7 @@ def run_steps(learner: Trainee, late: bool) -> None:
             learner.step(number)
     else:
         moves = learner.config.trainer.align_rate > 0
-        learner.step(round(learner.config.trainer.perceptual_start * iterations) - 1, moves)
+        learner.step(perceptual_start(learner.config.trainer) - 1, moves)
     settle(learner.avatar.code.device)
 
 
@@ -197,8 +197,8 @@ def floors(avatar: Avatar) -> dict[str, float]:
 
 
 def share_of_faithful(rows: Sequence[Row]) -> dict[str, float]:
-    """How many times faster each preset's late step is than the first row's."""
-    return {row.preset: rows[0].late.median / row.late.median for row in rows}
+    """How many times faster each recipe's late step is than the first row's."""
+    return {row.recipe: rows[0].late.median / row.late.median for row in rows}
 
 
 def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:

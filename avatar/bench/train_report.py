@@ -27,21 +27,21 @@ def run(request: Request) -> None:
 def table(rows: Sequence[Row]) -> list[str]:
     """Milliseconds of a step as median (95th percentile), then of the stages of a step with the perceptual term."""
     lines = [
-        f"{'preset':>9} {'Gaussians':>9} {'network at':>10} {'parameters':>10} {'ms, first half':>17} "
+        f"{'recipe':>9} {'Gaussians':>9} {'network at':>10} {'parameters':>10} {'ms, first half':>17} "
         f"{'ms, second half':>17} {'faster':>7}"
     ]
     faster = share_of_faithful(rows)
     for row in rows:
         early, late = (f"{time.median:.1f} ({time.p95:.1f})" for time in (row.early, row.late))
         lines.append(
-            f"{row.preset:>9} {row.gaussians:9,} {row.places:10,} {row.parameters:10,} {early:>17} {late:>17} "
-            f"{faster[row.preset]:6.1f}x"
+            f"{row.recipe:>9} {row.gaussians:9,} {row.places:10,} {row.parameters:10,} {early:>17} {late:>17} "
+            f"{faster[row.recipe]:6.1f}x"
         )
     names = stage_names(rows)
     if not names:
         return lines
     heading = "stage: forward / backward (floor)"
-    lines += ["", f"{heading:>40} {''.join(f'{row.preset:>24}' for row in rows)}"]
+    lines += ["", f"{heading:>40} {''.join(f'{row.recipe:>24}' for row in rows)}"]
     for name in names:
         lines.append(f"{name:>40} {''.join(f'{stage_cell(row, name):>24}' for row in rows)}")
     lines.append(f"{'sum without ' + ', '.join(ONCE_A_FRAME):>40} {''.join(f'{stage_sum(row):24.1f}' for row in rows)}")
@@ -67,17 +67,17 @@ def stage_sum(row: Row) -> float:
 
 
 def write_plot(rows: Sequence[Row], path: Path) -> None:
-    """One bar a preset, stacked by stage."""
+    """One bar a recipe, stacked by stage."""
     figure = new_figure(9, 3.6)
     axes = figure.subplots()
-    left = {row.preset: 0.0 for row in rows}
+    left = {row.recipe: 0.0 for row in rows}
     for index, name in enumerate(name for name in stage_names(rows) if name not in ONCE_A_FRAME):
         for row in rows:
             width = sum(row.stages[key].median for key in (name, f"{name}, backward") if key in row.stages)
-            axes.barh(row.preset, width, left=left[row.preset], color=f"C{index % 10}", label=name)
-            left[row.preset] += width
+            axes.barh(row.recipe, width, left=left[row.recipe], color=f"C{index % 10}", label=name)
+            left[row.recipe] += width
     if not stage_names(rows):
-        axes.barh([row.preset for row in rows], [row.late.median for row in rows], label="second half")
+        axes.barh([row.recipe for row in rows], [row.late.median for row in rows], label="second half")
     handles, labels = axes.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     axes.legend(unique.values(), unique.keys(), fontsize=8, ncols=2)

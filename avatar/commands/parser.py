@@ -17,7 +17,17 @@ from avatar.commands.options import (
     add_token,
     add_tracking,
 )
+from avatar.config import Config, declared_keys, flatten
+from avatar.config_values import shown
 from avatar.version import __version__
+
+
+def list_keys() -> str:
+    """A line for each configuration key: what it does and its default."""
+    defaults = flatten(Config().to_dict())
+    return "\n".join(
+        f"  {key}: {meaning} (default: {shown(defaults[key])})" for key, meaning in declared_keys().items()
+    )
 
 
 def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
@@ -70,7 +80,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     add_folder(train)
     train.add_argument("--out", type=Path, metavar="RUN", help="where the run goes (default: runs/NAME)")
     train.add_argument("--size", type=int, help="width of the training images in pixels (default: the video's)")
-    train.add_argument("--iterations", type=int, help="optimizer steps (default: the preset's)")
+    train.add_argument("--iterations", type=int, help="optimizer steps (default: the recipe's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on with RUN from its newest checkpoint")
     train.add_argument(
@@ -83,7 +93,10 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
         help="with --refine: about what all of it may take, tracking included, by fewer steps",
     )
     add_device(train, "the configuration's, auto")
-    train.add_argument_group("configuration", "key=value, such as model=flashavatar or trainer.iterations=3000")
+    train.formatter_class = argparse.RawDescriptionHelpFormatter  # for the lines of the keys
+    train.add_argument_group(
+        "configuration", f"model=NAME, experiment=NAME, or KEY=VALUE of these keys:\n{list_keys()}"
+    )
 
     evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
     add_run(evaluate)

@@ -11,7 +11,8 @@ from avatar.data.shelf import Shelf
 from avatar.data.subject import FramePixels, Subject
 from avatar.types import Frame
 
-DEFAULT_CACHE_BYTES = 2**30
+CACHE_BYTES = 2**30  # for decoded frames; what does not fit is decoded again
+WORKERS = 1  # threads that decode frames ahead of the training step
 BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
 FRAMES_AHEAD = 3  # of every worker
 
@@ -33,8 +34,8 @@ class FrameLoader:
         self,
         subject: Subject,
         size: int | None = None,
-        cache_bytes: int = DEFAULT_CACHE_BYTES,
-        workers: int = 2,
+        cache_bytes: int = CACHE_BYTES,
+        workers: int = WORKERS,
         shelf: Shelf | None = None,
     ) -> None:
         if workers < 1:

@@ -182,7 +182,7 @@ def measure(
     known = {drive: conditions(run.avatar.head, recording, order) for drive, recording in recordings.items()}
     results: Measured = {drive: {protocol.name: [] for protocol in protocols} for drive in recordings}
     jitter = {(drive, protocol.look): JitterMeter() for drive in recordings for protocol in protocols}
-    with FrameLoader(subject, data.size, data.cache_mb << 20, data.workers) as loader:
+    with FrameLoader(subject, data.size) as loader:
         for frame in tqdm(loader.frames(order), total=len(order), desc="eval", unit="frame", disable=None):
             wanted = [protocol for protocol in protocols if frame.index in indices[protocol.name]]
             masks = region_masks(frame, run.avatar.head, {"head", *(r for p in wanted for r in p.regions)})

@@ -1,6 +1,6 @@
 """The avatar as browsers read it: a gzip file of a JSON header and arrays, quantised where the picture does not mind.
 
-    bytes 0-3    "AVW3"; "AVW2" before there were `blur` and `facing`, "AVW1" before there was `rigidity`
+    bytes 0-3    "AVW3"
     bytes 4-7    length of the header, uint32, little-endian like everything
     header       JSON: sizes, arrays (type, offset, length, columns, scales), motion, camera, names
     arrays       each at a multiple of 4 bytes

@@ -59,8 +59,6 @@ def composite(
     transmittances,
     stops,
     chunks,
-    composited,
-    COUNT: tl.constexpr,
     TILE: tl.constexpr,
     CHUNK: tl.constexpr,
     STEP: tl.constexpr,
@@ -68,8 +66,8 @@ def composite(
     """Draw the pixels of the region [left, right) x [top, bottom); see `bin` for records, begins and ends.
 
     image float32 [H, W, 3], alphas and transmittances [H, W], stops int32 [H, W]: the pair of the tile's list from which on
-    the pixel shows none;  chunks int32 [tiles]: of STEP pairs, that were looked at;  composited int32 [stride], with
-    COUNT: pixels that show the pair. Everything drawn is NaN where the pairs exceed the capacity.
+    the pixel shows none;  chunks int32 [tiles]: of STEP pairs, that were looked at. Everything drawn is NaN where the pairs
+    exceed the capacity.
     """
     tile = tl.program_id(0)
     column, row, pixel, inside = tile_pixels(tile, width, first_x, first_y, across, left, top, right, bottom, TILE)
@@ -96,8 +94,6 @@ def composite(
         red += tl.sum(weight * tl.load(records + 6 * stride + at)[:, None], 0)
         green += tl.sum(weight * tl.load(records + 7 * stride + at)[:, None], 0)
         blue += tl.sum(weight * tl.load(records + 8 * stride + at)[:, None], 0)
-        if COUNT:
-            tl.store(composited + at, tl.sum(drawn.to(tl.int32), 1), mask=done + k < pairs)
         transmittance = tl.min(tl.where(enough, after, transmittance[None, :]), 0)
         reached = done + tl.sum(enough.to(tl.int32), 0)
         stop = tl.where((reached < done + STEP) & (done < stop), reached, stop)

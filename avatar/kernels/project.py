@@ -30,8 +30,6 @@ from avatar.kernels.rows import load3
 REACH_MARGIN = tl.constexpr(1e-4)  # in log2 of alpha; far above float rounding there
 # A count that no capacity holds: a value that is not finite makes the image NaN as too many pairs do.
 POISON = tl.constexpr(1 << 30)
-# Why a Gaussian is not drawn, or that it is; in the order of `avatar.splat.counters.Counters`.
-TRANSPARENT, CLOSE, FLAT, OUTSIDE, VISIBLE = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2), tl.constexpr(3), 4
 
 
 @triton.jit
@@ -69,11 +67,8 @@ def project(
     ellipses,
     looks,
     boxes,
-    visibility,
     STORED: tl.constexpr,
     ANTIALIASED: tl.constexpr,
-    EVERYWHERE: tl.constexpr,
-    COUNT: tl.constexpr,
     TILE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -84,7 +79,6 @@ def project(
                is opacity * 2^-(u^2 + v^2)
     looks      float32 [5, N]: opacity, reach (alpha can reach alpha_min where u^2 + v^2 <= reach only), red, green, blue
     boxes      int32 [4, N]: first tile across and down, tiles across, tiles in all
-    visibility int8 [N], with COUNT
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -135,10 +129,8 @@ def project(
     a = root * WHITENING / root_det
     b = -xy * WHITENING / (root * root_det)
     c = WHITENING / root
-    reach = tl.full([BLOCK], float("inf"), tl.float32)
-    if not EVERYWHERE:
-        ratio = tl.where(drawn, opacity, 1.0) / alpha_min  # infinite for an alpha_min of 0
-        reach = tl.where(alpha_min > 0.0, tl.log2(ratio) + REACH_MARGIN, reach)
+    ratio = tl.where(drawn, opacity, 1.0) / alpha_min  # infinite for an alpha_min of 0
+    reach = tl.where(alpha_min > 0.0, tl.log2(ratio) + REACH_MARGIN, tl.full([BLOCK], float("inf"), tl.float32))
     bounded = reach < float("inf")
     size = tl.sqrt(tl.where(bounded, reach, 0.0).to(tl.float64)) / WHITENING
     half_x, half_y = size * tl.sqrt(tl.where(drawn, xx, 0.0)), size * tl.sqrt(tl.where(drawn, yy, 0.0))
@@ -166,8 +158,3 @@ def project(
     tl.store(boxes + count + i, tile_y, mask=here)
     tl.store(boxes + 2 * count + i, tiles_x, mask=here)
     tl.store(boxes + 3 * count + i, tl.where(poisoned, POISON, tiles), mask=here)
-    if COUNT:
-        reason = tl.where(tiles > 0, VISIBLE, OUTSIDE)
-        reason = tl.where(solid, reason, FLAT)
-        reason = tl.where(in_front, reason, CLOSE)
-        tl.store(visibility + i, tl.where(transparent, TRANSPARENT, reason).to(tl.int8), mask=here)

@@ -38,7 +38,7 @@ def source_of(arguments: Namespace) -> Source:
 
 
 def split_sizes(config: Config) -> SplitSizes:
-    return SplitSizes(config.data.train_frames, config.data.test_frames)
+    return SplitSizes(test=config.data.test_frames)
 
 
 def open_run(

@@ -33,7 +33,6 @@ LEAST_STEPS = 500  # fewer make no avatar
 # tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own; but no fewer than
 # these, where the run takes as many: what is still blurred tells little, however often it has seen a few frames.
 FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.25, 1000
-EARLIER_SHARE = 0.4  # in plans that do not say it
 PLANNED_SHARE = 0.97  # of the minutes: the rest is for opening and closing the run itself, which nothing before shows
 
 
@@ -76,9 +75,9 @@ class Plan:
             raise UserError(f"{path} was written by another version of this program; start a new run")
         try:
             rounds, iterations = _whole(raw["rounds"]), _whole(raw["iterations"])
-            in_rounds = _whole(raw.get("round_iterations", round(EARLIER_SHARE * iterations)))
+            in_rounds = _whole(raw["round_iterations"])
             minutes = None if raw["minutes"] is None else parse_number(raw["minutes"], "minutes")
-            spent = parse_number(raw.get("spent", 0.0), "spent")
+            spent = parse_number(raw["spent"], "spent")
             overrides = raw["overrides"]
             if not isinstance(overrides, list) or not all(isinstance(override, str) for override in overrides):
                 raise ValueError("overrides are no list of texts")

@@ -95,7 +95,7 @@ def reenact(
     if choices.camera == "driver" and choices.intrinsics == "driver":
         warn_of_other_intrinsics(cameras[0], own, say)
     renders = (rendering.image for rendering in trained.stream(zip(moved, cameras, strict=True)))
-    loader = FrameLoader(driver, data.size, data.cache_mb << 20, data.workers) if isinstance(driver, Subject) else None
+    loader = FrameLoader(driver, data.size) if isinstance(driver, Subject) else None
     with loader or nullcontext():
         pictures = (frame.image for frame in loader.frames(range(len(drive)))) if loader else None
         frames = panels(renders, pictures, trained.name, distances.tolist())

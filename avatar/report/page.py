@@ -1,4 +1,4 @@
-"""RUN/report.html: figures, curves, held-out frames, uncertainty and configuration of a run in one file."""
+"""RUN/report.html: figures, curves, held-out frames and configuration of a run in one file."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from avatar.evaluation.evaluate import RESULTS_FORMAT
 from avatar.evaluation.tracked import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there, read_bytes, read_json
-from avatar.html import Markup, data_table, document, element, figure_of, fold, join, picture, plot, section, tiles
+from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
-from avatar.report.pictures import frame_panels, uncertainty_map
+from avatar.report.pictures import frame_panels
 from avatar.runs.run import Run, versions
 
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
@@ -59,7 +59,6 @@ def render_report(run: Run) -> str:
         section("Held-out figures", *_figures(run, results)),
         section("Held-out frames", *_frames(run)),
         section("Training", *_curves(run.path / "tensorboard")),
-        *_uncertainty(run),
         section("Origin", *_origin(run, results)),
     ]
     return document(f"Run {run.path.name}", parts, SCRIPT)
@@ -204,17 +203,6 @@ def read_curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
         points = [(point.step, point.value) for point in events.Scalars(tag)]
         curves[tag] = points[:: max(1, -(-len(points) // MAX_POINTS))]
     return curves
-
-
-def _uncertainty(run: Run) -> list[Markup]:
-    image = uncertainty_map(run)
-    if image is None:
-        return []
-    caption = (
-        "sigmoid(2.5 u) of each Gaussian on the UV map: bright is a large conditional variance; half-way at the start. It "
-        "does not predict the error (docs/method.md)"
-    )
-    return [section("Uncertainty", element("div", picture(image, caption, format="png"), class_="gallery wide"))]
 
 
 def _origin(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:

@@ -9,7 +9,7 @@ import math
 
 from avatar.compute.memory import Need
 from avatar.config import Config, ModelConfig
-from avatar.data.loader import BYTES_PER_PIXEL, FRAMES_AHEAD
+from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES, FRAMES_AHEAD, WORKERS
 from avatar.errors import UserError
 from avatar.gaussians.covariance import triangle_size
 from avatar.gaussians.encoding import encoded_size
@@ -18,7 +18,7 @@ from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.teeth import with_teeth
-from avatar.model import CONDITION_EXTRAS, WITH_LATENTS
+from avatar.model import CONDITION_EXTRAS, SH_DEGREE, WITH_LATENTS
 
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
 
@@ -51,14 +51,14 @@ def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
 def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) -> Shapes:
     """The shape of every tensor in the state dict of the `Avatar` that this makes."""
     N, n, width = gaussians, config.latent_dim, config.mlp_width
-    inputs = encoded_size(config.frequencies) + assets.num_expressions + CONDITION_EXTRAS
+    inputs = encoded_size() + assets.num_expressions + CONDITION_EXTRAS
     inputs += VALUES if config.facing else 0
     shapes: Shapes = {
         "log_scales": (N, 3),
         "quats": (N, 4),
         "opacity_logits": (N,),
         "sh_dc": (N, 1, 3),
-        "sh_rest": (N, (config.sh_degree + 1) ** 2 - 1, 3),
+        "sh_rest": (N, (SH_DEGREE + 1) ** 2 - 1, 3),
     }
     layers = [("input", inputs, width), *((f"hidden.{i}", width, width) for i in range(config.mlp_layers - 1))]
     if config.name != "splattingavatar":
@@ -94,13 +94,13 @@ def training_needs(
     model, pixels = config.model, size[0] * size[1]
     gaussians = count_gaussians(model, assets)
     shapes = parameter_shapes(model, assets, gaussians)
-    cached = min(config.data.cache_mb << 20, frames * pixels * BYTES_PER_PIXEL)
-    ahead = config.data.workers * FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
+    cached = min(CACHE_BYTES, frames * pixels * BYTES_PER_PIXEL)
+    ahead = WORKERS * FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
     lasting = [
-        Need("the cache of decoded frames", cached, "data.cache_mb"),
+        Need("the cache of decoded frames", cached, "--size"),
         Need("a frame and its losses", ahead + pixels * PIXEL_BYTES.get(perceptual, PIXEL_BYTES["dssim"]), "--size"),
     ]
-    layers = encoded_size(model.frequencies) + (model.mlp_layers + 2) * model.mlp_width
+    layers = encoded_size() + (model.mlp_layers + 2) * model.mlp_width
     step = [
         *parameter_needs(shapes, STEP_COPIES),
         Need(
@@ -121,7 +121,7 @@ def drawing_needs(config: ModelConfig, assets: HeadAssets, gaussians: int) -> li
     """What opening a trained avatar and drawing it takes."""
     shapes = parameter_shapes(config, assets, gaussians)
     # The first layer's, and two that are filled in turn.
-    layers = encoded_size(config.frequencies) + 3 * config.mlp_width
+    layers = encoded_size() + 3 * config.mlp_width
     return [
         *parameter_needs(shapes, DRAWING_COPIES, UNPACKING_COPIES),
         Need("the network's layers at every place", FLOAT * places(config, gaussians) * layers, "model.mlp_width"),

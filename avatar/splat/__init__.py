@@ -11,15 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
-from avatar.splat.counters import Counters
-from avatar.splat.cpu import CannotDraw, count_cpu, splat_cpu
+from avatar.splat.cpu import CannotDraw, splat_cpu
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["CannotDraw", "Counters", "counters", "splat"]
+__all__ = ["CannotDraw", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
@@ -102,21 +101,6 @@ def splat(
 
         return splat_gpu(gaussians, camera, background, **options)
     return splat_cpu(gaussians, camera, background, **options)
-
-
-def counters(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Counters:
-    """What the "cpu" or "gpu" backend does and skips to draw `splat(gaussians, camera, background, **options)`.
-
-    The scene is drawn once more to be counted; drawing without counting costs nothing for it.
-    """
-    backend = options.get("backend") or _backend_for(gaussians.means)
-    given = {**(splat.__kwdefaults__ or {}), **options, "backend": backend}
-    checked = _checked_options(gaussians, camera, background, **given)
-    if backend == "gpu":
-        from avatar.splat.gpu_counters import count_gpu
-
-        return count_gpu(gaussians, camera, background, **checked)[1]
-    return count_cpu(gaussians, camera, background, **checked)[1]
 
 
 def _backend_for(tensor: Any) -> str:

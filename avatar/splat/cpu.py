@@ -11,7 +11,6 @@ from torch.autograd.function import once_differentiable
 
 from avatar import _core
 from avatar.compute.native import instruction_set, thread_count
-from avatar.splat.counters import Counters
 from avatar.splat.pose import pose_of
 from avatar.splat.region import Region
 from avatar.tensors import describe_non_finite
@@ -27,18 +26,6 @@ def splat_cpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 
     size, pose = (camera.height, camera.width), pose_of(camera, gaussians.means.device)
     image, alpha = _Splat.apply(*gaussians, background, pose, size, _settings(camera, **options))  # pyright: ignore
     return Rendering(image, alpha)
-
-
-def count_cpu(
-    gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], *, everywhere: bool = False, **options: Any
-) -> tuple[Rendering, Counters]:
-    """Draw without a gradient, and count. `everywhere` looks for every splat at every pixel: the same bits, slowly."""
-    tensors = Gaussians(*(t.detach().contiguous() for t in gaussians))
-    size = camera.height, camera.width
-    counts = torch.empty(len(Counters._fields), dtype=torch.int64)
-    settings = {**_settings(camera, **options), "counts": counts, "everywhere": everywhere}
-    image, alpha, _ = _draw(tensors, background.detach(), size, settings)
-    return Rendering(image, alpha), Counters(*counts.tolist())
 
 
 def _settings(

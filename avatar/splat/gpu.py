@@ -78,7 +78,7 @@ class _Splat(torch.autograd.Function):
         if len(gaussians.means) == 0:
             image = background.repeat(settings.height, settings.width, 1)
             return image, torch.zeros_like(image[..., 0])
-        (image, alpha), ctx.drawing, _ = draw(gaussians, pose, background, settings)
+        (image, alpha), ctx.drawing = draw(gaussians, pose, background, settings)
         return image, alpha
 
     @staticmethod

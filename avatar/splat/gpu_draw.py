@@ -58,7 +58,6 @@ class Settings(NamedTuple):
     alpha_max: float
     t_min: float
     antialiased: bool
-    everywhere: bool = False  # for tests: look for every splat at every pixel, as if nothing were known of its extent
 
     @property
     def is_whole(self) -> bool:
@@ -99,23 +98,9 @@ class Drawing(NamedTuple):
     chunks: Int[Tensor, " tiles"]
 
 
-class Counted(NamedTuple):
-    """What a drawing that counts finds besides."""
-
-    visibility: Int[Tensor, " N"]
-    ellipses: Float[Tensor, "5 N"]
-    looks: Float[Tensor, "5 N"]
-    composited: Int[Tensor, " stride"]
-
-
 def draw(
-    gaussians: Gaussians,
-    pose: Float[Tensor, " 12"],
-    background: Float[Tensor, " 3"],
-    settings: Settings,
-    *,
-    count: bool = False,
-) -> tuple[Rendering, Drawing, Counted]:
+    gaussians: Gaussians, pose: Float[Tensor, " 12"], background: Float[Tensor, " 3"], settings: Settings
+) -> tuple[Rendering, Drawing]:
     """Draw contiguous tensors of at least one Gaussian, seen from `pose` (float64, see avatar.splat.pose)."""
     device, tuning, s = gaussians.means.device, TUNING, settings
     N, stored = len(gaussians.means), gaussians.sh.shape[1]
@@ -126,17 +111,14 @@ def draw(
 
     depths, ellipses = empty(N, dtype=torch.float64), empty(5, N, dtype=torch.float64)
     looks, boxes = empty(5, N), empty(4, N, dtype=torch.int32)
-    visibility = empty(N, dtype=torch.int8) if count else boxes  # not written without COUNT
     start(
         project,
         programs(N, tuning.lanes),
         *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree, N, s.width, s.height, *grid),
-        *(depths, ellipses, looks, boxes, visibility),
+        *(depths, ellipses, looks, boxes),
         warps=warps,
         STORED=stored,
         ANTIALIASED=s.antialiased,
-        EVERYWHERE=s.everywhere,
-        COUNT=count,
         TILE=tuning.tile,
         BLOCK=tuning.lanes,
     )
@@ -180,15 +162,13 @@ def draw(
         image, alphas = background.repeat(*size, 1), torch.zeros(size, device=device)
         transmittances = torch.ones(size, device=device)
     stops, chunks = empty(*size, dtype=torch.int32), empty(grid.tiles, dtype=torch.int32)
-    composited = torch.zeros(stride, dtype=torch.int32, device=device) if count else stops  # not written without COUNT
     start(
         composite,
         grid.tiles,
         *(records, begins, ends, background, s.alpha_min, s.alpha_max, s.t_min, N, capacity, stride),
         *(s.width, *grid.place, *s.region),
-        *(image, alphas, transmittances, stops, chunks, composited),
+        *(image, alphas, transmittances, stops, chunks),
         warps=tuning.warps,
-        COUNT=count,
         TILE=tuning.tile,
         CHUNK=tuning.chunk,
         STEP=tuning.step,
@@ -196,7 +176,7 @@ def draw(
     CAPACITIES.watch(kind, ends)
     lists = (order, ends, boxes, begins, records, places)
     drawing = Drawing(tuning, grid, capacity, *lists, transmittances, stops, chunks)
-    return Rendering(image, alphas), drawing, Counted(visibility, ellipses, looks, composited)
+    return Rendering(image, alphas), drawing
 
 
 def programs(items: int, each: int) -> int:

@@ -2,7 +2,7 @@
 
 subjects: [../anna, {folder: ../carla, head: ../head_model, frame_offset: 1}]
 head: ../head_model                            # of subjects that name none
-variants: {n8: [], n32: [model.latent_dim=32]} # or `product: {model.latent_dim: [8, 32], trainer.passes: [5, 10]}`
+variants: {n8: [], n32: [model.latent_dim=32]} # or `product: {model.latent_dim: [8, 32], experiment: [demo, paper]}`
 overrides: [data.size=256]                     # of every job
 seeds: [0, 1, 2]
 protocols: [hypergaussians]                    # none: all of them

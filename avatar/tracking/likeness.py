@@ -21,7 +21,7 @@ from torch.nn.functional import huber_loss, normalize
 from avatar.compute.device import brought, on_gpu
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
-from avatar.model import Avatar
+from avatar.model import SH_DEGREE, Avatar
 from avatar.splat.sh import C0, sh_colours
 from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.types import Camera, Frame, Gaussians, HeadParams
@@ -157,7 +157,7 @@ class Likeness:
         drawn = gaussians._replace(means=gaussians.means.view_as(gaussians.means), quats=quats)
         camera = HeadPose(*(part.detach() for part in pose))
         seen_from = eye.detach().requires_grad_()
-        colours = sh_colours(gaussians.sh, normalize(gaussians.means - seen_from, dim=-1), self.avatar.config.sh_degree)
+        colours = sh_colours(gaussians.sh, normalize(gaussians.means - seen_from, dim=-1), SH_DEGREE)
         flat = ((colours - 0.5) / C0)[:, None]
         picture = self._draw(drawn, camera, flat, target)
         error = misfit(picture, target)
@@ -181,7 +181,7 @@ class Likeness:
         """Moves the head before the target's own camera, which has the given pose: a GPU would have to hand a moved camera
         back. Differentiable by autograd alone."""
         directions = gaussians.means + (pose.R.T @ pose.t)
-        moved = before_camera(gaussians, values[TURN], pose, given, directions, self.avatar.config.sh_degree)
+        moved = before_camera(gaussians, values[TURN], pose, given, directions, SH_DEGREE)
         return self._drawn(moved, target.camera, target)
 
     def _draw(self, gaussians: Gaussians, pose: HeadPose, sh: Tensor, target: Target) -> Float[Tensor, "h w 3"]:

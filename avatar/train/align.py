@@ -57,10 +57,9 @@ def make_alignment(
 ) -> Alignment | None:
     """For a run that begins, or goes on from the tensors of a checkpoint; None where it moves no tracking.
 
-    Neither does one whose checkpoint knows of no moves: an earlier version began it, on a GPU. Raises UserError for tensors
-    that are not of these frames.
+    Raises UserError for tensors that are not of these frames.
     """
-    if config.trainer.align_rate == 0 or (saved is not None and f"{_PREFIX}moves" not in saved):
+    if config.trainer.align_rate == 0:
         return None
     alignment = Alignment(avatar, subject, config)
     if saved is not None:
@@ -175,7 +174,7 @@ class Alignment:
 
     def placed(self, step: int, frame: Frame, row: Row) -> Seen:
         """The frame where `row` has it, in a step with the colours of step `step`."""
-        degree = sh_degree(step, self._trainer, self._likeness.avatar.config.sh_degree)
+        degree = sh_degree(step)
         values = self._freedom_of(row).values(0, row.moves)
         placed = place(frame, values, HeadPose(row.R, row.t), self._likeness.centre, degree)
         return Seen(placed.frame, self._likeness.vertices(placed.frame.params), placed, row)
@@ -261,7 +260,7 @@ class Alignment:
 
     def _measure(self, step: int, loader: FrameLoader) -> None:
         self.measured += 1
-        mean = self._inquiry.curvature(step, loader, self._moves, SAMPLES, self._trainer.mouth_weight)
+        mean = self._inquiry.curvature(step, loader, self._moves, SAMPLES)
         if mean is None:
             self._is_over = True
             return

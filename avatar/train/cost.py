@@ -12,14 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.config import Config, TrainerConfig
-from avatar.data.loader import BYTES_PER_PIXEL
+from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.tracking.likeness import Likeness
 from avatar.train.align import MOVING_SHARE
 from avatar.train.optim import make_optimizer
 from avatar.train.placed import moving_step
-from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.train.step import Objective, choose_perceptual, perceptual_start, training_step
 from avatar.types import Frame
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
@@ -32,7 +32,7 @@ class Cost:
     parameters: int
     step_seconds: float  # on this machine, the mean over the run; of each kind of step the median
     iterations: int
-    cache_bytes: int  # decoded frames, at most what the configuration allows
+    cache_bytes: int  # decoded frames that are kept
     parameter_bytes: int  # with gradients and the optimizer's state
 
     def facts(self) -> dict[str, str]:
@@ -83,7 +83,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
         parameters=parameters,
         step_seconds=total / config.trainer.iterations,
         iterations=config.trainer.iterations,
-        cache_bytes=min(width * height * BYTES_PER_PIXEL * frames, config.data.cache_mb << 20),
+        cache_bytes=min(width * height * BYTES_PER_PIXEL * frames, CACHE_BYTES),
         parameter_bytes=4 * _COPIES * parameters,
     )
 
@@ -91,7 +91,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
 def kinds_of_steps(trainer: TrainerConfig, every: int) -> list[tuple[int, int]]:
     """How many steps of a run are alike in what their loss takes, and the last one of them: before the perceptual term,
     with it, which every so many-th step is, and between those."""
-    start = round(trainer.perceptual_start * trainer.iterations)
+    start = perceptual_start(trainer)
     late = trainer.iterations - start
     with_term = math.ceil(late / every)
     last_with_term = start + (with_term - 1) * every

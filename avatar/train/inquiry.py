@@ -13,6 +13,7 @@ from torch import Tensor
 from avatar.compute.device import brought, on_gpu
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
+from avatar.losses.photometric import MOUTH_WEIGHT
 from avatar.splat import CannotDraw
 from avatar.tracking.descent import Problem, curvature
 from avatar.tracking.freedom import Freedom
@@ -36,7 +37,7 @@ class Inquiry:
     freedom: Freedom
 
     def curvature(
-        self, step: int, loader: FrameLoader, moves: Float[Tensor, "T F"], frames: int, mouth_weight: float
+        self, step: int, loader: FrameLoader, moves: Float[Tensor, "T F"], frames: int
     ) -> Float[Tensor, "F F"] | None:
         """The mean curvature of so many frames' misfits, by pictures that are no larger than they need be; None where none
         of them shows a head."""
@@ -44,7 +45,7 @@ class Inquiry:
         def measured(frame: Frame, problem: Problem) -> Tensor:
             coarsest = problem.targets[-1]
             mouth = resized(frame.mouth_mask, coarsest.camera.width, coarsest.camera.height)[coarsest.box]
-            weight = brought(1.0 + mouth_weight * mouth, moves.device)
+            weight = brought(1.0 + MOUTH_WEIGHT * mouth, moves.device)
             return curvature(self.likeness, problem, len(problem.targets) - 1, moves[frame.index], weight)
 
         found = self._of_frames(step, loader, frames, moves, measured)

@@ -21,15 +21,15 @@ from avatar.losses.photometric import PhotometricLoss
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
+LOG_EVERY = 10  # steps between points of the training curves
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
 
 
 class TrainingLog:
     """Writes RUN/tensorboard and RUN/previews; a context manager, so that an interruption still closes its files."""
 
-    def __init__(self, run: Path, start: int, stop: int, every: int) -> None:
+    def __init__(self, run: Path, start: int, stop: int) -> None:
         self._previews = run / "previews"
-        self._every = every
         self._writer = _open_writer(run / "tensorboard", start)
         self._bar = tqdm(total=stop, initial=start, unit="step", desc="train", dynamic_ncols=True)
         self._loss = self._psnr = math.nan
@@ -54,14 +54,14 @@ class TrainingLog:
 
     def shows(self, step: int) -> bool:
         """Whether the curves have a point at `step`."""
-        return step % self._every == 0
+        return step % LOG_EVERY == 0
 
     def note(self, step: int, total: float, terms: Mapping[str, float], quality: float) -> None:
         """Record the numbers of a step; all but the total count at those steps only that the curves show."""
         self._loss = smoothed(self._loss, total, 1)
         self._bar.update(1)
         if self.shows(step):
-            self._psnr = smoothed(self._psnr, quality, self._every)
+            self._psnr = smoothed(self._psnr, quality, LOG_EVERY)
             if self._writer is not None:
                 for name, term in terms.items():
                     self._writer.add_scalar(f"loss/{name}", term, step)

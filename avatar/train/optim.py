@@ -14,6 +14,13 @@ from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.model import Avatar
 
+OPACITY_RATE = 0.05  # of the logits of opacity and of rigidity
+NETWORK_RATE = 1e-4  # of the deformation network
+HYPER_RATE = 1e-4  # of the HyperGaussian heads, and of learned places on the mesh (metres)
+EPSILON = 1e-15  # Adam's
+WARM_UP = 20  # steps
+FINAL_SHARE = 0.05  # of the learning rates, at the last step
+
 
 def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     """Adam with the paper's groups: colour, opacity, scale, rotation, deformation network, HyperGaussian heads."""
@@ -22,21 +29,21 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     groups: list[dict[str, Any]] = [
         {"params": [avatar.sh_dc], "lr": rates.sh_dc},
         {"params": [avatar.sh_rest], "lr": rates.sh_rest},
-        {"params": logits, "lr": rates.opacity},
+        {"params": logits, "lr": OPACITY_RATE},
         {"params": [avatar.log_scales], "lr": rates.scale},
         {"params": [avatar.quats], "lr": rates.rotation},
     ]
     if avatar.deformation is not None:
-        groups.append({"params": list(avatar.deformation.parameters()), "lr": rates.mlp})
+        groups.append({"params": list(avatar.deformation.parameters()), "lr": NETWORK_RATE})
     if avatar.mesh_points is not None and avatar.mesh_points.place.requires_grad:
-        groups.append({"params": [avatar.mesh_points.place], "lr": rates.hyper})
+        groups.append({"params": [avatar.mesh_points.place], "lr": HYPER_RATE})
     for distributions in (avatar.hyper, avatar.ndgs):
         if distributions is not None:
-            groups.append({"params": list(distributions.parameters()), "lr": rates.hyper})
+            groups.append({"params": list(distributions.parameters()), "lr": HYPER_RATE})
     for group in groups:
         group["full_lr"] = group["lr"]
     # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.
-    optimizer = torch.optim.Adam(groups, eps=config.adam_eps, fused=True, capturable=avatar.code.is_cuda)
+    optimizer = torch.optim.Adam(groups, eps=EPSILON, fused=True, capturable=avatar.code.is_cuda)
     if on_gpu(avatar.code) and not avatar.code.is_meta:  # where they are read: a graph is for any step's rates
         rates_there = torch.zeros(len(groups), device=avatar.code.device)
         for group, rate in zip(optimizer.param_groups, rates_there, strict=True):
@@ -47,12 +54,14 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
 def schedule(step: int, config: TrainerConfig) -> float:
     """The share of the learning rates that step `step` (from 0) uses.
 
-    Rises linearly to 1 over the first `lr_warmup` steps, times half a cosine from 1 at the first step to `lr_final` at the
-    last. A pure function of the step, so that a resumed run goes on as an uninterrupted one.
+    1 without `lr_decay`. With it, rises linearly to 1 over the first steps, times half a cosine from 1 at the first step to
+    `FINAL_SHARE` at the last. A pure function of the step, so that a resumed run goes on as an uninterrupted one.
     """
-    rise = min((step + 1) / config.lr_warmup, 1.0) if config.lr_warmup else 1.0
+    if not config.lr_decay:
+        return 1.0
+    rise = min((step + 1) / WARM_UP, 1.0)
     fall = 0.5 * (1.0 + math.cos(math.pi * step / max(config.iterations - 1, 1)))
-    return rise * (config.lr_final + (1.0 - config.lr_final) * fall)
+    return rise * (FINAL_SHARE + (1.0 - FINAL_SHARE) * fall)
 
 
 def set_rates(optimizer: torch.optim.Adam, share: float) -> None:

@@ -108,7 +108,7 @@ def moving_step(
     given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world).on(avatar.code.device)
     tracks = {name: getattr(params, name)[None] for name in ("neck", "jaw", "eyes", "eyelids", "expression")}
     values = values_of(tracks | {"t": given.t[None]})[0]
-    degree = sh_degree(step, objective.config, avatar.config.sh_degree)
+    degree = sh_degree(step)
     placed = place(frame, values, given, likeness.centre, degree)
     posed = likeness.vertices(placed.frame.params)
     training_step(avatar, optimizer, objective, step, placed.frame, posed, judge, placed.watched)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,15 +16,27 @@ from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.losses.lpips import MissingWeights, load_lpips
-from avatar.losses.lpips_network import MIN_SIZE, Net
+from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_WINDOW
-from avatar.losses.photometric import Perceptual, PhotometricLoss, dssim, masked_lpips, on_head, photometric_loss
-from avatar.model import Avatar
+from avatar.losses.photometric import (
+    LPIPS_WEIGHT,
+    Perceptual,
+    PhotometricLoss,
+    dssim,
+    masked_lpips,
+    on_head,
+    photometric_loss,
+)
+from avatar.model import SH_DEGREE, Avatar
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
 from avatar.train.optim import schedule, set_rates
 from avatar.train.points import move_points
 from avatar.types import Frame, Gaussians
+
+SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part
+PERCEPTUAL_START = 0.5  # share of the steps after which the perceptual term takes part (15,000 of 30,000)
+SPARSE_EVERY = 10  # LPIPS takes part in every so many-th step, with so many times the weight, where it is sparse
 
 Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
 
@@ -64,9 +76,14 @@ class Outcome(NamedTuple):
     target: Float[Tensor, "H W 3"]
 
 
-def sh_degree(step: int, config: TrainerConfig, stored: int) -> int:
+def sh_degree(step: int) -> int:
     """The degree of the view-dependent colour that takes part in step `step` (from 0)."""
-    return min(step // config.sh_interval, stored)
+    return min(step // SH_INTERVAL, SH_DEGREE)
+
+
+def perceptual_start(config: TrainerConfig) -> int:
+    """The first step (from 0) in which the perceptual term takes part."""
+    return round(PERCEPTUAL_START * config.iterations)
 
 
 @dataclass(frozen=True)
@@ -79,7 +96,7 @@ class Objective:
 
     def term(self, step: int) -> Weighted | None:
         """The third term of step `step`."""
-        return self.perceptual.at(step, round(self.config.perceptual_start * self.config.iterations))
+        return self.perceptual.at(step, perceptual_start(self.config))
 
     def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
         term = self.term(step)
@@ -91,13 +108,10 @@ class Objective:
             frame.head_mask,
             perceptual=function,
             perceptual_weight=term.weight if term else 0.0,
-            mouth_weight=self.config.mouth_weight,
-            delta=self.config.huber_delta,
         )
 
     def draw(self, step: int, frame: Frame, gaussians: Gaussians, avatar: Avatar) -> Float[Tensor, "H W 3"]:
-        degree = sh_degree(step, self.config, avatar.config.sh_degree)
-        return avatar.draw(gaussians, frame.camera, self.background, sh_degree=degree).image
+        return avatar.draw(gaussians, frame.camera, self.background, sh_degree=sh_degree(step)).image
 
 
 def training_step(
@@ -176,11 +190,11 @@ def choose_perceptual(
         try:
             if size is not None and min(size) < MIN_SIZE:
                 raise UserError(too_small("LPIPS", MIN_SIZE, size))
-            lpips = load_lpips(cast(Net, config.lpips_net), download=config.perceptual == "lpips").on(device)
-            crops = config.lpips_region == "head"
+            lpips = load_lpips(config.lpips_net, download=config.perceptual == "lpips").on(device)
+            crops = config.sparse_lpips
             function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
-            term = Weighted(function, config.perceptual_weight, crops)
-            return PerceptualTerm(lpips_name, term, config.lpips_every, in_its_place, before)
+            every = SPARSE_EVERY if config.sparse_lpips else 1
+            return PerceptualTerm(lpips_name, Weighted(function, LPIPS_WEIGHT, crops), every, in_its_place, before)
         except UserError as error:
             if recorded is not None:
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None

@@ -129,7 +129,7 @@ class Steps:
         if term is not None and term.crops:
             return None
         curvature = None if row is None or self._alignment is None else self._alignment.measured
-        degree = sh_degree(step, self._objective.config, self._avatar.config.sh_degree)
+        degree = sh_degree(step)
         return Kind((frame.camera.width, frame.camera.height), degree, term, curvature)
 
     def _ready(self, kind: Kind) -> Script | None:

@@ -65,7 +65,7 @@ def train(
     optimizer = make_optimizer(avatar, trainer)
     if resume is not None:
         load_optimizer(optimizer, avatar, resume.tensors)
-    data, is_gpu = config.data, on_gpu(avatar.code)
+    is_gpu = on_gpu(avatar.code)
     alignment = make_alignment(avatar, subject, config, None if resume is None else resume.tensors)
     background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)
@@ -88,8 +88,8 @@ def train(
     step = saved = start
     with (
         own_stream(device),
-        FrameLoader(subject, data.size, data.cache_mb << 20, data.workers, shelf) as loader,
-        TrainingLog(run, start, trainer.iterations, trainer.log_every) as log,
+        FrameLoader(subject, config.data.size, shelf=shelf) as loader,
+        TrainingLog(run, start, trainer.iterations) as log,
         interruption() as interrupted,
     ):
         progress = Ahead(log, optimizer, device) if is_gpu else Prompt(log)
@@ -106,13 +106,11 @@ def train(
                     if step == strays_step(trainer):
                         progress.settle()
                         remove_strays(avatar, loader, subject.split.train, trainer.stray_share, step)
-                    shows = step % trainer.preview_every == 0 or step == trainer.iterations
                     saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
-                    if shows or saves or interrupted():
+                    if saves or interrupted():
                         progress.settle()
-                    if shows:
-                        log.preview(step, *render_held_out(avatar, loader, subject, background, step))
                     if saves:
+                        log.preview(step, *render_held_out(avatar, loader, subject, background, step))
                         save(step)
                         saved = step
                     if interrupted():

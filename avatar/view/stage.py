@@ -12,19 +12,16 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.compute.device import brought
 from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.controls import ExpressionControl, expression_controls, joint_ranges, posed
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
-from avatar.report.pictures import UNCERTAINTY_GAIN
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.capacity import with_room
-from avatar.splat.sh import C0
 from avatar.types import Camera, HeadParams, Rendering
 
-Overlay = Literal["none", "mesh", "uncertainty", "error"]
-OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "uncertainty", "error")
+Overlay = Literal["none", "mesh", "error"]
+OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "error")
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 MARGIN = 10.0  # degrees by which the camera may leave what the training video shows
 ZOOM = (0.5, 4.0)
@@ -70,13 +67,11 @@ class Stage:
         self.joints = joint_ranges(motion)
         frames = list(zip((recording.camera(i) for i in train), motion, strict=True))
         self.limits: OrbitLimits = orbit_limits((trained.rest_camera(), rest), frames)
-        self._uncertainty = _uncertainty_colours(trained)
 
     @property
     def overlays(self) -> tuple[Overlay, ...]:
         """Those that this avatar has."""
-        has = {"uncertainty": self._uncertainty is not None, "error": self.truth is not None}
-        return tuple(name for name in OVERLAYS if has.get(name, True))
+        return tuple(name for name in OVERLAYS if name != "error" or self.truth is not None)
 
     def within(self, look: Look) -> tuple[Look, bool]:
         """The nearest look that is allowed, and whether the training video shows the head from there."""
@@ -118,7 +113,7 @@ class Stage:
         own = frame[1].resized(width, max(1, round(width * frame[1].height / frame[1].width)))
         look, _ = self.within(setting.look)
         camera = orbited(own, look.yaw, look.pitch, look.zoom)
-        picture = to_bytes(with_room(lambda: self.rendered(params, camera, setting.overlay)).image)
+        picture = to_bytes(with_room(lambda: self.rendered(params, camera)).image)
         if setting.overlay == "mesh":
             _draw_mesh(picture, self.trained.renderer.vertices(params).cpu(), self.trained.assets.faces, camera)
         beside = [picture]
@@ -132,27 +127,14 @@ class Stage:
         return np.concatenate(beside, axis=1)
 
     @torch.no_grad()
-    def rendered(self, params: HeadParams, camera: Camera, overlay: Overlay = "none") -> Rendering:
+    def rendered(self, params: HeadParams, camera: Camera) -> Rendering:
         """The avatar alone, where it computes; nothing is read back."""
         gaussians = self.trained.gaussians(params, camera)
-        if overlay == "uncertainty" and self._uncertainty is not None:
-            gaussians = gaussians._replace(sh=self._uncertainty)
         return self.trained.avatar.draw(gaussians, camera, self.trained.renderer.background)
 
 
 def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-
-
-def _uncertainty_colours(trained: TrainedAvatar) -> Float[Tensor, "N 1 3"] | None:
-    """Coefficients of a colour for each Gaussian, on the scale of the report's map."""
-    if trained.avatar.hyper is None:
-        return None
-    with torch.no_grad():
-        values = torch.sigmoid(UNCERTAINTY_GAIN * trained.avatar.hyper.uncertainty())
-    levels = (values * 255).round().byte().cpu().numpy()[:, None]
-    colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)[:, 0]
-    return brought(((torch.from_numpy(colours.copy()).float() / 255 - 0.5) / C0)[:, None], values.device)
 
 
 def _draw_mesh(picture: np.ndarray, vertices: Float[Tensor, "V 3"], faces: Tensor, camera: Camera) -> None:

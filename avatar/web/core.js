@@ -1,7 +1,6 @@
 // An avatar in memory and the WebAssembly module that draws it. Runs in a page, a worker and node; no DOM.
 
 export const MAGIC = "AVW3";
-const EARLIER = ["AVW1", "AVW2"]; // without `rigidity`; with one blur for all, and without `facing`
 // The arrays that the module takes, in its order (avatar/csrc/web/portrait.h).
 const ARRAYS = [
   "shape", "expression_dirs", "pose_dirs", "weights", "eyelid_dirs", "joints_at_rest", "expression_joints", "barycentric",
@@ -47,7 +46,7 @@ export async function unpack(bytes) {
 export function parse(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const magic = new TextDecoder().decode(bytes.subarray(0, 4));
-  if (magic !== MAGIC && !EARLIER.includes(magic)) throw new AvatarError(`This is not an avatar of this viewer (it begins with “${printable(magic)}”).`);
+  if (magic !== MAGIC) throw new AvatarError(`This is not an avatar of this viewer (it begins with “${printable(magic)}”).`);
   const length = bytes.byteLength >= 8 ? view.getUint32(4, true) : 0;
   if (length === 0 || 8 + length > bytes.byteLength) throw new AvatarError("The avatar file is cut short.");
   let header;
@@ -66,15 +65,6 @@ export function parse(bytes) {
     // Copied, so that it is aligned whatever the file's own offset is.
     const data = bytes.slice(start + offset, start + offset + count * type.BYTES_PER_ELEMENT);
     arrays.set(name, new type(data.buffer));
-  }
-  if (magic !== MAGIC && [header?.sizes, header?.arrays].every((part) => part && typeof part === "object")) {
-    Object.assign(header, { blur: 0.3, facing: null });
-    header.sizes.has_facing = 0;
-    if (magic === EARLIER[0]) {
-      header.sizes.has_rigidity = 0;
-      header.arrays.rigidity = {};
-      arrays.set("rigidity", new Float32Array(0));
-    }
   }
   check(header, arrays);
   return { header, arrays };

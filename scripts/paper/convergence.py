@@ -162,7 +162,7 @@ def held_out(subject: Subject, config: Config, count: int) -> list[Frame]:
 
 
 def take_turns(learners: Sequence[Learner], at: Sequence[float], frames: Sequence[Frame]) -> None:
-    loaders = [FrameLoader(x.subject, x.config.data.size, x.config.data.cache_mb << 20, 1) for x in learners]
+    loaders = [FrameLoader(x.subject, x.config.data.size) for x in learners]
     try:
         for mark in at:
             for learner, loader in zip(learners, loaders, strict=True):

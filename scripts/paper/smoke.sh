@@ -16,7 +16,7 @@ import conditioning, convergence, cross, slicing, table, uncertainty
 folder = Path(sys.argv[1])
 out = ["--out", str(folder / "paper")]
 small = [str(folder / "someone"), "data.size=64", "model.uv_size=16", "trainer.iterations=4", "trainer.perceptual=dssim"]
-small += ["trainer.preview_every=4", "trainer.checkpoint_every=4", "--frame-offset", "1", *out]
+small += ["trainer.checkpoint_every=4", "--frame-offset", "1", *out]
 together = [*small, "--side-by-side"]
 statuses = [
     table.main(["table1", *together]),

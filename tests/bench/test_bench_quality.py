@@ -42,7 +42,10 @@ def test_the_front_is_what_no_other_run_has_in_less_time() -> None:
 def test_runs_of_one_subject_get_a_curve_each(
     tracked_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, overrides in (("faithful", ["preset=paper"]), ("quick", ["preset=fast"])):
+    for name, overrides in (
+        ("faithful", ["experiment=paper", "data.size=null", "trainer.perceptual=dssim"]),
+        ("quick", []),
+    ):
         train_small(tracked_folder, tmp_path / name, overrides)
     run(Request(tmp_path, quick=True, inputs=(tmp_path / "faithful", tmp_path / "quick")))
     output = capsys.readouterr().out

@@ -45,12 +45,6 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
             usual = (row["variant"]["alpha_min"], row["variant"]["t_min"]) == (1 / 255, 1e-4)
             assert (row["accuracy"]["image"] <= 1e-5) == usual  # another cut-off is another image
             assert (row["accuracy"]["gradient"] <= 1e-4) == usual
-    scenes = {(row["variant"]["count"], row["variant"]["size"]) for row in written["rows"]}
-    assert {(work["count"], work["size"]) for work in written["work"]} == scenes
-    for work in written["work"]:
-        numbers = work["counters"]
-        assert 0 < numbers["pixels_composited"] <= numbers["pixels_evaluated"]
-        assert numbers["pairs"] <= numbers["pairs_in_boxes"]
     assert (tmp_path / "out" / "bench_splat.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out.splitlines()
     lines = [line for line in printed if line.lstrip().startswith(("cpu", "plain", "reference"))]

@@ -46,7 +46,7 @@ def test_help_and_version_answer_for_every_command() -> None:
 def test_what_training_was_made_from_is_recorded(trained: Path, tracked_folder: Path) -> None:
     info = json.loads((trained / "run.json").read_text())
     assert info["source"]["folder"] == str(tracked_folder) and info["source"]["frame_offset"] == 1
-    assert info["perceptual"] == "dssim" and info["options"]["preset"] == "best"
+    assert info["perceptual"] == "dssim" and info["options"]["model"] == "hypergaussians"
     assert info["config"]["data"]["size"] == 40 and info["config"]["trainer"]["seed"] == 3
     assert len(info["data_hash"]) == len(info["head_fingerprint"]) == 64
 
@@ -152,11 +152,12 @@ def test_a_csv_without_cameras_shows_the_avatars_own(trained: Path, tmp_path: Pa
 
 
 def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
-    tracked_folder: Path, tmp_path: Path
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed without warning and resumed, the run ends with the bits of one that was never disturbed."""
     options = ["--frame-offset", "1", *SMALL, "trainer.iterations=60", "trainer.checkpoint_every=5"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
+    monkeypatch.setattr("avatar.train.step.SH_INTERVAL", 500)  # as in the process that is killed
     avatar("train", tracked_folder, "--out", whole, *options)
     command = [sys.executable, "-m", "avatar.cli", "train", str(tracked_folder), "--out", str(killed), *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -177,7 +178,7 @@ def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
 
 def test_ctrl_c_saves_and_says_how_to_go_on(tracked_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    options = ["--frame-offset", "1", *SMALL, "trainer.iterations=100000", "trainer.checkpoint_every=100000"]
+    options = ["--frame-offset", "1", *SMALL, "trainer.iterations=100000", "trainer.checkpoint_every=50"]
     command = [sys.executable, "-m", "avatar.cli", "train", str(tracked_folder), "--out", str(run), *options]
     process = subprocess.Popen(
         command,

@@ -84,7 +84,6 @@ def test_a_run_begun_with_weights_does_not_go_on_without_them(
 
 
 CHANGES = {
-    "another preset": (["preset=paper"], "began with preset=best, not paper"),
     "another model": (["model=flashavatar"], "began with model=hypergaussians, not flashavatar"),
     "a recipe": (["experiment=paper"], "began with experiment=none, not paper"),
     "another key": (["trainer.seed=5"], "began with trainer.seed=0, not 5"),
@@ -106,7 +105,7 @@ def test_what_a_resumed_run_cannot_change_is_refused(name: str, kept: Path, kept
 
 
 def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:
-    same = ("preset=best", "model=hypergaussians", "trainer.seed=0", "--frame-offset", 1, "--max-left-out", 0.05)
+    same = ("model=hypergaussians", "trainer.seed=0", "--frame-offset", 1, "--max-left-out", 0.05)
     assert "at step 8 of 12" in avatar("train", own_folder, "--out", begun, "--resume", *same)
 
 

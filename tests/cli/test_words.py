@@ -39,15 +39,15 @@ def test_a_misspelt_option_is_answered_with_the_nearest() -> None:
 @pytest.mark.parametrize(
     ("words", "folder", "overrides"),
     [
-        ("me preset=fast", "me", ["preset=fast"]),
-        ("preset=fast me trainer.seed=1", "me", ["preset=fast", "trainer.seed=1"]),
+        ("me experiment=demo", "me", ["experiment=demo"]),
+        ("experiment=demo me trainer.seed=1", "me", ["experiment=demo", "trainer.seed=1"]),
         ("./a=b", "a=b", []),
-        ("runs/x=1/me preset=fast", "runs/x=1/me", ["preset=fast"]),
+        ("runs/x=1/me experiment=demo", "runs/x=1/me", ["experiment=demo"]),
         ("/data/a=b.mp4", "/data/a=b.mp4", []),
-        ("take-2=final --out x preset=fast", "take-2=final", ["preset=fast"]),
+        ("take-2=final --out x experiment=demo", "take-2=final", ["experiment=demo"]),
         ("here=now", "here=now", []),
         ("me nowhere=now", "me", ["nowhere=now"]),
-        ("me preset=paper", "me", ["preset=paper"]),
+        ("me experiment=paper", "me", ["experiment=paper"]),
     ],
 )
 def test_a_path_with_an_equals_sign_is_no_override(
@@ -55,7 +55,7 @@ def test_a_path_with_an_equals_sign_is_no_override(
 ) -> None:
     """A plain word with the sign is a path where it is there and its first part is no key."""
     monkeypatch.chdir(tmp_path)
-    for name in ("here=now", "preset=paper"):
+    for name in ("here=now", "experiment=paper"):
         (tmp_path / name).mkdir()
     arguments = parse(["train", *words.split()])
     assert arguments.paths == [Path(folder)] and arguments.overrides == overrides

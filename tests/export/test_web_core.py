@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 import json
 import os
@@ -28,7 +27,6 @@ MODELS = {
     "grid": ("model=hypergaussians",),
     "no grid": ("model=hypergaussians", "model.latent_grid=null"),
     "no HyperGaussians": ("model=flashavatar",),
-    "no view dependence": ("model.sh_degree=0",),
     "covariance": ("model=covariance",),
     "detail": ("model.uv_detail=2",),
     "rigidity": ("model.rigidity=true",),
@@ -96,25 +94,6 @@ def test_webassembly_draws_the_same_pictures(
     assert psnr(truth[0], truth[1]) < 30, "frames differ"
     picture = drawn_by_node(trained, "float", tmp_path)
     assert min(psnr(a, b) for a, b in zip(picture, truth, strict=True)) > 60
-
-
-@pytest.mark.parametrize("magic", [b"AVW1", b"AVW2"])
-def test_files_of_earlier_formats_are_drawn_as_they_were(magic: bytes, tracked_folder: Path, tmp_path: Path) -> None:
-    rigidity = "false" if magic == b"AVW1" else "true"
-    earlier_model = (f"model.rigidity={rigidity}", "model.facing=false", "model.blur=0.3")
-    trained = lively_avatar(tracked_folder, tmp_path / "run", *earlier_model)
-    now = drawn_by_node(trained, "float", tmp_path)
-    raw = gzip.decompress((tmp_path / "a.avatar").read_bytes())
-    length = int.from_bytes(raw[4:8], "little")
-    header = json.loads(raw[8 : 8 + length])
-    del header["sizes"]["has_facing"], header["facing"], header["blur"]
-    if magic == b"AVW1":
-        del header["sizes"]["has_rigidity"], header["arrays"]["rigidity"]
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    earlier = b"".join((magic, len(text).to_bytes(4, "little"), text, raw[8 + length :]))
-    (tmp_path / "a.avatar").write_bytes(gzip.compress(earlier))
-    assert (pictures_of_node(trained, tmp_path) == now).all()
 
 
 def test_opacities_that_change_are_refused_in_a_sentence(tracked_folder: Path, tmp_path: Path) -> None:

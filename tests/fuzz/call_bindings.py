@@ -23,7 +23,7 @@ from valid_calls import BINDINGS, Arguments, Shapes
 from avatar import _core
 from avatar.tensors import check_shapes
 
-OPTIONAL = {"counts", "solved", "grad_latents", "grad_image", "grad_alpha", "gradient"}
+OPTIONAL = {"solved", "grad_latents", "grad_image", "grad_alpha", "gradient"}
 EVIL = [None, "text", b"", object(), [], {}, 1.5, math.nan, -1, 0, 2**31, 2**70]
 NUMBERS = [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e308, 1e-320]
 # Values that are refused for what the argument means; any number is taken for the others.
@@ -85,7 +85,7 @@ def other_array(r: random.Random, array: Tensor) -> Any:
 
 
 INTEGERS = {"faces": torch.int32, "face_id": torch.int32, "cells": torch.int32, "gaussians": torch.int32}
-INTEGERS |= {"begins": torch.int64, "counts": torch.int64}
+INTEGERS |= {"begins": torch.int64}
 INDICES = {"faces", "cells", "gaussians", "begins"}
 
 

@@ -25,7 +25,7 @@ from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, 
 
 SWEEP = b"""subjects: [../anna, {folder: ../carla, head: ../head_model, frame_offset: 1}]
 head: ../head_model
-product: {model.latent_dim: [4, 8], preset: [fast, balanced]}
+product: {model.latent_dim: [4, 8], experiment: [demo, paper]}
 overrides: [data.size=256]
 seeds: [0, 1, 2]
 protocols: [hypergaussians]

@@ -16,7 +16,6 @@ Shapes = dict[str, str]  # of every array, as check_shapes takes them
 OUTPUTS = {
     "image",
     "alpha",
-    "counts",
     "face_id",
     "barycentric",
     "depth",
@@ -43,10 +42,8 @@ def splat_forward(r: random.Random) -> tuple[Arguments, Shapes]:
     shapes = {"means": "N 3", "quats": "N 4", "scales": "N 3", "opacities": "N", "sh": "N K 3", "background": "3"}
     shapes |= {"image": "H W 3", "alpha": "H W"}
     left, top = r.randrange(W), r.randrange(H)
-    counts = {"counts": torch.zeros(16, dtype=torch.int64)} if r.random() < 0.5 else {}
     return {
         **arrays(shapes, {"N": N, "K": K, "H": H, "W": W}),
-        **counts,
         "rotation": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "translation": [0.0, 0.0, 1.0],
         "intrinsics": [float(W), float(W), W / 2, H / 2],
@@ -58,7 +55,7 @@ def splat_forward(r: random.Random) -> tuple[Arguments, Shapes]:
         "everywhere": r.random() < 0.2,
         "region": [left, top, r.randint(left + 1, W), r.randint(top + 1, H)],
         **KERNEL,
-    }, {**shapes, **({"counts": "16"} if counts else {})}
+    }, shapes
 
 
 def splat_backward(r: random.Random) -> tuple[Arguments, Shapes]:

@@ -59,7 +59,7 @@ def test_a_grid_as_fine_as_the_raster_is_no_grid() -> None:
     torch.testing.assert_close(grid.interpolate(grid.places), points, rtol=0, atol=1e-7)
     assert len(grid.places) == len(points)
 
-    config = small_config("preset=paper").model
+    config = small_config("experiment=paper").model
     fine = replace(config, latent_grid=config.uv_size)
     avatars = []
     for model in (config, fine):

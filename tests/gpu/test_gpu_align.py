@@ -34,7 +34,6 @@ TINY = (
     "trainer.perceptual=dssim",
     "trainer.iterations=10",
     "trainer.checkpoint_every=3",
-    "trainer.preview_every=10",
     "trainer.keep_checkpoints=4",
     "trainer.stray_share=0",
 )

@@ -31,7 +31,7 @@ def test_a_timed_step_is_the_gpus_and_is_not_cut(tracked_folder: Path, tmp_path:
     assert next(learner.frames).image.device.type == learner.avatar.code.device.type == DEVICE.type
     assert not torch.equal(learner.avatar.sh_dc, before)
     once = Time(1.0, 2.0, 3)
-    rows = [train.Row("fast", 5, 4, 9, once, once, {}, {})]
+    rows = [train.Row("default", 5, 4, 9, once, once, {}, {})]
     lines = train_report.table(rows)
     assert len(lines) == 2 and "1.0 (2.0)" in lines[1]
     train_report.write_plot(rows, tmp_path / "plot.png")
@@ -41,7 +41,7 @@ def test_a_timed_step_is_the_gpus_and_is_not_cut(tracked_folder: Path, tmp_path:
 def test_a_rendered_frame_is_compared_and_timed_there(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train_small(tracked_folder, tmp_path / "run", (*TINY, "trainer.iterations=2", "trainer.preview_every=2"))
+    train_small(tracked_folder, tmp_path / "run", (*TINY, "trainer.iterations=2"))
     trained = open_trained(tmp_path / "run")
     trained.avatar.to(DEVICE)
     monkeypatch.setattr(render, "stream_rate", lambda *_: 25.0)

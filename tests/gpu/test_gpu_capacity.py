@@ -22,15 +22,23 @@ from splat.scenes import (
 
 from avatar.splat import CannotDraw, _checked_options, splat
 from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Capacities, Kind, fixed_capacity, roomy
+from avatar.types import Gaussians
 
 SCENE = SCENES["17x33"]
 
 
 def pairs_of(scene: Scene) -> int:
     """What the drawing needs, before pairs without a pixel are left out."""
-    from avatar.splat import counters
+    from avatar.splat.gpu import pose_on, settings_of
+    from avatar.splat.gpu_draw import draw
 
-    return counters(scene.gaussians, scene.camera, scene.background, backend="gpu", **scene.options).pairs_in_boxes
+    given = {**(splat.__kwdefaults__ or {}), **scene.options, "backend": "gpu"}
+    settings = settings_of(
+        scene.camera, DEVICE, **_checked_options(scene.gaussians, scene.camera, scene.background, **given)
+    )
+    gaussians = Gaussians(*(t.detach().contiguous() for t in scene.gaussians))
+    _, drawing = draw(gaussians, pose_on(scene.camera, DEVICE), scene.background, settings)
+    return int(drawing.ends[-1])
 
 
 @pytest.mark.skipif(DEVICE.type == "cuda", reason="counts where Triton interprets")

@@ -15,7 +15,7 @@ from avatar.render import Renderer
 from avatar.splat.scenes import head_camera
 from avatar.types import Gaussians
 
-RECIPES = ("preset=fast", "preset=paper", "model=flashavatar")
+RECIPES = ("model=hypergaussians", "experiment=paper", "model=flashavatar")
 
 
 def avatar_of(recipe: str) -> Avatar:
@@ -45,7 +45,7 @@ def test_gaussians_and_picture_are_those_of_the_cpu(recipe: str) -> None:
 
 
 def test_a_stream_gives_the_pictures_in_order_on_the_cpu() -> None:
-    renderer = Renderer(avatar_of("preset=fast").to(DEVICE), torch.ones(3))
+    renderer = Renderer(avatar_of("model=hypergaussians").to(DEVICE), torch.ones(3))
     frames = [(random_params(seed), head_camera(20)) for seed in range(5)]
     found = list(renderer.stream(frames))
     assert len(found) == 5
@@ -54,7 +54,7 @@ def test_a_stream_gives_the_pictures_in_order_on_the_cpu() -> None:
 
 
 def test_fewer_coefficients_than_the_head_has_stand_for_zeros() -> None:
-    renderer = Renderer(avatar_of("preset=fast").to(DEVICE), torch.ones(3))
+    renderer = Renderer(avatar_of("model=hypergaussians").to(DEVICE), torch.ones(3))
     params = random_params()
     filled = replace(params, expression=torch.cat((params.expression[:2], torch.zeros(3))))
     short = replace(params, expression=params.expression[:2])
@@ -62,7 +62,7 @@ def test_fewer_coefficients_than_the_head_has_stand_for_zeros() -> None:
 
 
 def test_later_training_does_not_show() -> None:
-    avatar = avatar_of("preset=fast").to(DEVICE)
+    avatar = avatar_of("model=hypergaussians").to(DEVICE)
     renderer = Renderer(avatar, torch.ones(3))
     before = renderer.gaussians(random_params())
     with torch.no_grad():

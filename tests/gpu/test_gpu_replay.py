@@ -20,6 +20,7 @@ from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
 from avatar.splat.capacity import CAPACITIES, Capacities, Kind, fixed_capacity
 from avatar.train import align as align_module
+from avatar.train import step as step_module
 from avatar.train import steps as steps_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import choose_perceptual
@@ -27,15 +28,13 @@ from avatar.train.steps import Steps
 from avatar.train.trainer import train
 from avatar.types import Gaussians
 
-# Degrees of the colours change at steps 7 and 14, the third term at step 10; previews and checkpoints come in between.
+# Degrees of the colours change at steps 7 and 14, the third term at step 10; checkpoints come in between.
 TINY = (
     "model.uv_size=10",
     "model.latent_grid=4",
     "data.size=24",
     "trainer.perceptual=dssim",
     "trainer.iterations=20",
-    "trainer.sh_interval=7",
-    "trainer.preview_every=9",
     "trainer.checkpoint_every=8",
     "trainer.stray_share=0",
 )
@@ -43,7 +42,7 @@ STILL = (*TINY, "trainer.align_rate=0")
 
 
 def trained(
-    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int
+    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int, degree_every: int = 7
 ) -> tuple[Checkpoint, Steps, list[float]]:
     """The last checkpoint, what made the steps, and the loss of each."""
     config = small_config(*overrides)
@@ -62,6 +61,7 @@ def trained(
             return outcome
 
     with monkeypatch.context() as patch:
+        patch.setattr(step_module, "SH_INTERVAL", degree_every)
         patch.setattr(trainer_module, "Steps", Noting)
         patch.setattr(steps_module, "WARM", warm)
         term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
@@ -143,8 +143,10 @@ def test_a_script_without_todays_room_is_written_anew(
     expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)
     monkeypatch.setattr(Capacities, "known", growing)
     monkeypatch.setattr(steps_module, "Replay", counting)
-    one_kind = ("trainer.sh_interval=99", "trainer.perceptual_start=1.0", "trainer.iterations=12")
-    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *STILL, *one_kind, warm=1)
+    monkeypatch.setattr(step_module, "PERCEPTUAL_START", 1.0)
+    found, steps, _ = trained(
+        tracked_folder, tmp_path / "run", monkeypatch, *STILL, "trainer.iterations=12", warm=1, degree_every=99
+    )
     assert found.step == 12 and steps.replayed == 11
     assert written == [4096, 8192]
     assert expected.step == 20

@@ -63,7 +63,7 @@ def trained(
 
 def test_thirty_steps_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path: Path) -> None:
     """Across the steps where a spherical-harmonics degree, the perceptual term and a checkpoint come in."""
-    steps = ("trainer.iterations=30", "trainer.preview_every=30")
+    steps = ("trainer.iterations=30",)
     _, expected = trained(tracked_folder, tmp_path / "cpu", *steps, on_cpu=True)
     avatar, found = trained(tracked_folder, tmp_path / "gpu", *steps)
     assert len(found) == len(expected) == 30
@@ -93,7 +93,7 @@ def poison_gradient_at(step: int) -> Callable[[Avatar], object]:
 
 @pytest.mark.usefixtures("launched")
 def test_a_gradient_that_is_not_finite_is_named_and_has_moved_nothing(tracked_folder: Path, tmp_path: Path) -> None:
-    steps = ("trainer.iterations=9", "trainer.checkpoint_every=3", "trainer.preview_every=9")
+    steps = ("trainer.iterations=9", "trainer.checkpoint_every=3")
     with pytest.raises(UserError) as caught:
         trained(tracked_folder, tmp_path / "run", *steps, change=poison_gradient_at(4))
     message = str(caught.value)
@@ -106,7 +106,7 @@ def test_a_drawing_without_room_is_repeated_and_leaves_no_trace(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Steps 3 and 4 find buffers that are too small, as if the splats had grown; the run is the same to the bit."""
-    steps = ("trainer.iterations=5", "trainer.preview_every=5")
+    steps = ("trainer.iterations=5",)
     expected_avatar, expected = trained(tracked_folder, tmp_path / "whole", *steps)
     drawn = {"count": 0, "without room": 0}
     draw, forget = gpu_draw.draw, capacity_module.Capacities.forget
@@ -137,7 +137,7 @@ def test_a_drawing_without_room_is_repeated_and_leaves_no_trace(
 def test_a_checkpoint_of_the_gpus_path_goes_on_there_to_the_same_bits_and_on_the_cpu_to_rounding(
     tracked_folder: Path, tmp_path: Path
 ) -> None:
-    steps = ("trainer.iterations=6", "trainer.checkpoint_every=3", "trainer.preview_every=6")
+    steps = ("trainer.iterations=6", "trainer.checkpoint_every=3")
     whole, _ = trained(tracked_folder, tmp_path / "run", *steps)
     halfway = load_checkpoint(list_checkpoints(tmp_path / "run" / "checkpoints")[0])
     assert halfway.step == 3

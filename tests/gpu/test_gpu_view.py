@@ -15,7 +15,6 @@ pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.capacity import fixed_capacity
-from avatar.view import stage as stage_module
 from avatar.view.stage import Setting, Stage
 
 
@@ -27,7 +26,7 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 def test_pictures_are_those_of_the_cpu(trained: TrainedAvatar) -> None:
     frame = trained.recording.params(5), trained.recording.camera(5, 48)
-    settings = (Setting(), Setting(overlay="mesh"), Setting(overlay="uncertainty"), Setting(overlay="error"))
+    settings = (Setting(), Setting(overlay="mesh"), Setting(overlay="error"))
     truth = torch.full((32, 32, 3), 0.4)
     with the_cpus_way():
         stage = Stage(trained, lambda *_: truth)
@@ -42,13 +41,9 @@ def test_pictures_are_those_of_the_cpu(trained: TrainedAvatar) -> None:
 
 @pytest.mark.without_kernels
 def test_a_picture_reads_nothing_back_before_it_is_there(
-    trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch
+    trained: TrainedAvatar,
 ) -> None:
-    colours = stage_module._uncertainty_colours(trained)
-    assert colours is not None
-    monkeypatch.setattr(stage_module, "_uncertainty_colours", lambda _: colours.to("meta"))  # made once, and read
     stage = Stage(replace(trained, avatar=deepcopy(trained.avatar).to("meta")))
     with fixed_capacity(10_000):
-        for overlay in ("none", "uncertainty"):
-            drawn = stage.rendered(trained.recording.params(5), trained.recording.camera(5, 48), overlay)
-            assert drawn.image.is_meta and drawn.image.shape == (48, 48, 3)
+        drawn = stage.rendered(trained.recording.params(5), trained.recording.camera(5, 48))
+        assert drawn.image.is_meta and drawn.image.shape == (48, 48, 3)

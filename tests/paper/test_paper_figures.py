@@ -189,7 +189,7 @@ def test_convergence_goes_on_from_its_last_mark(folder: Path, tmp_path: Path) ->
     points = [point for path in before for point in load_checkpoint(list_checkpoints(path)[-1]).meta["points"][1:]]
     assert sorted(float(line["psnr"]) for line in found) == pytest.approx(sorted(point["psnr"] for point in points))
     with pytest.raises(UserError, match="another configuration; give another --out"):
-        convergence.main([*words, "trainer.sh_interval=7", "--seconds", "0.1"])
+        convergence.main([*words, "trainer.dssim_early=0.3", "--seconds", "0.1"])
 
 
 def test_marks_lie_between_the_pictures() -> None:

@@ -14,9 +14,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from avatar.errors import UserError
-from avatar.pipeline.open import open_run
 from avatar.report.page import bins_tables, means_table, read_curves, read_results
-from avatar.report.pictures import uncertainty_map
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 MOVE_SLIDER = """
@@ -47,9 +45,9 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     means = results["protocols"]["hypergaussians"]["means"]
     assert f"{means['psnr']:.2f}" in page and f"{means['ssim']:.4f}" in page
     sources = re.findall(r'src="([^"]{0,30})', page)
-    assert len(sources) == 6 + 2 + 2 + 1  # held-out frames; curves and worst of the evaluation; training; uncertainty
+    assert len(sources) == 6 + 2 + 2  # held-out frames; curves and worst of the evaluation; training
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)
-    assert results["data_hash"] in page and "trainer.learning_rates.mlp" in page
+    assert results["data_hash"] in page and "trainer.learning_rates.scale" in page
     assert len(page) < 8e6
 
 
@@ -58,30 +56,6 @@ def test_curves_are_those_that_training_recorded(run: Path) -> None:
     assert [step for step, _ in curves["loss/total"]] == [2, 4, 6, 8, 10, 12]
     assert all(np.isfinite(value) for _, value in curves["train/psnr"])
     assert read_curves(run / "nowhere") == {}
-
-
-def test_uncertainty_is_grey_before_training_and_lies_where_the_gaussians_are(run: Path) -> None:
-    opened = open_run(run)
-    assert opened.avatar.hyper is not None
-    opened.avatar.hyper.packed.data.zero_()
-    image = uncertainty_map(opened)
-    assert image is not None
-    scale = image.shape[0] // 20
-    painted = (image[::scale, ::scale] != 255).any(axis=-1)
-    assert painted.sum() == len(opened.avatar)
-    assert len(np.unique(image[::scale, ::scale][painted], axis=0)) == 1  # sigmoid(0) everywhere
-
-
-def test_uncertainty_of_a_detailed_avatar_has_the_finer_raster(tracked_folder: Path, tmp_path: Path) -> None:
-    train_small(tracked_folder, tmp_path / "run", ["trainer.iterations=2", "model.uv_detail=2"])
-    opened = open_run(tmp_path / "run")
-    side = opened.avatar.embedding.texels.side
-    assert set(side.tolist()) == {20, 40}
-    image = uncertainty_map(opened)
-    assert image is not None and image.shape[0] % 40 == 0
-    scale = image.shape[0] // 40
-    painted = (image[::scale, ::scale] != 255).any(axis=-1)
-    assert int((side == 40).sum()) < painted.sum() <= int((side == 40).sum() + 4 * (side == 20).sum())
 
 
 def test_protocols_without_a_figure_have_a_dash() -> None:
@@ -137,7 +111,7 @@ def test_in_a_browser_the_slider_moves_and_all_images_load(run: Path, tmp_path: 
     open_page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
     hooked = tmp_path / "report.html"
     hooked.write_text(open_page.replace("</body>", f"<script>{MOVE_SLIDER}</script></body>"), encoding="utf-8")
-    assert "<title>shown frame 00028 loaded 11 of 11</title>" in dump_dom(hooked, tmp_path)
+    assert "<title>shown frame 00028 loaded 10 of 10</title>" in dump_dom(hooked, tmp_path)
     dump_dom(run / "report.html", tmp_path)
 
 

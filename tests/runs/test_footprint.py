@@ -14,17 +14,18 @@ from avatar.model import Avatar
 from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shapes, places, training_needs
 
 MIB = 2**20
+PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
 
 
 @pytest.mark.parametrize(
     "overrides",
     [
         (),
-        ("preset=paper", "model.latent_dim=3", "model.sh_degree=1"),
-        ("model=flashavatar", "model.mlp_layers=1", "model.sh_degree=0", "model.frequencies=0"),
+        ("experiment=paper", "model.latent_dim=3"),
+        ("model=flashavatar", "model.mlp_layers=1"),
         ("model.mlp_layers=5", "model.mlp_width=7", "model.uv_size=9"),
         ("model=covariance", "model.latent_dim=3"),
-        ("preset=paper", "model=covariance"),
+        ("experiment=paper", "model=covariance"),
         ("model=ndgs", "model.latent_dim=5"),
         ("model=splattingavatar",),
         ("model=monogaussianavatar", "model.uv_size=9"),
@@ -79,7 +80,7 @@ print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("preset=paper", "model.uv_size=256", "model.mlp_width=256", "model.mlp_layers=4"),  # activations
+        (*PAPER, "model.uv_size=256", "model.mlp_width=256", "model.mlp_layers=4"),  # activations
         ("model.uv_size=256", "model.latent_dim=64"),  # HyperGaussians, which are largest while they are saved
         ("model.mlp_width=2048", "model.mlp_layers=6"),  # the network, likewise
         ("model=covariance", "model.uv_size=256", "model.latent_dim=12"),
@@ -110,10 +111,10 @@ def test_the_largest_part_is_what_is_to_be_lowered() -> None:
     assert largest("model.mlp_width=65536", "model.mlp_layers=1000") == "the deformation network"
     assert largest("model.uv_size=1024", "model.latent_dim=64") == "the HyperGaussians"
     assert (
-        largest("preset=paper", "model.uv_size=2048", "model.mlp_width=1024") == "the network's layers at every place"
+        largest("experiment=paper", "model.uv_size=2048", "model.mlp_width=1024")
+        == "the network's layers at every place"
     )
-    assert largest("data.cache_mb=100000") == "the cache of decoded frames"
-    assert largest("data.cache_mb=1", "data.workers=64") == "a frame and its losses"
+    assert largest() == "the cache of decoded frames"
 
 
 def test_drawing_takes_less_than_training_and_grows_with_what_it_holds() -> None:

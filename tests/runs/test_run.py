@@ -15,7 +15,7 @@ from avatar.runs.run import read_run_info, write_run_info
 def test_what_a_run_began_with_comes_back(tmp_path: Path) -> None:
     write_run_info(tmp_path, run_info("dssim"))
     info = read_run_info(tmp_path)
-    assert info.perceptual == "dssim" and info.options["preset"] == "best" and info.config.model.latent_dim == 8
+    assert info.perceptual == "dssim" and info.options["experiment"] == "none" and info.config.model.latent_dim == 8
     assert info.source.folder == Path("/x") and info.source.tracking is None and info.source.max_left_out == 0.05
 
 

@@ -29,7 +29,6 @@ from splat.scenes import (
 )
 
 from avatar import _core
-from avatar.splat import counters
 from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Gaussians
 
@@ -141,8 +140,7 @@ def test_gradients_hold_behind_thousands_of_faint_splats(simd: str, monkeypatch:
     scene = scene.with_options(alpha_min=0.0)  # or cut-offs would fall on many pixels
     # The splats' gradients cancel to a three-hundredth in those of the pose, which are their sums.
     assert_agrees(scene, pose_tolerance=1e-3)
-    found = counters(scene.gaussians, scene.camera, scene.background, **scene.options)
-    assert found.pixels_composited > 1000 * 400
+    assert (1 - render(scene).alpha).max() < 0.995**1000, "more than a thousand splats at every pixel"
 
 
 def test_two_python_threads_may_draw_at_once() -> None:

@@ -39,13 +39,13 @@ def test_a_sweep_is_every_subject_with_every_variant_and_seed(tmp_path: Path) ->
 
 
 def test_a_product_is_every_combination(tmp_path: Path) -> None:
-    text = "subjects: [a]\nproduct: {model.latent_dim: [4, 8], preset: [fast, paper], data.size: [null]}\n"
+    text = "subjects: [a]\nproduct: {model.latent_dim: [4, 8], experiment: [demo, paper], data.size: [null]}\n"
     spec = read_spec(write(tmp_path / "sweep.yaml", text))
     assert [job.variant for job in spec.jobs] == [
-        "model.latent_dim=4 preset=fast data.size=null",
-        "model.latent_dim=4 preset=paper data.size=null",
-        "model.latent_dim=8 preset=fast data.size=null",
-        "model.latent_dim=8 preset=paper data.size=null",
+        "model.latent_dim=4 experiment=demo data.size=null",
+        "model.latent_dim=4 experiment=paper data.size=null",
+        "model.latent_dim=8 experiment=demo data.size=null",
+        "model.latent_dim=8 experiment=paper data.size=null",
     ]
 
 
@@ -79,12 +79,12 @@ MISTAKES = {
     "seeds that are text": ("subjects: [a]\nseeds: [one]", "seeds holds 'one'"),
     "a seed twice": ("subjects: [a]\nseeds: [1, 1]", "seeds names one twice"),
     "variants and product": (
-        "subjects: [a]\nvariants: [[]]\nproduct: {preset: [fast]}",
+        "subjects: [a]\nvariants: [[]]\nproduct: {experiment: [demo]}",
         "variants or product, not both",
     ),
-    "an empty product": ("subjects: [a]\nproduct: {preset: []}", "product must hold a list of values for each key"),
+    "an empty product": ("subjects: [a]\nproduct: {experiment: []}", "product must hold a list of values for each key"),
     "too many": (
-        f"subjects: [a]\nseeds: {list(range(318))}\nproduct: {{trainer.huber_delta: {list(range(1, 316))}}}",  # 100,170
+        f"subjects: [a]\nseeds: {list(range(318))}\nproduct: {{trainer.dssim_weight: {list(range(1, 316))}}}",  # 100,170
         "more than 100,000 jobs",
     ),
     "threads that are none": ("subjects: [a]\nthreads: many", "threads is 'many'; it must lie between 1 and 1024"),

@@ -21,7 +21,7 @@ from avatar.sweep.state import State, read_state, write_state
 
 ENGINES = {"local": "json", "ray": "ray", "slurm": "submitit"}
 OPTIONS = {"local": (), "ray": (), "slurm": ("--address", "local")}
-BROKEN = "data.train_frames=500"
+BROKEN = "data.test_frames=500"
 
 
 def write_spec(folder: Path, name: str = "sweep.yaml", **changes: object) -> Path:

@@ -14,7 +14,7 @@ from avatar.train.log import TrainingLog
 def test_no_psnr_is_shown_before_one_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = torch.full((4, 4, 3), 0.5)
     loss = PhotometricLoss(*torch.ones(len(PhotometricLoss._fields)))
-    with TrainingLog(tmp_path, 0, 3, every=2) as log:
+    with TrainingLog(tmp_path, 0, 3) as log:
         shown = []
         for step in (1, 2, 3):
             log.step(step, loss, image, image + 0.1)

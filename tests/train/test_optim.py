@@ -10,17 +10,17 @@ from avatar.train.optim import make_optimizer, schedule, set_rates
 
 
 def test_without_schedule_every_step_has_the_full_rates() -> None:
-    trainer = small_config("preset=paper", "trainer.iterations=50").trainer
+    trainer = small_config("experiment=paper", "trainer.iterations=50").trainer
     assert [schedule(step, trainer) for step in range(50)] == [1.0] * 50
 
 
 def test_the_rates_rise_then_fall_by_half_a_cosine() -> None:
-    trainer = small_config("trainer.iterations=101", "trainer.lr_warmup=4", "trainer.lr_final=0.1").trainer
-    shares = [schedule(step, trainer) for step in range(101)]
-    assert shares[:4] == pytest.approx([0.25, 0.5, 0.75, 1.0], rel=3e-3)
-    assert shares[50] == pytest.approx(0.55) and shares[100] == pytest.approx(0.1)
-    assert shares[25] == pytest.approx(0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi / 4)))
-    assert shares[4:] == sorted(shares[4:], reverse=True)
+    trainer = small_config("trainer.iterations=401").trainer
+    shares = [schedule(step, trainer) for step in range(401)]
+    assert shares[:20] == pytest.approx([(step + 1) / 20 for step in range(20)], rel=6e-3)
+    assert shares[200] == pytest.approx(0.525) and shares[400] == pytest.approx(0.05)
+    assert shares[100] == pytest.approx(0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi / 4)))
+    assert shares[20:] == sorted(shares[20:], reverse=True)
 
 
 def test_every_group_keeps_its_own_rate(tracked_folder) -> None:

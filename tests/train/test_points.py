@@ -23,7 +23,7 @@ from avatar.types import HeadParams
 
 def started(model: str) -> tuple[Avatar, torch.optim.Adam, TrainerConfig]:
     """An avatar after one optimizer step whose gradients are 1."""
-    config = small_config("preset=paper", f"model={model}", "trainer.iterations=100")
+    config = small_config("experiment=paper", f"model={model}", "trainer.iterations=100")
     avatar = Avatar(grid_head(), torch.zeros(3), config.model)
     optimizer = make_optimizer(avatar, config.trainer)
     for parameter in avatar.parameters():
@@ -71,7 +71,7 @@ def test_a_set_grows_beside_what_is_seen_and_covers_as_much() -> None:
     assert torch.equal(now[others], places[others])
     away = (now[born] - places[parents]).norm(dim=1) / avatar.log_scales[born].mean(dim=1).exp()
     assert 0.3 < float(away.median()) < 3.0 and float(away.max()) < 6.0
-    torch.testing.assert_close(avatar.code, positional_encoding(now, avatar.config.frequencies))
+    torch.testing.assert_close(avatar.code, positional_encoding(now))
 
 
 def test_growth_repeats_to_the_bit_and_another_seed_is_another_set() -> None:

@@ -10,44 +10,6 @@
 #include "thread_pool.h"
 
 namespace avatar::splat {
-namespace {
-
-// The first and last pixel whose centre lies in [low, high], within [begin, end); first > last where there is none.
-struct PixelRange {
-    int first, last;
-};
-
-PixelRange pixels_between(double low, double high, int begin, int end) {
-    const double first = std::ceil(low - 0.5), last = std::floor(high - 0.5);
-    return {first > begin ? int(std::min(first, double(end))) : begin,
-            last < end - 1.0 ? int(std::max(last, begin - 1.0)) : end - 1};
-}
-
-std::int64_t tiles_between(const Splat& s, double half_x, double half_y, const TileGrid& grid) {
-    const Region& region = grid.region;
-    const PixelRange columns = pixels_between(s.x - half_x, s.x + half_x, region.left, region.right);
-    const PixelRange rows = pixels_between(s.y - half_y, s.y + half_y, region.top, region.bottom);
-    if (columns.first > columns.last || rows.first > rows.last) return 0;
-    return std::int64_t{columns.last / kTileWidth - columns.first / kTileWidth + 1} *
-           (rows.last / kTileHeight - rows.first / kTileHeight + 1);
-}
-
-}  // namespace
-
-std::int64_t tiles_of_box(const Splat& s, const TileGrid& grid) {
-    const double radius = std::sqrt(double(s.reach));
-    return tiles_between(s, radius * std::hypot(1.0, s.b / s.c) / s.a, radius / s.c, grid);
-}
-
-std::int64_t tiles_of_square(const Splat& s, const TileGrid& grid) {
-    // The covariance is kHalfLog2E times the inverse of the squared factor (a, b; 0, c).
-    const double yy = 1.0 / (s.c * s.c), xx = (1.0 + s.b * s.b * yy) / (s.a * s.a), det = yy / (s.a * s.a);
-    const double middle = 0.5 * (xx + yy);
-    const double longest = kHalfLog2E * (middle + std::sqrt(std::max(middle * middle - det, 0.0)));
-    const double half = 3.0 * std::sqrt(longest);
-    return tiles_between(s, half, half, grid);
-}
-
 Span* SpanStore::take(void* store, std::int64_t count) {
     auto& self = *static_cast<SpanStore*>(store);
     if (count > self.left_) {

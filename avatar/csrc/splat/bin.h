@@ -38,9 +38,4 @@ constexpr std::int64_t kRange = 256;
 void fill_tile_lists(const std::vector<std::uint32_t>& order, const std::vector<std::vector<std::uint32_t>>& tiles_of,
                      const TileGrid& grid, int threads, TileLists& lists);
 
-// How many tiles other ways of choosing them would take: the box around the ellipse, and the square of three standard
-// deviations of the longer axis.
-std::int64_t tiles_of_box(const Splat& splat, const TileGrid& grid);
-std::int64_t tiles_of_square(const Splat& splat, const TileGrid& grid);
-
 }  // namespace avatar::splat

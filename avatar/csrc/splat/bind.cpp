@@ -19,7 +19,6 @@ namespace {
 
 using Floats = Array<float>;
 using ConstFloats = Array<const float>;
-constexpr std::size_t kCounts = sizeof(Counts) / sizeof(std::int64_t);
 
 // Also of gradients, whose names begin with `prefix`. sh must hold the coefficients of `sh_degree`.
 template <typename T>
@@ -52,13 +51,12 @@ void bind_splat(nb::module_& m) {
            ConstFloats background, std::array<double, 9> rotation, std::array<double, 3> translation,
            std::array<double, 4> intrinsics, int sh_degree, std::array<float, 3> cutoffs, double blur, double near,
            bool antialiased, std::array<int, 4> region, const std::string& simd, int threads, Floats image,
-           Floats alpha, std::optional<Array<std::int64_t>> counts, bool everywhere) {
+           Floats alpha, bool everywhere) {
             Size N("N"), K("K"), H("H"), W("W");
             check_gaussians("", means, quats, scales, opacities, sh, sh_degree, N, K);
             check_shape("background", background, {3});
             check_shape("image", image, {H, W, 3});
             check_shape("alpha", alpha, {H, W});
-            if (counts) check_shape("counts", *counts, {kCounts});
             avatar::check_within("region's left column", region[0], 0, W.value - 1);
             avatar::check_within("region's top row", region[1], 0, H.value - 1);
             avatar::check_within("region's end column", region[2], region[0] + 1, W.value);
@@ -72,19 +70,16 @@ void bind_splat(nb::module_& m) {
                                     everywhere};
             const Kernels& kernels = select_kernels(simd.c_str());
             const nb::gil_scoped_release unlocked;
-            Counts counted{};
-            auto drawing = forward(gaussians_of(means, quats, scales, opacities, sh), camera, settings,
+            return forward(gaussians_of(means, quats, scales, opacities, sh), camera, settings,
                            {region[0], region[1], region[2], region[3]}, background.data(), kernels, threads,
-                           image.data(), alpha.data(), counts ? &counted : nullptr);
-            if (counts) std::memcpy(counts->data(), &counted, sizeof counted);
-            return drawing;
+                           image.data(), alpha.data());
         },
         nb::arg("means").noconvert(), nb::arg("quats").noconvert(), nb::arg("scales").noconvert(),
         nb::arg("opacities").noconvert(), nb::arg("sh").noconvert(), nb::arg("background").noconvert(),
         nb::arg("rotation"), nb::arg("translation"), nb::arg("intrinsics"), nb::arg("sh_degree"), nb::arg("cutoffs"),
         nb::arg("blur"), nb::arg("near"), nb::arg("antialiased"), nb::arg("region"), nb::arg("simd"),
         nb::arg("threads"), nb::arg("image").noconvert(), nb::arg("alpha").noconvert(),
-        nb::arg("counts").noconvert() = nb::none(), nb::arg("everywhere") = false);
+        nb::arg("everywhere") = false);
 
     m.def(
         "splat_backward",

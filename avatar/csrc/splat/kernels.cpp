@@ -9,8 +9,7 @@
 namespace avatar::splat {
 
 extern const Kernels AVATAR_KERNELS;
-const Kernels AVATAR_KERNELS = {kWords,           all_finite,          project,
-                                project_backward, forward_tile<false>, forward_tile<true>,
-                                backward_tile};
+const Kernels AVATAR_KERNELS = {kWords,           all_finite,   project,
+                                project_backward, forward_tile, backward_tile};
 
 }  // namespace avatar::splat

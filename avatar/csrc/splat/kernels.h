@@ -16,7 +16,6 @@ struct Kernels {
                              const std::uint32_t* slot_begin, const float* moments, const GaussianGradients&,
                              double* grad_pose);
     void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
-    void (*count_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);  // draws as forward_tile and counts
     void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
 };
 

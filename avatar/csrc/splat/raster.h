@@ -17,12 +17,6 @@ struct Raster {
     float background[3];
 };
 
-// What drawing one tile took; see Counts in splat.h.
-struct TileCounts {
-    std::int64_t pairs_processed, pixels_evaluated, pixels_composited;
-    std::int32_t blocks, blocks_stopped;
-};
-
 constexpr int kNeverStops = 0x7fffffff;  // a pair's number
 
 typedef unsigned long long Word;  // of a set of blocks, as bits
@@ -34,8 +28,7 @@ struct ForwardTarget {
     // [tiles * 2 * kTilePixels], in the kernels' own order, the transmittance behind all splats, and the bits of a number:
     // the pair of the tile from which on the pixel shows none, 0 outside the region.
     float* ends;
-    Word* blocks;        // [pairs * Kernels::words] that were looked at; from count_tile: that show the splat
-    TileCounts* counts;  // [tiles]; written by count_tile only
+    Word* blocks;  // [pairs * Kernels::words] that were looked at
 };
 
 struct BackwardSource {

@@ -4,12 +4,6 @@
 namespace avatar::splat {
 namespace {
 
-inline int size_of(const Word set[kWords]) {
-    int size = 0;
-    for (int w = 0; w < kWords; ++w) size += __builtin_popcountll(set[w]);
-    return size;
-}
-
 // (u, v) at the first pixels of blocks, and which blocks may have a pixel where alpha reaches alpha_min. The former are
 // there for the rows of the latter only.
 struct Blocks {
@@ -51,7 +45,6 @@ struct Blocks {
     }
 };
 
-template <bool kCount>
 void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& target) {
     const TileArea area(r, tile);
     // A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance; nothing
@@ -75,8 +68,6 @@ void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& targe
     }
     Word alive[kWords];
     area.blocks(alive);
-    TileCounts counts{};
-    if (kCount) counts.blocks = size_of(alive);
 
     const Floats alpha_min = broadcast(r.alpha_min), alpha_max = broadcast(r.alpha_max), t_min = broadcast(r.t_min);
     const std::int64_t begin = r.tile_begin[tile], count = r.tile_begin[tile + 1] - begin;
@@ -114,20 +105,10 @@ void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& targe
                           stopping ? (Floats)(Ints{} + static_cast<int>(at)) : load(p + kStops * kLanes));
                     if (signs(stopped) == kAllLanes) alive[w] &= ~(Word{1} << bit);
                 }
-                if (kCount) {
-                    counts.pixels_evaluated += kLanes;
-                    counts.pixels_composited += __builtin_popcount(signs(drawn));
-                    if (signs(drawn) == 0) blocks_of_pairs[at * kWords + w] &= ~(Word{1} << bit);
-                }
             }
         }
     }
     __builtin_memset(blocks_of_pairs + at * kWords, 0, (count - at) * kWords * sizeof(Word));
-    if (kCount) {
-        counts.pairs_processed = at;
-        counts.blocks_stopped = counts.blocks - size_of(alive);
-        target.counts[tile] = counts;
-    }
 
     float* const ends = target.ends + tile * 2 * kTilePixels;
     for (int block = 0; block < kBlocks; ++block) {

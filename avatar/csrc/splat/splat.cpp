@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <atomic>
 #include <numeric>
-#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -78,37 +77,6 @@ void add_outside(const Drawing& drawing, const float* grad_image, double grad_ba
     for (std::size_t i = 0; i < rows.size(); ++i) grad_background[i % 3] += rows[i];
 }
 
-void count_drawing(const Drawing& drawing, const std::vector<Visibility>& visibility,
-                   const std::vector<TileCounts>& tile_counts, Counts& counts) {
-    constexpr Visibility reasons[4] = {Visibility::kTransparent, Visibility::kNear, Visibility::kFlat,
-                                       Visibility::kOutside};
-    for (int k = 0; k < 4; ++k) counts.hidden[k] = std::count(visibility.begin(), visibility.end(), reasons[k]);
-    counts.visible = std::count(visibility.begin(), visibility.end(), Visibility::kVisible);
-    const TileLists& lists = drawing.lists;
-    const TileGrid grid(drawing.view.region);
-    std::vector<bool> shown(visibility.size());
-    const std::int64_t words = drawing.kernels->words;
-    for (std::int64_t k = 0; k < lists.pair_count; ++k)
-        for (std::int64_t w = 0; w < words; ++w)
-            if (drawing.blocks[k * words + w] != 0) shown[lists.pairs[k].splat] = true;
-    counts.without_effect = counts.visible - std::count(shown.begin(), shown.end(), true);
-    for (std::size_t i = 0; i < visibility.size(); ++i) {
-        if (visibility[i] != Visibility::kVisible) continue;
-        counts.pairs_in_boxes += tiles_of_box(drawing.splats[i], grid);
-        counts.pairs_in_squares += tiles_of_square(drawing.splats[i], grid);
-    }
-    counts.tiles = static_cast<std::int64_t>(tile_counts.size());
-    for (const TileCounts& t : tile_counts) {
-        counts.tiles_stopped += t.blocks == t.blocks_stopped;
-        counts.blocks += t.blocks;
-        counts.blocks_stopped += t.blocks_stopped;
-        counts.pairs_processed += t.pairs_processed;
-        counts.pixels_evaluated += t.pixels_evaluated;
-        counts.pixels_composited += t.pixels_composited;
-    }
-    counts.pairs = lists.pair_count;
-}
-
 std::vector<std::uint32_t> tiles_in(const TileSpans* spans_of, std::int64_t count, std::int64_t tile_count) {
     std::vector<std::uint32_t> tiles(tile_count);
     std::uint32_t* next = tiles.data();
@@ -119,9 +87,8 @@ std::vector<std::uint32_t> tiles_in(const TileSpans* spans_of, std::int64_t coun
     return tiles;
 }
 
-// Projects all Gaussians and makes the tile lists of the visible ones, whose visibility it gives. Empty when an input is
-// not finite.
-std::optional<std::vector<Visibility>> project_all(const Gaussians& gaussians, Drawing& drawing) {
+// Projects all Gaussians and makes the tile lists of the visible ones. False when an input is not finite.
+bool project_all(const Gaussians& gaussians, Drawing& drawing) {
     const std::int64_t count = gaussians.count, ranges = (count + kRange - 1) / kRange;
     const Kernels& kernels = *drawing.kernels;
     const TileGrid grid(drawing.view.region);
@@ -148,7 +115,7 @@ std::optional<std::vector<Visibility>> project_all(const Gaussians& gaussians, D
         if (kept.fetch_add(pairs) + pairs > kMaxPairs) return;  // refused below: only their number still matters
         tiles_of[begin / kRange] = tiles_in(spans, end - begin, pairs);
     });
-    if (!finite) return std::nullopt;
+    if (!finite) return false;
 
     std::int64_t pairs = 0;
     for (std::int64_t i = 0; i < count; ++i) {
@@ -165,14 +132,14 @@ std::optional<std::vector<Visibility>> project_all(const Gaussians& gaussians, D
                                 "; are the scales too large for this camera?");
     const std::vector<std::uint32_t> order = depth_order(depths.get(), visibility.data(), count);
     fill_tile_lists(order, tiles_of, grid, drawing.threads, lists);
-    return visibility;
+    return true;
 }
 
 }  // namespace
 
 std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camera, const Settings& settings,
                                  const Region& region, const float background[3], const Kernels& kernels, int threads,
-                                 float* image, float* alpha, Counts* counts) {
+                                 float* image, float* alpha) {
     std::unique_ptr<Drawing> drawing(new Drawing{View(camera, settings, region),
                                                  {background[0], background[1], background[2]},
                                                  &kernels,
@@ -181,25 +148,17 @@ std::unique_ptr<Drawing> forward(const Gaussians& gaussians, const Camera& camer
                                                  {},
                                                  {},
                                                  {}});
-    const std::optional<std::vector<Visibility>> visibility = project_all(gaussians, *drawing);
-    if (!visibility) return nullptr;
+    if (!project_all(gaussians, *drawing)) return nullptr;
 
     const std::int64_t tiles = TileGrid(region).count();
     // Not initialised: the kernels write all that they read.
     drawing->ends.reset(new float[tiles * 2 * kTilePixels]);
     drawing->blocks.reset(new Word[drawing->lists.pair_count * kernels.words]);
     const Raster raster = raster_of(*drawing);
-    std::vector<TileCounts> tile_counts(counts != nullptr ? tiles : 0);
-    const ForwardTarget target{image,
-                               alpha,
-                               drawing->ends.get(),
-                               drawing->blocks.get(),
-                               tile_counts.data()};
-    const auto draw_tile = counts != nullptr ? kernels.count_tile : kernels.forward_tile;
+    const ForwardTarget target{image, alpha, drawing->ends.get(), drawing->blocks.get()};
     parallel_for(threads, tiles, 1, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t k = begin; k < end; ++k) draw_tile(raster, drawing->lists.tile_order[k], target);
+        for (std::int64_t k = begin; k < end; ++k) kernels.forward_tile(raster, drawing->lists.tile_order[k], target);
     });
-    if (counts != nullptr) count_drawing(*drawing, *visibility, tile_counts, *counts);
     if (!is_whole_image(drawing->view)) draw_outside(*drawing, image, alpha);
     return drawing;
 }
