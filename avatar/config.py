@@ -53,8 +53,8 @@ class ModelConfig:
     mlp_layers: Annotated[int, Range(1, 1000), "hidden layers of the deformation network"] = 6
     initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6), "opacity of every Gaussian before training"] = 0.3
     blur: Annotated[float, Range(0, 100), "pixels^2 added to both variances of a projected Gaussian"] = 0.05
-    rigidity: Annotated[bool, "learn how far each Gaussian moves with the skull instead of the skin"] = True
-    facing: Annotated[bool, "give the network the head's rotation relative to the camera"] = True
+    skull_binding: Annotated[bool, "learn how far each Gaussian moves with the skull instead of the skin"] = True
+    head_rotation: Annotated[bool, "give the network the head's rotation relative to the camera"] = True
     teeth: Annotated[bool, "add two rows of Gaussians behind the lips that move with skull and jaw"] = True
 
 
@@ -91,7 +91,7 @@ class TrainerConfig:
     )
     dssim_weight: Annotated[float, WEIGHT, "weight of D-SSIM in steps where it replaces LPIPS"] = 0.2
     dssim_early: Annotated[float, WEIGHT, "weight of D-SSIM before the perceptual loss begins"] = 0.1
-    stray_share: Annotated[
+    prune_share: Annotated[
         float, SHARE, "Gaussians whose rendered coverage lies less than this share on the head are pruned; 0: none"
     ] = 0.05
     align_rate: Annotated[

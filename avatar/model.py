@@ -9,20 +9,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.config import ModelConfig
 from avatar.gaussians.compose import compose_carried, compose_raw, compose_slice
 from avatar.gaussians.covariance import CovarianceHeads
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size, positional_encoding
-from avatar.gaussians.facing import VALUES, facing, learned_turning
 from avatar.gaussians.growth import alive_after, evenly_ordered
+from avatar.gaussians.head_rotation import VALUES, head_rotation_input, learned_turning
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import LatentGrid, latent_grid
 from avatar.gaussians.mesh_points import MeshPoints
 from avatar.gaussians.ndgs import NdGaussians
-from avatar.gaussians.rigidity import INITIAL_LOGIT, Hold, Skull, held
+from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, PoseTensors
@@ -45,7 +45,7 @@ class Avatar(nn.Module):
     `name = "monogaussianavatar"`: the same for the first `count` points of a set that grows in training.
     `name = "splattingavatar"`: no network; learned places on the mesh, which alone moves the Gaussians.
     With `rigidity`, Gaussians that are bound to a texel learn how far they keep with the skull in place of the skin.
-    With `facing`, the network is told how the head is turned before the camera.
+    With `head_rotation_input`, the network is told how the head is turned before the camera.
     With `teeth`, `mesh`, which Gaussians are bound to, goes on after the vertices and triangles of `head`; else it is
     `head`.
 
@@ -55,7 +55,7 @@ class Avatar(nn.Module):
 
     code: Tensor
     count: Tensor | None  # of the points that are alive; None: all are
-    turning: Tensor | None  # of `avatar.gaussians.facing`; zeros until `learn_facing`
+    turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__()
@@ -80,12 +80,12 @@ class Avatar(nn.Module):
         if config.name != "splattingavatar":
             self.deformation = DeformationMLP(
                 code_size=encoded_size(),
-                condition_size=assets.num_expressions + CONDITION_EXTRAS + (VALUES if config.facing else 0),
+                condition_size=assets.num_expressions + CONDITION_EXTRAS + (VALUES if config.head_rotation else 0),
                 out_size=config.latent_dim if has_latents else 10,
                 width=config.mlp_width,
                 layers=config.mlp_layers,
             )
-        tells = config.facing and self.deformation is not None
+        tells = config.head_rotation and self.deformation is not None
         self.register_buffer("turning", torch.zeros(3, 9) if tells else None)
         self._turning_at_hand: Tensor | None = None  # on the CPU, where `turning` is not
         self.mesh_points: MeshPoints | None = None
@@ -98,10 +98,10 @@ class Avatar(nn.Module):
             self.hyper = (HyperHeads if config.name == "hypergaussians" else CovarianceHeads)(N, config.latent_dim)
         self.ndgs = NdGaussians(N, config.latent_dim) if config.name == "ndgs" else None
         self.skull: Skull | None = None
-        self.rigidity_logits: nn.Parameter | None = None
-        if config.rigidity and self.mesh_points is None:
+        self.skull_logits: nn.Parameter | None = None
+        if config.skull_binding and self.mesh_points is None:
             self.skull = Skull.of(self.mesh, self.embedding)
-            self.rigidity_logits = nn.Parameter(torch.full((N,), INITIAL_LOGIT))
+            self.skull_logits = nn.Parameter(torch.full((N,), INITIAL_LOGIT))
 
         initial_scale = torch.log(torch.cat((knn_scales(neutral[:alive]), knn_scales(neutral)[alive:])))
         self.log_scales = nn.Parameter(initial_scale[:, None].repeat(1, 3))
@@ -123,25 +123,25 @@ class Avatar(nn.Module):
         vertices: Float[Tensor, "V 3"] | None = None,
         rotation: Float[Tensor, "3 3"] | None = None,
         *,
-        told: Float[Tensor, " 3"] | None = None,
+        head_rotation: Float[Tensor, " 3"] | None = None,
     ) -> Gaussians:
         """The Gaussians of one frame, world space.
 
         vertices  the head posed by `params` already, metres
         rotation  R_cam_world of the camera that sees it; None: the head is turned as on average in training
-        told      what `told` gave for that rotation, if it is there already
+        told      what `head_rotation` gave for that rotation, if it is there already
         """
         vertices = self.vertices(params) if vertices is None else vertices
         base = self.base()
         if self.deformation is None:
             assert self.mesh_points is not None
             return compose_carried(self.mesh_points.points(vertices), self.mesh_points.turns(vertices), *base)
-        values = self.deformation(self.living(self.code), self.condition(params, rotation, told))
+        values = self.deformation(self.active(self.code), self.condition(params, rotation, head_rotation))
         if on_gpu(values) and values.dtype == torch.float32 and self.is_fused:
             from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
 
             grid = None if self.grid is None else self.grid.interpolate
-            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid, self.hold(params))
+            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid, self.skull_binding(params))
         if self.grid is not None:
             values = self.grid.interpolate(values)
         points = self.points(vertices, params)
@@ -154,29 +154,29 @@ class Avatar(nn.Module):
     def base(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Quaternions, log-scales, logits of the opacities and colours of the Gaussians that are alive."""
         sh = torch.cat((self.sh_dc, self.sh_rest), dim=1)
-        quats, log_scales, opacity_logits, sh = map(self.living, (self.quats, self.log_scales, self.opacity_logits, sh))
+        quats, log_scales, opacity_logits, sh = map(self.active, (self.quats, self.log_scales, self.opacity_logits, sh))
         return quats, log_scales, opacity_logits, sh
 
-    def living(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "alive ..."]:
+    def active(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "alive ..."]:
         """Those of the points that are alive."""
         return values if self.count is None else values[: int(self.count)]
 
     def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "alive 3"]:
         """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""
         if self.mesh_points is not None:
-            return self.living(self.mesh_points.points(vertices))
-        return held(self.embedding.points(vertices), self.hold(params))
+            return self.active(self.mesh_points.points(vertices))
+        return bind_to_skull(self.embedding.points(vertices), self.skull_binding(params))
 
-    def hold(self, params: HeadParams) -> Hold | None:
+    def skull_binding(self, params: HeadParams) -> SkullBinding | None:
         """What brings the Gaussians' points to the skull in a frame."""
-        if self.skull is None or self.rigidity_logits is None:
+        if self.skull is None or self.skull_logits is None:
             return None
-        return Hold(self.skull, params.neck, self.rigidity_logits)
+        return SkullBinding(self.skull, params.neck, self.skull_logits)
 
     @property
-    def rigidity(self) -> Float[Tensor, " N"] | None:
+    def skull_shares(self) -> Float[Tensor, " N"] | None:
         """The share in which each Gaussian keeps with the skull, in [0, 1]; None where none does."""
-        return None if self.rigidity_logits is None else torch.sigmoid(self.rigidity_logits)
+        return None if self.skull_logits is None else torch.sigmoid(self.skull_logits)
 
     def encode_points(self) -> None:
         """Give the network the places that points on the mesh have now."""
@@ -211,7 +211,7 @@ class Avatar(nn.Module):
         if self._pose is None or self._pose.shape.device != device:
             self._pose = self.mesh.pose_tensors(device)
         if self._pose is None:
-            return brought(self.mesh.vertices(params.to(torch.device("cpu"))), device)
+            return to_device(self.mesh.vertices(params.to(torch.device("cpu"))), device)
         from avatar.head.pose_gpu import pose_gpu
 
         return pose_gpu(self._pose, params.to(device))
@@ -228,28 +228,35 @@ class Avatar(nn.Module):
         return self
 
     def condition(
-        self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None = None, told: Float[Tensor, " 3"] | None = None
+        self,
+        params: HeadParams,
+        rotation: Float[Tensor, "3 3"] | None = None,
+        head_rotation: Float[Tensor, " 3"] | None = None,
     ) -> Float[Tensor, " D"]:
-        """The network's input, with expression coefficients that the frame does not carry as zeros. `rotation` and `told`:
-        as in `forward`."""
+        """The network's input, with expression coefficients that the frame does not carry as zeros.
+
+        rotation, head_rotation  as in `forward`
+        """
         parts = [params.expression, params.jaw, params.eyes, params.eyelids]
         missing = self.head.assets.num_expressions - len(params.expression)
         if missing > 0:
             parts.insert(1, params.jaw.new_zeros(missing))
         if self.turning is not None:
-            if told is None:
-                told = params.jaw.new_zeros(VALUES) if rotation is None else self.told(rotation)
-            parts.append(brought(told, params.jaw.device))
-        return brought(torch.cat(parts), self.code.device)
+            if head_rotation is None:
+                head_rotation = params.jaw.new_zeros(VALUES) if rotation is None else self.head_rotation(rotation)
+            parts.append(to_device(head_rotation, params.jaw.device))
+        return to_device(torch.cat(parts), self.code.device)
 
-    def told(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
-        """What the network of an avatar with `facing` is told of a camera's R_cam_world; where that is, so that a camera on
-        the CPU costs a GPU one copy."""
+    def head_rotation(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+        """The network's input for the head's rotation before a camera with this R_cam_world (`model.head_rotation`).
+
+        Where `rotation` is, so that a camera on the CPU costs a GPU one copy.
+        """
         assert self.turning is not None
         at_hand = self.turning if self._turning_at_hand is None else self._turning_at_hand
-        return facing(at_hand if rotation.is_cpu else self.turning, rotation)
+        return head_rotation_input(at_hand if rotation.is_cpu else self.turning, rotation)
 
-    def learn_facing(self, rotations: Float[Tensor, "T 3 3"]) -> None:
+    def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:
         """Before training: how heads are turned in its frames, whose R_cam_world these are."""
         if self.turning is not None:
             self.turning.copy_(learned_turning(rotations))

@@ -20,13 +20,13 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.compute.workers import single_threaded_workers
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose_carried, compose_raw, compose_slice
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.ndgs import Slice
-from avatar.gaussians.rigidity import Hold, held
+from avatar.gaussians.skull_binding import SkullBinding, bind_to_skull
 from avatar.model import Avatar
 from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
@@ -45,14 +45,14 @@ class Renderer:
 
     @torch.no_grad()
     def __init__(self, avatar: Avatar, background: Float[Tensor, " 3"]) -> None:
-        self.background = brought(background.detach().clone(), avatar.code.device)
+        self.background = to_device(background.detach().clone(), avatar.code.device)
         self._avatar = avatar
         self._network = None if avatar.deformation is None else FoldedNetwork(avatar, avatar.deformation)
         self._on_gpu = on_gpu(avatar.code) and avatar.is_fused
         self._heads = None if avatar.hyper is None or self._on_gpu else avatar.hyper.fold()
         self._packed = avatar.packed.detach().clone() if self._on_gpu and avatar.packed is not None else None
         self._ndgs, self._mesh_points = deepcopy(avatar.ndgs), deepcopy(avatar.mesh_points)
-        self._rigidity_logits = deepcopy(avatar.rigidity_logits)
+        self._skull_logits = deepcopy(avatar.skull_logits)
         names = ("quats", "log_scales", "opacity_logits", "sh")
         self._base = {name: value.detach().clone() for name, value in zip(names, avatar.base(), strict=True)}
 
@@ -75,7 +75,7 @@ class Renderer:
                 **self._base,
                 embedding=avatar.embedding,
                 grid=None if grid is None else grid.interpolate,
-                hold=self._hold(params),
+                skull_binding=self._skull_binding(params),
             )
         return self.place(self.points(self.vertices(params), params), self.offsets(self.latents(params, camera)))
 
@@ -151,11 +151,15 @@ class Renderer:
             return self._mesh_points.points(vertices)[: len(self._base["quats"])]
         embedding = self._avatar.embedding
         points = embedding_bag(embedding.corners, vertices, mode="sum", per_sample_weights=embedding.barycentric)
-        return held(points, self._hold(params))
+        return bind_to_skull(points, self._skull_binding(params))
 
-    def _hold(self, params: HeadParams) -> Hold | None:
-        hold = self._avatar.hold(params)
-        return None if hold is None or self._rigidity_logits is None else hold._replace(logits=self._rigidity_logits)
+    def _skull_binding(self, params: HeadParams) -> SkullBinding | None:
+        skull_binding = self._avatar.skull_binding(params)
+        return (
+            None
+            if skull_binding is None or self._skull_logits is None
+            else skull_binding._replace(logits=self._skull_logits)
+        )
 
     def latents(self, params: HeadParams, camera: Camera | None = None) -> Float[Tensor, "N n"]:
         """The network's output for each Gaussian, as in `gaussians`. Raises ValueError for an avatar without a network."""
@@ -188,7 +192,7 @@ class FoldedNetwork:
 
     def __init__(self, avatar: Avatar, network: DeformationMLP) -> None:
         for_code, for_condition = network.input.weight.detach().split((network.code_size, network.condition_size), 1)
-        self._of_code: Float[Tensor, "M width"] = avatar.living(avatar.code) @ for_code.T
+        self._of_code: Float[Tensor, "M width"] = avatar.active(avatar.code) @ for_code.T
         self._for_condition, self._bias = for_condition.clone(), network.input.bias.detach().clone()
         self._layers = [
             (layer.get_parameter("weight").detach().T.clone(), layer.get_parameter("bias").detach().clone())

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 
 IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
@@ -81,7 +81,7 @@ class HeadParams:
         if self.jaw.device == device:
             return self
         parts = (self.expression, self.jaw, self.eyes, self.eyelids, self.neck)
-        expression, jaw, eyes, eyelids, neck = brought(torch.cat(parts), device).split([len(part) for part in parts])
+        expression, jaw, eyes, eyelids, neck = to_device(torch.cat(parts), device).split([len(part) for part in parts])
         return HeadParams(expression, jaw, eyes, eyelids, neck)
 
 

@@ -37,11 +37,11 @@ from avatar.model import Avatar
 from avatar.render import Renderer
 from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera
-from avatar.tracking.freedom import find_freedom
-from avatar.train.ahead import Guard
+from avatar.tracking.parameterization import find_freedom
 from avatar.train.align import Alignment
-from avatar.train.optim import make_optimizer
+from avatar.train.optimizer import make_optimizer
 from avatar.train.step import SPARSE_EVERY, Objective, PerceptualTerm, Weighted, training_step
+from avatar.train.step_monitor import Guard
 from avatar.types import IDENTITY_6D, Frame, HeadParams
 
 META = torch.device("meta")
@@ -156,7 +156,7 @@ class Rehearsal:
                     seen = alignment.see(number, self.frame, cast(FrameLoader, None), print)
                     step = objective, number, seen.frame, seen.vertices, self.guard.judge, seen.watched
                     training_step(self.avatar, self.optimizer, *step)
-                    alignment.learn(seen, self.guard.is_spoilt)
+                    alignment.learn(seen, self.guard.is_nonfinite)
         return launches
 
     def recording(self) -> Recording:

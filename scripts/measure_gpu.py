@@ -32,7 +32,7 @@ from avatar.splat import gpu_draw, splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.train.step import Objective, PerceptualTerm, Weighted
-from avatar.train.steps import WARM, Steps
+from avatar.train.step_runner import WARM, Steps
 from avatar.types import Gaussians
 
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # mean over the pixels, of a field's norm; cut-offs may decide a pixel
@@ -125,7 +125,7 @@ class Replays:
 
     def train(self, late: bool) -> None:
         r = self.rehearsal
-        self.steps.make(r.number(late), r.frame, r.guard.judge, r.guard.is_spoilt)
+        self.steps.make(r.number(late), r.frame, r.guard.judge, r.guard.is_nonfinite)
 
 
 def check_replays(make: Callable[[], Rehearsal]) -> str:

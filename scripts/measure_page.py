@@ -46,7 +46,7 @@ def open_page(browser: Any, path: Path, renderer: str) -> tuple[Any, float]:
     return page, time.perf_counter() - begin
 
 
-def likeness(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
+def fitter(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
     """Lowest and mean PSNR to our renderer over FRAMES held-out frames, 8 bits a channel."""
     test = list(trained.recording.split.test)
     found = []
@@ -127,7 +127,7 @@ def main() -> None:
             )
             for renderer in ("wasm", "webgl"):
                 page, first = open_page(browser, page_file.path, renderer)
-                least, mean = likeness(page, trained)
+                least, mean = fitter(page, trained)
                 line = f"{precision}, {renderer}: PSNR at least {least:.1f} dB, mean {mean:.1f}"
                 line += f"; first picture {first:.1f} s"
                 if precision == "small":

@@ -30,7 +30,7 @@ def lively_avatar(folder: Path, run: Path, *overrides: str, seed: int = 3) -> Tr
         "hyper": 0.02,
         "ndgs": 0.02,
         "mesh_points": 0.002,
-        "rigidity_logits": 2.0,
+        "skull_logits": 2.0,
     }
     with torch.no_grad():
         for name, parameter in trained.avatar.named_parameters():

@@ -15,7 +15,6 @@ from avatar.errors import UserError
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
 from avatar.model import SH_DEGREE
-from avatar.train import optim
 from avatar.train.step import perceptual_start
 
 
@@ -26,8 +25,8 @@ def test_the_papers_recipe() -> None:
     assert (config.model.name, config.model.latent_dim, config.model.uv_size) == ("hypergaussians", 8, 128)
     assert (config.model.mlp_width, config.model.mlp_layers, FREQUENCIES, SH_DEGREE) == (256, 6, 8, 3)
     rates = config.trainer.learning_rates
-    assert (rates.sh_dc, rates.sh_rest, optim.OPACITY_RATE) == (2.5e-3, 2.5e-3 / 20, 0.05)
-    assert (rates.scale, rates.rotation, optim.NETWORK_RATE, optim.HYPER_RATE) == (5e-3, 1e-3, 1e-4, 1e-4)
+    assert (rates.sh_dc, rates.sh_rest, optimizer.OPACITY_RATE) == (2.5e-3, 2.5e-3 / 20, 0.05)
+    assert (rates.scale, rates.rotation, optimizer.NETWORK_RATE, optimizer.HYPER_RATE) == (5e-3, 1e-3, 1e-4, 1e-4)
     assert (config.trainer.iterations, perceptual_start(config.trainer)) == (30000, 15000)
     assert config.data.background == (1.0, 1.0, 1.0)
 
@@ -68,8 +67,8 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "model.mlp_width": (128, 256),
         "model.initial_opacity": (0.3, 0.1),
         "model.blur": (0.05, 0.3),
-        "model.rigidity": (True, False),
-        "model.facing": (True, False),
+        "model.skull_binding": (True, False),
+        "model.head_rotation": (True, False),
         "model.teeth": (True, False),
         "trainer.iterations": (4000, 30000),
         "trainer.passes": (10, None),
@@ -84,7 +83,7 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "trainer.sparse_lpips": (True, False),
         "trainer.dssim_weight": (0.2, 0.05),
         "trainer.dssim_early": (0.1, 0.0),
-        "trainer.stray_share": (0.05, 0.0),
+        "trainer.prune_share": (0.05, 0.0),
         "trainer.align_rate": (0.25, 0.0),
         "trainer.condition_noise": (0.2, 0.0),
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from avatar.bench.results import leave
+from avatar.bench.results import write_report
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -31,5 +31,5 @@ def test_no_writer_of_json_writes_nan(package: str) -> None:
 
 
 def test_a_benchmark_writes_null_for_what_it_did_not_measure(tmp_path: Path) -> None:
-    leave(tmp_path, "bench_some", ["table"], {"rows": [{"lpips": float("nan"), "psnr": (30.5, float("inf"))}]})
+    write_report(tmp_path, "bench_some", ["table"], {"rows": [{"lpips": float("nan"), "psnr": (30.5, float("inf"))}]})
     assert json.loads((tmp_path / "bench_some.json").read_text())["rows"] == [{"lpips": None, "psnr": [30.5, None]}]

@@ -42,7 +42,7 @@ def trained_looking(*overrides: str) -> Avatar:
     "overrides",
     [
         ("model.latent_grid=4",),
-        ("model.rigidity=true",),
+        ("model.skull_binding=true",),
         ("model.blur=1",),
         ("model.latent_grid=null",),
         ("model=flashavatar",),

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from avatar.bench import Request
 from avatar.bench.hyper import LATENT_SIZES, QUICK_LATENT_SIZES, Row, measure
-from avatar.bench.results import leave, new_figure
+from avatar.bench.results import new_figure, write_report
 
 
 def run(request: Request) -> None:
     """Measure, print and write; `quick` takes too few Gaussians to say anything."""
     rows = measure(QUICK_LATENT_SIZES, count=300, repeats=3) if request.quick else measure(LATENT_SIZES)
     content = {"rows": [asdict(row) for row in rows]}
-    leave(
+    write_report(
         request.out, "bench_hyper", [*table(rows), "", *comparisons(rows)], content, lambda path: write_plot(rows, path)
     )
 

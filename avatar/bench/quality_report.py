@@ -8,7 +8,7 @@ from pathlib import Path
 
 from avatar.bench import Request
 from avatar.bench.quality import Curve, measure, pareto
-from avatar.bench.results import leave, new_figure
+from avatar.bench.results import new_figure, write_report
 
 FRAMES, FULL_FRAMES, QUICK_FRAMES = 50, 10_000, 2
 REPEATS, QUICK_REPEATS = 11, 1
@@ -21,7 +21,7 @@ def run(request: Request) -> None:
     repeats = QUICK_REPEATS if request.quick else REPEATS
     curves = measure(request.inputs, request.head, frames=frames, repeats=repeats)
     content = {"curves": [asdict(curve) for curve in curves]}
-    leave(request.out, "bench_quality", table(curves), content, lambda path: write_plot(curves, path))
+    write_report(request.out, "bench_quality", table(curves), content, lambda path: write_plot(curves, path))
 
 
 def table(curves: Sequence[Curve]) -> list[str]:

@@ -18,7 +18,7 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.disturb import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed
-from avatar.bench.results import leave
+from avatar.bench.results import write_report
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
@@ -86,7 +86,7 @@ def run(request: Request) -> None:
         "recovered": recovered(rows),
         "rows": [asdict(row) for row in rows],
     }
-    leave(request.out, f"bench_refine_{folder.resolve().name}", report(rows, config).splitlines(), content)
+    write_report(request.out, f"bench_refine_{folder.resolve().name}", report(rows, config).splitlines(), content)
 
 
 def measure(source: Source, config: Config, out: Path) -> list[Row]:

@@ -20,9 +20,9 @@ from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import limited_to
 from avatar.bench.render_plot import write_plot
-from avatar.bench.results import leave
+from avatar.bench.results import write_report
 from avatar.bench.splat_gpu import settle
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.errors import UserError
 from avatar.render import Renderer
 from avatar.runs.run import open_trained
@@ -62,7 +62,9 @@ def run(request: Request) -> None:
     trained.avatar.to(torch.device(request.device))
     rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
     content = {"avatar": describe(trained), "rows": [asdict(row) for row in rows]}
-    leave(request.out, "bench_render", table(rows, describe(trained)), content, lambda path: write_plot(rows, path))
+    write_report(
+        request.out, "bench_render", table(rows, describe(trained)), content, lambda path: write_plot(rows, path)
+    )
 
 
 def describe(trained: TrainedAvatar) -> dict[str, Any]:
@@ -159,7 +161,7 @@ def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callabl
 
 
 def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
-    background = brought(torch.tensor(trained.config.data.background), trained.avatar.code.device)
+    background = to_device(torch.tensor(trained.config.data.background), trained.avatar.code.device)
     return trained.avatar.draw(trained.avatar(params, None, camera.R_cam_world), camera, background)
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def leave(
+def write_report(
     folder: Path,
     name: str,
     table: Sequence[str],

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from avatar.bench import Request
-from avatar.bench.results import leave
+from avatar.bench.results import write_report
 from avatar.bench.splat import Row, all_variants, measure
 from avatar.bench.splat_gpu import ON_GPU, gpu_backends
 from avatar.bench.splat_plot import total, write_plot
@@ -40,7 +40,7 @@ def run(request: Request) -> None:
     scenes = dict.fromkeys((row.variant.count, row.variant.size) for row in rows) if is_measured else ()
     memory = {scene: peak_memory(*scene) for scene in scenes}
     lines = [*table(rows), *(memory_table(memory) if memory else ()), others_line()]
-    leave(request.out, "bench_splat", lines, as_json(rows, memory), lambda path: write_plot(rows, path))
+    write_report(request.out, "bench_splat", lines, as_json(rows, memory), lambda path: write_plot(rows, path))
 
 
 def as_json(rows: Sequence[Row], memory: Mapping[tuple[int, int], int]) -> dict[str, Any]:

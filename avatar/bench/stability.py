@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.bench import Request
-from avatar.bench.results import leave, new_figure
+from avatar.bench.results import new_figure, write_report
 from avatar.gaussians.hyper import Factor, conditional_mean
 
 ATTRIBUTE = 3  # values of a, as of a position
@@ -41,7 +41,7 @@ def run(request: Request) -> None:
     count = 16 if request.quick else 1000 if request.full else 200
     rows = measure(LATENTS[:4] if request.quick else LATENTS, CONDITIONS, count)
     found = {"gaussians": count, "rows": [asdict(row) for row in rows]}
-    leave(request.out, "stability", table(rows), found, lambda path: write_plot(rows, path))
+    write_report(request.out, "stability", table(rows), found, lambda path: write_plot(rows, path))
 
 
 def measure(latents: Sequence[int], conditions: Sequence[float], count: int) -> list[Row]:

@@ -13,10 +13,10 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.deformation import DeformationMLP
-from avatar.gaussians.rigidity import held
+from avatar.gaussians.skull_binding import bind_to_skull
 from avatar.losses.photometric import PhotometricLoss
 from avatar.model import Avatar
-from avatar.train.optim import schedule, set_rates
+from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import Objective, check_step
 from avatar.types import Frame, Gaussians
 
@@ -72,12 +72,12 @@ class StagedStep:
             heads = avatar.hyper
             (raw,) = self._forward("heads", lambda z: (heads(z),), [raw], list(heads.parameters()))
         base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
-        hold = avatar.hold(frame.params)
+        skull_binding = avatar.skull_binding(frame.params)
         gaussians = self._forward(
             "compose",
-            lambda z: compose_raw(held(points, hold), *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
+            lambda z: compose_raw(bind_to_skull(points, skull_binding), *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
             [raw],
-            base if avatar.rigidity_logits is None else [*base, avatar.rigidity_logits],
+            base if avatar.skull_logits is None else [*base, avatar.skull_logits],
         )
         (image,) = self._forward(
             "splat", lambda *g: (objective.draw(step, frame, Gaussians(*g), avatar),), list(gaussians)

@@ -22,7 +22,7 @@ import torch
 from avatar.bench import Request
 from avatar.bench.placement import Placement, corners_distance, placement
 from avatar.bench.refine import MEASURED_EVERY, Figures, Trial, figures
-from avatar.bench.results import leave
+from avatar.bench.results import write_report
 from avatar.config import Config, load_config
 from avatar.data.recording import TRACK_SHAPES, Recording
 from avatar.data.source import Source
@@ -109,7 +109,7 @@ def run(request: Request) -> None:
             results.append(measure(filmed, config, Path(scratch)))
     content = {"config": config.to_dict(), "subjects": [asdict(result) for result in results]}
     name = "_".join(["bench_track", *(folder.resolve().name for folder in request.inputs)])
-    leave(request.out, name, report(results, config), content)
+    write_report(request.out, name, report(results, config), content)
 
 
 @dataclass(frozen=True)

@@ -17,18 +17,18 @@ from avatar.bench.stages import StagedStep, network_of
 from avatar.compute.device import on_gpu
 from avatar.compute.replay import own_stream
 from avatar.config import Config, load_config
+from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
-from avatar.data.shelf import Shelf, shelf_bytes
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
-from avatar.tracking.likeness import Likeness
-from avatar.train.ahead import Guard
-from avatar.train.optim import make_optimizer
+from avatar.tracking.frame_fitter import FrameFitter
+from avatar.train.optimizer import make_optimizer
 from avatar.train.placed import moving_step
 from avatar.train.step import Judge, Objective, choose_perceptual, perceptual_start
-from avatar.train.steps import WARM, Steps
+from avatar.train.step_monitor import Guard
+from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
 
@@ -62,14 +62,14 @@ class Trainee:
     optimizer: torch.optim.Adam
     objective: Objective
     frames: Iterator[Frame]
-    steps: Steps
-    likeness: Likeness
+    steps: StepRunner
+    fitter: FrameFitter
     judge: Judge | None  # None: every step is checked at once
 
     def step(self, number: int, moves: bool = False) -> None:
         frame = next(self.frames)
         if moves:
-            moving_step(self.likeness, self.optimizer, self.objective, number, frame, self.judge)
+            moving_step(self.fitter, self.optimizer, self.objective, number, frame, self.judge)
         else:
             self.steps.make(number, frame, self.judge)
 
@@ -119,17 +119,17 @@ def trainee(
     train = subject.split.train
     chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
     device, is_gpu = avatar.code.device, on_gpu(avatar.code)
-    shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
-    with FrameLoader(subject, config.data.size, shelf=shelf) as loader:
+    frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None
+    with FrameLoader(subject, config.data.size, frame_cache=frame_cache) as loader:
         frames = list(loader.frames(chosen))
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
     optimizer = make_optimizer(avatar, config.trainer)
-    likeness = Likeness(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0).to(device))
+    fitter = FrameFitter(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0).to(device))
     judge = Guard(optimizer, device).judge if is_gpu else None
-    steps = Steps(avatar, optimizer, objective, say=say)
+    steps = StepRunner(avatar, optimizer, objective, say=say)
     steps.pose(frames)
-    return Trainee(config, avatar, optimizer, objective, cycle(frames), steps, likeness, judge)
+    return Trainee(config, avatar, optimizer, objective, cycle(frames), steps, fitter, judge)
 
 
 def silent(_: str) -> None:

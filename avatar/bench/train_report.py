@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from avatar.bench import Request
-from avatar.bench.results import leave, new_figure
+from avatar.bench.results import new_figure, write_report
 from avatar.bench.train import ONCE_A_FRAME, Row, as_json, measure, share_of_faithful
 
 REPEATS, QUICK_REPEATS, FULL_REPEATS = 15, 2, 41
@@ -21,7 +21,7 @@ def run(request: Request) -> None:
         "overrides": list(request.overrides),
         "rows": as_json(rows),
     }
-    leave(request.out, "bench_train", table(rows), content, lambda path: write_plot(rows, path))
+    write_report(request.out, "bench_train", table(rows), content, lambda path: write_plot(rows, path))
 
 
 def table(rows: Sequence[Row]) -> list[str]:

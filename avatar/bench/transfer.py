@@ -23,7 +23,7 @@ from torch import Tensor
 from avatar.bench import Request
 from avatar.bench.disturb import disturbed
 from avatar.bench.refine import Trial
-from avatar.bench.results import leave
+from avatar.bench.results import write_report
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
@@ -36,7 +36,7 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import psnr
 from avatar.model import Avatar
-from avatar.motion.repertoire import learn_repertoire
+from avatar.motion.statistics import learn_repertoire
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
@@ -89,7 +89,7 @@ def run(request: Request) -> None:
         "overrides": request.overrides,
         "rows": [asdict(row) for row in rows],
     }
-    leave(request.out, "bench_transfer", lines, content)
+    write_report(request.out, "bench_transfer", lines, content)
 
 
 def measure(
@@ -122,8 +122,8 @@ def measure(
         own = tracking_bias(TARGET_SEED, NEUTRAL_BIAS).expression
         rows = []
         for tracking, avatar, recording in avatars(target, assets, config, Path(scratch), trackings):
-            repertoire = learn_repertoire(recording.motion(target.split.train), avatar.head)
-            motions = {mode: transfer_motion(tracked, repertoire, mode, driver_head).motion for mode in TRANSFERS}
+            statistics = learn_repertoire(recording.motion(target.split.train), avatar.head)
+            motions = {mode: transfer_motion(tracked, statistics, mode, driver_head).motion for mode in TRANSFERS}
             motions[CEILING] = [replace(params, expression=params.expression + own) for params in true]
             renderer = Renderer(avatar, torch.tensor(config.data.background))
             rows += [compare(tracking, name, renderer, motion, cameras, truth) for name, motion in motions.items()]

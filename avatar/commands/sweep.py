@@ -43,7 +43,7 @@ def run_sweep(arguments: Namespace) -> int:
     except KeyboardInterrupt:
         print(f"\nInterrupted; what was done is kept. Go on with: avatar sweep --out {folder}")
         return INTERRUPTED
-    leave_tables(folder, spec)
+    write_sweep_tables(folder, spec)
     failed = [state for state in states.values() if state.status == "failed"]
     return FAILED if failed else OK
 
@@ -79,7 +79,7 @@ def reopen_failed(folder: Path, spec: Spec) -> None:
             write_state(place, replace(State(), seconds=state.seconds))
 
 
-def leave_tables(folder: Path, spec: Spec) -> None:
+def write_sweep_tables(folder: Path, spec: Spec) -> None:
     """The table on the terminal, and in every format in files, as far as there are results."""
     try:
         comparison = fold_results(folder, spec)

@@ -32,7 +32,7 @@ def visible_gpus() -> list[str]:
     return [name for name in names if name][:count]
 
 
-def brought(tensor: Tensor, device: torch.device) -> Tensor:
+def to_device(tensor: Tensor, device: torch.device) -> Tensor:
     """The tensor on `device`; to a GPU the copy is made while the program goes on."""
     if tensor.device == device:
         return tensor

@@ -7,7 +7,7 @@ from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from avatar.data.shelf import Shelf
+from avatar.data.gpu_frame_cache import GpuFrameCache
 from avatar.data.subject import FramePixels, Subject
 from avatar.types import Frame
 
@@ -27,7 +27,7 @@ class FrameLoader:
     """Decoded frames of a subject. Keeps the most recently used ones as uint8, at most `cache_bytes` of them.
 
     Use it as a context manager, or call `close`; the frames do not depend on the cache or on the number of workers. With a
-    `shelf` they are on its GPU, and what it holds is decoded once.
+    `frame_cache` they are on its GPU, and what it holds is decoded once.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class FrameLoader:
         size: int | None = None,
         cache_bytes: int = CACHE_BYTES,
         workers: int = WORKERS,
-        shelf: Shelf | None = None,
+        frame_cache: GpuFrameCache | None = None,
     ) -> None:
         if workers < 1:
             raise ValueError(f"workers must be at least 1, got {workers}")
@@ -46,7 +46,7 @@ class FrameLoader:
         self.size = size
         self.cache_bytes = cache_bytes
         self.cached_bytes = 0
-        self._shelf = shelf
+        self._frame_cache = frame_cache
         self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
         self._ahead = workers * FRAMES_AHEAD
         self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="frames")
@@ -93,8 +93,8 @@ class FrameLoader:
                 if not queue:
                     return
                 index, future = queue.popleft()
-                on_shelf = self._shelf is not None and index in self._shelf
-                pixels = None if on_shelf else self._take(index, future)
+                on_gpu_already = self._frame_cache is not None and index in self._frame_cache
+                pixels = None if on_gpu_already else self._take(index, future)
                 if not any(waiting == index for waiting, _ in queue):
                     pending.pop(index, None)
                 yield self._frame(index, pixels)
@@ -103,12 +103,12 @@ class FrameLoader:
                 future.cancel()
 
     def _holds(self, index: int) -> bool:
-        return index in self._cache or (self._shelf is not None and index in self._shelf)
+        return index in self._cache or (self._frame_cache is not None and index in self._frame_cache)
 
     def _frame(self, index: int, pixels: FramePixels | None) -> Frame:
-        if self._shelf is not None:
-            frame = self._shelf.frame(index, pixels, self.size)
-            if index in self._shelf and index in self._cache:  # in one place only
+        if self._frame_cache is not None:
+            frame = self._frame_cache.frame(index, pixels, self.size)
+            if index in self._frame_cache and index in self._cache:  # in one place only
                 self.cached_bytes -= self._cache.pop(index).nbytes
             return frame
         assert pixels is not None

@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 
+from avatar.demo.blendshape_fields import IDENTITY_FIELDS, expression_displacement, identity_displacement, smooth_step
 from avatar.demo.features import lip_line
-from avatar.demo.fields import IDENTITY_FIELDS, expression_displacement, identity_displacement, smooth_step
 from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, MOUTH_HALF_WIDTH
 from avatar.demo.topology import HeadMesh, build_head_mesh
 

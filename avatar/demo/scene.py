@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 
-from avatar.demo.fields import identity_displacement, smooth_step
+from avatar.demo.accessories import Prop, glasses_frame, glasses_lenses, grid_faces, lower_mouth, shirt, upper_mouth
+from avatar.demo.blendshape_fields import identity_displacement, smooth_step
 from avatar.demo.head import JOINTS, NUM_EXPRESSION, PARENTS, DemoHead, demo_head
 from avatar.demo.identity import Identity
-from avatar.demo.props import Prop, glasses_frame, glasses_lenses, grid_faces, lower_mouth, shirt, upper_mouth
 from avatar.demo.skin import fractal_noise, hair_cover
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel, matrix_from_6d

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 
+from avatar.demo.blendshape_fields import smooth_step
 from avatar.demo.features import lip_line
-from avatar.demo.fields import smooth_step
 from avatar.demo.head import DemoHead
 from avatar.demo.identity import Identity
 from avatar.demo.sculpt import EYE_CENTRE

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import Delaunay, KDTree
 
-from avatar.demo.chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
 from avatar.demo.features import Rings, ear_rings, eye_rings, mouth_rings
 from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, RAY_ORIGIN, cast
+from avatar.demo.uv_chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
 
 EYE_DISC_CENTRE, EYE_DISC_RADIUS = np.array([0.932, 0.932]), 0.062  # left eyeball; u is mirrored for the right
 EYEBALL_RINGS, EYEBALL_SECTORS, EYEBALL_REACH = 11, 24, np.radians(112.0)

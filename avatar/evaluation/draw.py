@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.data.background import Colour
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
@@ -38,8 +38,8 @@ def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, 
     for look in looks:
         if look.background not in images:
             colour = torch.tensor(look.background)
-            picture = with_room(partial(renderer.draw, gaussians, frame.camera, brought(colour, device)))
-            images[look.background] = Pair(picture.image, brought(frame.composite(colour), device))
+            picture = with_room(partial(renderer.draw, gaussians, frame.camera, to_device(colour, device)))
+            images[look.background] = Pair(picture.image, to_device(frame.composite(colour), device))
         pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
     return pairs
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.evaluation.measure import Pair
 from avatar.losses.metrics import weighted_mean
 
@@ -36,7 +36,7 @@ class JitterMeter:
         """The next picture in the order of time; three of successive `time` give the middle one its figure."""
         error = pair.render.float() - pair.truth.float()
         error = error if pair.render.dtype == torch.uint8 else error * 255.0
-        self._recent.append(_Moment(time, error, brought(head_mask, error.device)))
+        self._recent.append(_Moment(time, error, to_device(head_mask, error.device)))
         if len(self._recent) < 3:
             return
         before, middle, after = self._recent

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.compute.device import CPU, brought
+from avatar.compute.device import CPU, to_device
 from avatar.evaluation.protocol import MEASURES, Levels, Look, Protocol, Region, column
 from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.losses.metrics import SSIM_RADIUS, bounding_box, grown_box, squared_error, ssim_map, weighted_mean
@@ -52,7 +52,7 @@ class FrameMeasurer:
         """`masks` lacks a region that the head model cannot show; "head" is there always."""
         self._pairs = {look: tuple(_as_values(image) for image in pair) for look, pair in pairs.items()}
         device = next((pair[0].device for pair in self._pairs.values()), CPU)
-        self._masks = {region: brought(mask, device).double() / 255.0 for region, mask in masks.items()}
+        self._masks = {region: to_device(mask, device).double() / 255.0 for region, mask in masks.items()}
         self._networks = networks
         self._maps: dict[tuple[Look, bool], tuple[Tensor, Tensor]] = {}
         self._lpips: dict[tuple[Look, str, Net], float] = {}

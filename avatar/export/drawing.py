@@ -85,7 +85,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "log_scales": model.log_scales,
         "opacity_logits": model.opacity_logits,
         "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1),
-        "rigidity": torch.zeros(0) if model.rigidity is None else model.rigidity,
+        "rigidity": torch.zeros(0) if model.skull_shares is None else model.skull_shares,
     }
     grid = None if model.grid is None else model.grid.interpolate
     empty = torch.zeros(0)
@@ -103,7 +103,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "coefficients": arrays["sh"].shape[1],
         "has_grid": int(grid is not None),
         "has_heads": int(folded is not None),
-        "has_rigidity": int(model.rigidity is not None),
+        "has_rigidity": int(model.skull_shares is not None),
         "has_facing": int(model.turning is not None),
     }
     return Drawing(

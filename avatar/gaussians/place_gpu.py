@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
-from avatar.gaussians.rigidity import Hold
+from avatar.gaussians.skull_binding import SkullBinding
 from avatar.head.model import matrix_from_6d
 from avatar.kernels.place import place
 from avatar.kernels.place_backward import gather_nodes, place_backward
@@ -43,11 +43,11 @@ def place_gpu(
     sh: Float[Tensor, "N K 3"],
     embedding: Mesh,
     grid: Interpolation | None,
-    hold: Hold | None = None,
+    skull_binding: SkullBinding | None = None,
 ) -> Gaussians:
     """`compose_raw` of the embedding's points and of the network's `values`, in one launch. Float32 tensors on one GPU.
 
-    hold  what brings the points to the skull (`held`), if anything does
+    hold  what brings the points to the skull (`bind_to_skull`), if anything does
     The values are brought from the grid's nodes to the Gaussians if there is a grid, and through the HyperGaussians
     `packed` if there are any.
 
@@ -65,10 +65,10 @@ def place_gpu(
     if packed is None and grid is not None:
         raise ValueError("offsets are not smooth over the map: there is no grid without HyperGaussians")
     skull = neck = logits = None
-    if hold is not None:
-        skull, logits, neck = hold.skull, hold.logits, brought(hold.neck, quats.device)
+    if skull_binding is not None:
+        skull, logits, neck = skull_binding.skull, skull_binding.logits, to_device(skull_binding.neck, quats.device)
         check_shapes(quats=(quats, "N 4"), at_rest=(skull.at_rest, "N 3"), arms=(skull.arms, "N 3"))
-        check_shapes(quats=(quats, "N 4"), neck=(neck, "6"), rigidity_logits=(logits, "N"))
+        check_shapes(quats=(quats, "N 4"), neck=(neck, "6"), skull_logits=(logits, "N"))
     given = (vertices, neck, logits, values, packed, quats, log_scales, opacity_logits)
     placed: Any = _Place.apply(*given, embedding, grid, skull)
     means, turned, scales, opacities = placed

@@ -88,7 +88,7 @@ def place(
     at_rest,
     arms,
     neck,
-    rigidity_logits,
+    skull_logits,
     nodes,
     cells,
     weights,
@@ -114,7 +114,7 @@ def place(
     offsets [N, 10] and, with HAS_SKULL, how far their points on the skull are `away` from those on the mesh [N, 3].
 
     vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; with HAS_SKULL, at_rest and arms [N, 3] of the skull, the
-    6D rotation `neck` that turns it and rigidity_logits [N];
+    6D rotation `neck` that turns it and skull_logits [N];
     nodes [M, latents] with cells int32 [N, 4] and weights [N, 4], or, without HAS_GRID, [N, latents]; packed: see `hyper`.
     Without HAS_HYPER the network's values are the offsets.
     """
@@ -137,7 +137,7 @@ def place(
         a_x, a_y, a_z = n_x + a_x - x, n_y + a_y - y, n_z + a_z - z
         if SAVE:
             store3(away, i, a_x, a_y, a_z, here)
-        share = sigmoid(tl.load(rigidity_logits + i, mask=here, other=0.0))
+        share = sigmoid(tl.load(skull_logits + i, mask=here, other=0.0))
         x, y, z = x + share * a_x, y + share * a_y, z + share * a_z
     store3(means, i, x + tanh(o0), y + tanh(o1), z + tanh(o2), here)
     _, _, _, _, _, _, w, x, y, z, _, _ = turned(quats, i, tanh(o3), tanh(o4), tanh(o5), tanh(o6), here)

@@ -132,7 +132,7 @@ def place_backward(
     packed,
     raw,
     away,
-    rigidity_logits,
+    skull_logits,
     quats,
     log_scales,
     scales,
@@ -170,7 +170,7 @@ def place_backward(
     by0, by1, by2 = load3(grad_means, i, here)
     if HAS_SKULL:
         a_x, a_y, a_z = load3(away, i, here)
-        share = sigmoid(tl.load(rigidity_logits + i, mask=here, other=0.0))
+        share = sigmoid(tl.load(skull_logits + i, mask=here, other=0.0))
         by_share = by0 * a_x + by1 * a_y + by2 * a_z
         tl.store(out_rigidity_logits + i, by_share * share * (1.0 - share), mask=here)
     bw, bx, by, bz, inverse, is_long, tw, tx, ty, tz, turned_inverse, turned_is_long = turned(

@@ -26,9 +26,6 @@ from avatar.tensors import check_shapes
 HUBER_DELTA = 0.1
 MOUTH_WEIGHT = 40.0
 LPIPS_WEIGHT = 0.05
-# Ours, for D-SSIM in place of LPIPS: near the end of training (mean square error 1e-3, SSIM 0.95) the term is then
-# about as large as the Huber terms, the balance that 3D Gaussian Splatting has with its 0.8 L1 + 0.2 (1 - SSIM).
-DSSIM_WEIGHT = 0.05
 
 # (image [H, W, 3], target [H, W, 3], mask [H, W]) -> a dissimilarity of the two images times the mask, scalar
 Perceptual = Callable[..., Tensor]

@@ -18,8 +18,8 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 
 from avatar.head.model import HeadModel
-from avatar.motion.repertoire import Repertoire
 from avatar.motion.rest import RestPose, find_mean, find_neutral, stacked
+from avatar.motion.statistics import MotionStatistics
 from avatar.types import HeadParams
 
 Transfer = Literal["raw", "relative", "mean", "pca"]
@@ -35,7 +35,7 @@ class Transferred(NamedTuple):
 
 def transfer_motion(
     driver: Sequence[HeadParams],
-    target: Repertoire,
+    target: MotionStatistics,
     mode: Transfer,
     driver_head: HeadModel,
     *,

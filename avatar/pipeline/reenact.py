@@ -75,7 +75,7 @@ def reenact(
     trained, rest = choose_neutrals(trained, drive, choices)
     driver_head = HeadModel(trained.assets, drive.identity)
     moved, source, goal = transfer_motion(
-        drive.params, trained.repertoire, choices.transfer, driver_head, strength=choices.strength, rest=rest
+        drive.params, trained.statistics, choices.transfer, driver_head, strength=choices.strength, rest=rest
     )
     neutral = {
         drive.name: frame_name(source, drive.names),
@@ -88,7 +88,7 @@ def reenact(
     if choices.neutral is None:
         say_open_lips(goal, trained.avatar.head, trained.name, "--neutral", say)
 
-    distances = trained.repertoire.expressions.distances(moved)
+    distances = trained.statistics.expressions.distances(moved)
     say_distances(distances, say)
     own = trained.rest_camera()
     cameras = choose_cameras(drive, own, choices.camera, choices.intrinsics)

@@ -14,7 +14,7 @@ from avatar.errors import UserError
 from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, condition, touching_lists
-from avatar.gaussians.rigidity import Hold, Skull, held
+from avatar.gaussians.skull_binding import Skull, SkullBinding, bind_to_skull
 from avatar.losses.photometric import dssim, photometric_loss
 from avatar.splat import splat
 from avatar.splat.scenes import head_camera, head_shell
@@ -75,24 +75,24 @@ def placed(device: torch.device) -> Fields:
     heads = HyperHeads(COUNT, LATENT)
     shapes = {"vertices": (VERTICES, 3), "values": (NODES, LATENT), "packed": tuple(heads.packed.shape)}
     shapes |= {"quats": (COUNT, 4), "log_scales": (COUNT, 3), "opacity_logits": (COUNT,)}
-    shapes |= {"neck": (6,), "rigidity_logits": (COUNT,)}
+    shapes |= {"neck": (6,), "skull_logits": (COUNT,)}
     noise = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
     heads.packed.data.copy_(0.3 * noise["packed"])
     heads.set_heads(heads.heads())  # zeros where no Gaussian is
     noise["packed"] = heads.packed.detach()
     noise["log_scales"] -= 4.0
     leaves = {name: value.to(device).requires_grad_() for name, value in noise.items()}
-    vertices, values, packed, quats, log_scales, logits, neck, rigidity_logits = leaves.values()
+    vertices, values, packed, quats, log_scales, logits, neck, skull_logits = leaves.values()
     skull = Skull(*(torch.randn(COUNT, 3, generator=generator).to(device) for _ in range(2)))
-    hold = Hold(skull, neck, rigidity_logits)
+    skull_binding = SkullBinding(skull, neck, skull_logits)
     sh = torch.zeros(COUNT, 1, 3, device=device)
     if on_gpu(sh):
         from avatar.gaussians.place_gpu import place_gpu
 
         base = (quats, log_scales, logits, sh)
-        found = place_gpu(vertices, values, packed, *base, sheet, sheet.grid, hold)
+        found = place_gpu(vertices, values, packed, *base, sheet, sheet.grid, skull_binding)
     else:
-        points = held((vertices[sheet.corners] * sheet.barycentric[..., None]).sum(dim=1), hold)
+        points = bind_to_skull((vertices[sheet.corners] * sheet.barycentric[..., None]).sum(dim=1), skull_binding)
         found = compose_raw(points, quats, log_scales, logits, sh, condition(sheet.grid(values), packed))
     cotangents = [torch.randn(field.shape, generator=generator).to(device) for field in found[:4]]
     gradients = torch.autograd.grad(found[:4], list(leaves.values()), cotangents)

@@ -26,7 +26,7 @@ from avatar.runs.footprint import training_needs
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.order import within_passes
 from avatar.train.step import PerceptualTerm, choose_perceptual
-from avatar.train.trainer import leave_avatar, train
+from avatar.train.trainer import save_avatar, train
 from data_prep.prepare.open import open_subject
 
 # Adam's epsilon makes whole steps of gradients that are nothing but rounding.
@@ -81,7 +81,7 @@ def go_on(
     chosen = CPU if is_complete else choose_device(device or config.device, print)
     avatar = new_avatar(assets, subject, config, info.perceptual, chosen)
     if is_complete:
-        leave_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
+        save_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
         print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
         return OK
     if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.compute.native import thread_count
 from avatar.data.subject import Subject
 from avatar.errors import UserError
@@ -29,10 +29,10 @@ from avatar.model import Avatar
 from avatar.refine.progress import read_progress, write_progress
 from avatar.refine.smoothing import smoothed
 from avatar.tracking.descent import Descent, Problem, curvature, descend
-from avatar.tracking.freedom import Freedom, find_freedom
-from avatar.tracking.likeness import Likeness, Measure, Target, coarse_levels, head_psnr, targets
+from avatar.tracking.frame_fitter import FrameFitter, Measure, Target, coarse_levels, head_psnr, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
 from avatar.tracking.parallel import in_order, read_later
+from avatar.tracking.parameterization import PoseParameterization, find_parameterization
 from avatar.train.interruption import interruption
 from avatar.train.order import evenly_spread
 
@@ -79,7 +79,7 @@ def refine_subject(
     with frozen(avatar), interruption() as interrupted:
         work = _Work(avatar, subject, size, background)
         key = work.key()
-        moves, figures = read_progress(progress, key, len(work.freedom.index))
+        moves, figures = read_progress(progress, key, len(work.parameterization.index))
         if len(moves):
             say(f"going on after {len(moves)} of {len(subject)} frames ({progress})")
         matrices = work.curvatures()
@@ -111,13 +111,13 @@ def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, backgr
     with frozen(avatar):
         work = _Work(avatar, subject, size, background)
         frames = work.samples(max(TIMED_FRAMES, workers))
-        flat = work.factors([torch.eye(len(work.freedom.index))] * work.levels)
+        flat = work.factors([torch.eye(len(work.parameterization.index))] * work.levels)
         list(work.refined(work.samples(workers), flat))  # the first gradient loads parts of torch
         begin = time.perf_counter()
         factors = work.factors(work.curvatures(workers))
         middle = time.perf_counter()
         list(work.refined(frames, factors))
-        list(work.measured(frames, work.freedom.given))
+        list(work.measured(frames, work.parameterization.given))
         end = time.perf_counter()
     return (middle - begin) * SAMPLES / workers + (end - middle) * len(subject) / len(frames)
 
@@ -149,15 +149,17 @@ class _Work:
         self.subject, self.size, self.background = subject, size, background
         self.centre = avatar.head.neutral_vertices().mean(dim=0)
         self.device, self.waits = avatar.code.device, not on_gpu(avatar.code)
-        self.likeness = Likeness(avatar, brought(background, self.device), brought(self.centre, self.device))
+        self.fitter = FrameFitter(avatar, to_device(background, self.device), to_device(self.centre, self.device))
         self.tracks = subject.recording.tracks
-        self.freedom: Freedom = find_freedom(self.tracks, subject.split.train, self.centre)
-        self.there = self.freedom if self.waits else self.freedom.on(self.device)
+        self.parameterization: PoseParameterization = find_parameterization(
+            self.tracks, subject.split.train, self.centre
+        )
+        self.there = self.parameterization if self.waits else self.parameterization.on(self.device)
         self.levels = coarse_levels(subject.image_size(size)[0])
 
     def key(self) -> str:
         """Changes with everything that the result depends on."""
-        avatar, background = fingerprint(self.likeness.avatar), self.background.tolist()
+        avatar, background = fingerprint(self.fitter.avatar), self.background.tolist()
         choices = (PROGRESS_FORMAT, avatar, self.subject.data_hash, self.size, background)
         return hashlib.sha256(repr(choices).encode()).hexdigest()
 
@@ -174,7 +176,7 @@ class _Work:
 
     def factors(self, matrices: Sequence[Float[Tensor, "F F"]]) -> list[Float[Tensor, "F F"]]:
         """Lower Cholesky factors, where the avatar is."""
-        return [brought(torch.linalg.cholesky(matrix), self.device) for matrix in matrices]
+        return [to_device(torch.linalg.cholesky(matrix), self.device) for matrix in matrices]
 
     def samples(self, count: int) -> list[int]:
         """Training frames, evenly spread; fewer where there are fewer."""
@@ -189,7 +191,7 @@ class _Work:
             raise UserError(
                 f"no head is to be seen in the training frames of {self.subject.recording.name}: look at its masks"
             )
-        prior = torch.eye(len(self.freedom.index))
+        prior = torch.eye(len(self.parameterization.index))
         return [torch.stack(level).mean(dim=0) + prior for level in zip(*sampled, strict=True)]
 
     def _curvatures(self, frame: int) -> list[Float[Tensor, "F F"]] | None:
@@ -197,7 +199,7 @@ class _Work:
         if made is None:
             return None
         problem = Problem(self.pose(frame), made, frame, self.there)
-        return [curvature(self.likeness, problem, level) for level in range(self.levels)]
+        return [curvature(self.fitter, problem, level) for level in range(self.levels)]
 
     def _stacked_curvatures(self, frame: int) -> Float[Tensor, "levels F F"] | None:
         made = self._curvatures(frame)
@@ -208,7 +210,7 @@ class _Work:
         if self.waits:
             yield from in_order(lambda frame: self.refine(frame, factors), frames)
             return
-        unseen = _Found(torch.zeros(len(self.freedom.index)), UNSEEN, UNSEEN.psnr)
+        unseen = _Found(torch.zeros(len(self.parameterization.index)), UNSEEN, UNSEEN.psnr)
         for frame, found in zip(frames, read_later(lambda frame: self.begin(frame, factors), frames), strict=True):
             if found is None:
                 yield unseen
@@ -225,36 +227,39 @@ class _Work:
             return None
         problem = Problem(self.pose(frame), made, frame, self.there)
         found = self.descended(problem, factors)
-        before = self.likeness.figures(self.there.given[frame], problem.given, made[0])
+        before = self.fitter.figures(self.there.given[frame], problem.given, made[0])
         return torch.cat((found.moves.double(), before, head_psnr(found.picture, made[0])[None]))
 
     def descended(self, problem: Problem, factors: Sequence[Float[Tensor, "F F"]]) -> Descent:
-        return descend(self.likeness, problem, factors, [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)])
+        return descend(self.fitter, problem, factors, [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)])
 
     def refine(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> _Found:
         made = self.targets(frame, self.levels)
         if made is None:
-            return _Found(torch.zeros(len(self.freedom.index)), UNSEEN, UNSEEN.psnr)
-        problem = Problem(self.pose(frame), made, frame, self.freedom)
+            return _Found(torch.zeros(len(self.parameterization.index)), UNSEEN, UNSEEN.psnr)
+        problem = Problem(self.pose(frame), made, frame, self.parameterization)
         found = self.descended(problem, factors)
-        before = self.likeness.measure(self.freedom.given[frame], problem.given, made[0])
+        before = self.fitter.measure(self.parameterization.given[frame], problem.given, made[0])
         return _Found(found.moves, before, float(head_psnr(found.picture, made[0])))
 
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, keep the given tracking of frames that then fit no better than with it, and centre the rest."""
-        freedom, numbers = self.freedom, np.array([record.tracking for record in self.subject.manifest.frames])
+        parameterization, numbers = (
+            self.parameterization,
+            np.array([record.tracking for record in self.subject.manifest.frames]),
+        )
         trained_on = torch.zeros(len(moves), dtype=torch.bool)
         trained_on[list(self.subject.split.train)] = True
         for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one
-            given, own_numbers = freedom.acceleration[part], numbers[part.numpy()]
-            moves[part] = smoothed(moves[part], matrix, given, freedom.calm, own_numbers)
-        values = freedom.all_values(moves)
+            given, own_numbers = parameterization.acceleration[part], numbers[part.numpy()]
+            moves[part] = smoothed(moves[part], matrix, given, parameterization.calm, own_numbers)
+        values = parameterization.all_values(moves)
         after = np.array(list(self.measured(range(len(values)), values)))
         kept = ~(after[:, 0] <= before[:, 0])
         after[kept] = before[kept]
         keep = torch.from_numpy(kept)
-        values = freedom.all_values(freedom.centred(moves, trained_on & ~keep))
-        tracks = moved_tracks(self.tracks, values, freedom.changed(), self.centre)
+        values = parameterization.all_values(parameterization.centred(moves, trained_on & ~keep))
+        tracks = moved_tracks(self.tracks, values, parameterization.changed(), self.centre)
         for name, given in self.tracks.items():
             if name != "shape":
                 tracks[name] = torch.where(keep.reshape(-1, *[1] * (given.ndim - 1)), given, tracks[name])
@@ -265,15 +270,15 @@ class _Work:
         if self.waits:
             yield from in_order(lambda frame: self.measure(frame, values[frame]), frames)
             return
-        there = brought(values, self.device)
+        there = to_device(values, self.device)
 
         def begin(frame: int) -> Float[Tensor, 2] | None:
             made = self.targets(frame, 1)
-            return None if made is None else self.likeness.figures(there[frame], self.pose(frame), made[0])
+            return None if made is None else self.fitter.figures(there[frame], self.pose(frame), made[0])
 
         for found in read_later(begin, frames):
             yield UNSEEN if found is None else Measure(*found.tolist())
 
     def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:
         made = self.targets(frame, 1)
-        return UNSEEN if made is None else self.likeness.measure(values, self.pose(frame), made[0])
+        return UNSEEN if made is None else self.fitter.measure(values, self.pose(frame), made[0])

@@ -47,6 +47,6 @@ def own_clip(trained: TrainedAvatar, which: str, size: int | None = None) -> Cli
 def driven_clip(trained: TrainedAvatar, drive: Drive, size: int | None = None) -> Clip:
     """A drive as the avatar shows it: relative to both neutral faces, as `avatar reenact` does by default."""
     head = HeadModel(trained.assets, drive.identity)
-    moved = transfer_motion(drive.params, trained.repertoire, "relative", head).motion
+    moved = transfer_motion(drive.params, trained.statistics, "relative", head).motion
     cameras = choose_cameras(drive, trained.rest_camera(size), "driver", "target")
     return Clip(drive.name, drive.fps, list(zip(moved, cameras, strict=True)))

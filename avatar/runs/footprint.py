@@ -13,7 +13,7 @@ from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES, FRAMES_AHEAD, WORKE
 from avatar.errors import UserError
 from avatar.gaussians.covariance import triangle_size
 from avatar.gaussians.encoding import encoded_size
-from avatar.gaussians.facing import VALUES
+from avatar.gaussians.head_rotation import VALUES
 from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
@@ -52,7 +52,7 @@ def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) ->
     """The shape of every tensor in the state dict of the `Avatar` that this makes."""
     N, n, width = gaussians, config.latent_dim, config.mlp_width
     inputs = encoded_size() + assets.num_expressions + CONDITION_EXTRAS
-    inputs += VALUES if config.facing else 0
+    inputs += VALUES if config.head_rotation else 0
     shapes: Shapes = {
         "log_scales": (N, 3),
         "quats": (N, 4),
@@ -64,14 +64,14 @@ def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) ->
     if config.name != "splattingavatar":
         for name, given, made in (*layers, ("output", width, n if config.name in WITH_LATENTS else OFFSETS)):
             shapes |= {f"deformation.{name}.weight": (made, given), f"deformation.{name}.bias": (made,)}
-    if config.facing and config.name != "splattingavatar":
+    if config.head_rotation and config.name != "splattingavatar":
         shapes["turning"] = (VALUES, 9)
     if config.name in ("splattingavatar", "monogaussianavatar"):
         shapes |= {"mesh_points.face": (N,), "mesh_points.place": (N, 3)}
     if config.name == "monogaussianavatar":
         shapes["count"] = ()
-    if config.rigidity and config.name not in ("splattingavatar", "monogaussianavatar"):
-        shapes["rigidity_logits"] = (N,)
+    if config.skull_binding and config.name not in ("splattingavatar", "monogaussianavatar"):
+        shapes["skull_logits"] = (N,)
     if config.name == "ndgs":
         shapes |= {"ndgs.mean": (3 + n, N), "ndgs.root": (triangle_size(n), N), "ndgs.cross": (3, n, N)}
     for name, m in HEADS.items():

@@ -18,8 +18,8 @@ from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
-from avatar.motion.repertoire import Repertoire, learn_repertoire
 from avatar.motion.rest import RestPose
+from avatar.motion.statistics import MotionStatistics, learn_repertoire
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_portrait
 from avatar.runs.inputs import checked_camera, checked_params
@@ -65,7 +65,7 @@ class TrainedAvatar:
         return Renderer(self.avatar, self.background)
 
     @cached_property
-    def repertoire(self) -> Repertoire:
+    def statistics(self) -> MotionStatistics:
         """Rests and expressions of the training frames."""
         return learn_repertoire(self.recording.motion(self.recording.split.train), self.avatar.head, self.neutral)
 
@@ -82,7 +82,7 @@ class TrainedAvatar:
 
     def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
         """The Gaussians of one frame, activated, world space (metres), as `camera` sees the head; by default turned as on
-        average in training. To avatars without `model.facing` it is the same. Raises UserError as `render`."""
+        average in training. To avatars without `model.head_rotation` it is the same. Raises UserError as `render`."""
         return self.renderer.gaussians(self._params(params), None if camera is None else checked_camera(camera))
 
     def render(self, params: HeadParams, camera: Camera | None = None) -> Rendering:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.splat.gpu_backward import backward
 from avatar.splat.gpu_draw import Settings, draw
 from avatar.splat.pose import pose_of
@@ -58,7 +58,7 @@ def intrinsics_on(camera: Camera, blur: float, near: float, device: torch.device
 
 @lru_cache(maxsize=8192)  # the frames of a training come again
 def _uploaded(values: tuple[float, ...], device: torch.device) -> Tensor:
-    return brought(torch.tensor(values, dtype=torch.float64), device)
+    return to_device(torch.tensor(values, dtype=torch.float64), device)
 
 
 @cache  # for good: a CUDA graph reads them

@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
-from avatar.tracking.freedom import Freedom
-from avatar.tracking.likeness import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, Likeness, Target
+from avatar.tracking.frame_fitter import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, FrameFitter, Target
 from avatar.tracking.motion import HeadPose
+from avatar.tracking.parameterization import PoseParameterization
 
 PROBE = 0.1  # units that a value is moved by to see what it does
 MEMORY = 5  # steps that the frame's own curvature is learned from
@@ -36,12 +36,12 @@ class Problem:
     given: HeadPose
     targets: Sequence[Target]  # by level, full size first
     frame: int  # of the freedom
-    freedom: Freedom
+    parameterization: PoseParameterization
 
 
 @torch.no_grad()
 def curvature(
-    likeness: Likeness,
+    fitter: FrameFitter,
     problem: Problem,
     level: int,
     moves: Float[Tensor, " F"] | None = None,
@@ -52,11 +52,11 @@ def curvature(
     moves    where; None: at the given tracking
     weight   of the pixels besides; None: all are one
     """
-    target, freedom = problem.targets[level], problem.freedom
-    moves = torch.zeros(len(freedom.index), device=freedom.unit.device) if moves is None else moves
+    target, parameterization = problem.targets[level], problem.parameterization
+    moves = torch.zeros(len(parameterization.index), device=parameterization.unit.device) if moves is None else moves
 
     def picture(moves: Tensor) -> Tensor:
-        return likeness.picture(freedom.values(problem.frame, moves), problem.given, target)
+        return fitter.picture(parameterization.values(problem.frame, moves), problem.given, target)
 
     before = picture(moves)
     error = (before - target.picture).abs()
@@ -77,28 +77,28 @@ class Descent(NamedTuple):
 
 
 def descend(
-    likeness: Likeness, problem: Problem, factors: Sequence[Float[Tensor, "F F"]], steps: Sequence[int]
+    fitter: FrameFitter, problem: Problem, factors: Sequence[Float[Tensor, "F F"]], steps: Sequence[int]
 ) -> Descent:
     """The moves of a frame that minimise misfit + half their squared length, within their bounds.
 
     factors   lower Cholesky factors of the curvature with the prior's, by level
     steps     of each level at most; the coarsest, which is the last, comes first
     """
-    still = torch.zeros(len(problem.freedom.index), device=problem.freedom.unit.device)
+    still = torch.zeros(len(problem.parameterization.index), device=problem.parameterization.unit.device)
     found = Descent(still, problem.targets[0].picture)
     for level in reversed(range(len(problem.targets))):
-        found = _descend_level(likeness, problem, level, found.moves, factors[level], steps[level])
+        found = _descend_level(fitter, problem, level, found.moves, factors[level], steps[level])
     return found
 
 
 def _descend_level(
-    likeness: Likeness, problem: Problem, level: int, moves: Tensor, factor: Tensor, steps: int
+    fitter: FrameFitter, problem: Problem, level: int, moves: Tensor, factor: Tensor, steps: int
 ) -> Descent:
-    low, high = problem.freedom.bounds(problem.frame)
-    target, unit, index = problem.targets[level], problem.freedom.unit, problem.freedom.index
+    low, high = problem.parameterization.bounds(problem.frame)
+    target, unit, index = problem.targets[level], problem.parameterization.unit, problem.parameterization.index
 
     def evaluate(moves: Tensor) -> _Point:
-        fit = likeness.fit(problem.freedom.values(problem.frame, moves), problem.given, target)
+        fit = fitter.fit(problem.parameterization.values(problem.frame, moves), problem.given, target)
         value = fit.misfit.double() + 0.5 * (moves @ moves).double()
         return _Point(moves, value, fit.gradient[index] * unit + moves, fit.picture)
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle, vector_to_skew_symmetric_matrix
 from torch import Tensor
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.head.model import matrix_from_6d
 from avatar.types import HeadParams
 
@@ -43,7 +43,7 @@ class HeadPose(NamedTuple):
     t: Float[Tensor, "*B 3"]
 
     def on(self, device: torch.device) -> HeadPose:
-        return HeadPose(brought(self.R, device), brought(self.t, device))
+        return HeadPose(to_device(self.R, device), to_device(self.t, device))
 
 
 def rotation(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:

@@ -24,18 +24,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.config import Config
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.tracking.freedom import Freedom, find_freedom
-from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness
+from avatar.tracking.frame_fitter import OBSERVATIONS, PIXEL_SIGMA, FrameFitter
 from avatar.tracking.motion import HeadPose, head_params, moved_pose
-from avatar.train.inquiry import Inquiry
-from avatar.train.placed import Placed, place
-from avatar.train.posed import PosedMeshes
+from avatar.tracking.parameterization import PoseParameterization, find_parameterization
+from avatar.train.alignment_statistics import AlignmentStatistics
+from avatar.train.placed import AlignedFrame, place
+from avatar.train.posed_mesh_cache import PosedMeshes
 from avatar.train.step import sh_degree
 from avatar.types import Frame, Gaussians, HeadParams
 
@@ -67,8 +67,8 @@ def make_alignment(
     return alignment
 
 
-class Row(NamedTuple):
-    """What a frame's move in one step is made from, where the avatar is; see `Freedom`."""
+class FrameCorrection(NamedTuple):
+    """What a frame's move in one step is made from, where the avatar is; see `PoseParameterization`."""
 
     given: Float[Tensor, " P"]
     lowest: Float[Tensor, " P"]
@@ -79,13 +79,13 @@ class Row(NamedTuple):
     rate: float | Float[Tensor, ""]
 
 
-class Seen(NamedTuple):
+class StepInput(NamedTuple):
     """What a step sees."""
 
     frame: Frame
     vertices: Float[Tensor, "V 3"]
-    placed: Placed | None = None  # the frame's tracking may move
-    row: Row | None = None  # from which
+    placed: AlignedFrame | None = None  # the frame's tracking may move
+    row: FrameCorrection | None = None  # from which
 
     @property
     def watched(self) -> Callable[[Gaussians], Gaussians] | None:
@@ -105,16 +105,16 @@ class Alignment:
         tracks, centre = subject.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
         self._given = HeadPose(tracks["R"], tracks["t"])
         self._given_there = self._given.on(device)
-        self._freedom = find_freedom(tracks, self._train, centre)
-        self._freedom_there = self._freedom.on(device)
+        self._parameterization = find_parameterization(tracks, self._train, centre)
+        self._freedom_there = self._parameterization.on(device)
         self._centre = centre
         background = torch.tensor(config.data.background)
-        self._likeness = Likeness(avatar, brought(background, device), brought(centre, device))
+        self._likeness = FrameFitter(avatar, to_device(background, device), to_device(centre, device))
         there = self._likeness, self._given_there, self._freedom_there
-        self._inquiry = Inquiry(subject, config.data.size, background, *there)
+        self._inquiry = AlignmentStatistics(subject, config.data.size, background, *there)
         self._meshes = PosedMeshes(avatar)
         self._places: dict[int, tuple[HeadPose, HeadParams]] = {}  # of frames that move no more
-        self._moves = torch.zeros(len(subject.recording), len(self._freedom.index), device=device)
+        self._moves = torch.zeros(len(subject.recording), len(self._parameterization.index), device=device)
         self._last_moves: Float[Tensor, "T F"] | None = None  # on the CPU, once they move no more
         self._factor: Float[Tensor, "F F"] | None = None  # of the curvature, lower Cholesky; None: nothing moves
         self._is_over = False
@@ -145,7 +145,7 @@ class Alignment:
         loader: FrameLoader,
         say: Callable[[str], object],
         settle: Callable[[], object] = lambda: None,
-    ) -> Seen:
+    ) -> StepInput:
         """The frame as step `step` (from 0) sees it; every step has to ask.
 
         `settle` waits for all steps before this one and raises when one was not finite; it is called where what they made
@@ -155,13 +155,13 @@ class Alignment:
         row = self.row(step, frame)
         return self.still(step, frame) if row is None else self.placed(step, frame, row)
 
-    def still(self, step: int, frame: Frame) -> Seen:
+    def still(self, step: int, frame: Frame) -> StepInput:
         """A frame that does not move in step `step`."""
         if self._factor is not None and step >= self._end and self._shows_head(frame):
             frame = self._settled(frame)
-        return Seen(frame, self._meshes.vertices(frame))
+        return StepInput(frame, self._meshes.vertices(frame))
 
-    def row(self, step: int, frame: Frame) -> Row | None:
+    def row(self, step: int, frame: Frame) -> FrameCorrection | None:
         """Of a frame that moves in step `step`; None: it does not."""
         if self._factor is None or step >= self._end or not self._shows_head(frame):
             return None
@@ -170,42 +170,42 @@ class Alignment:
             part[frame.index] for part in (of.given, of.lowest, of.highest, self._moves, *self._given_there)
         )
         way = (step - self._begin) / max(self._end - self._begin, 1)
-        return Row(given, lowest, highest, moves, R, t, self._trainer.align_rate * LAST_RATE**way)
+        return FrameCorrection(given, lowest, highest, moves, R, t, self._trainer.align_rate * LAST_RATE**way)
 
-    def placed(self, step: int, frame: Frame, row: Row) -> Seen:
+    def placed(self, step: int, frame: Frame, row: FrameCorrection) -> StepInput:
         """The frame where `row` has it, in a step with the colours of step `step`."""
         degree = sh_degree(step)
         values = self._freedom_of(row).values(0, row.moves)
         placed = place(frame, values, HeadPose(row.R, row.t), self._likeness.centre, degree)
-        return Seen(placed.frame, self._likeness.vertices(placed.frame.params), placed, row)
+        return StepInput(placed.frame, self._likeness.vertices(placed.frame.params), placed, row)
 
-    def learn(self, seen: Seen, is_spoilt: Float[Tensor, ""] | None = None) -> None:
-        """Move the frame by what the step that saw it has found, unless that is not finite or `is_spoilt` is 1."""
+    def learn(self, seen: StepInput, is_nonfinite: Float[Tensor, ""] | None = None) -> None:
+        """Move the frame by what the step that saw it has found, unless that is not finite or `is_nonfinite` is 1."""
         if seen.placed is not None:
-            self.keep(seen.frame.index, self.moved(seen, is_spoilt))
+            self.keep(seen.frame.index, self.moved(seen, is_nonfinite))
 
     def keep(self, frame: int, moves: Float[Tensor, " F"]) -> None:
         self._moves[frame] = moves
 
-    def moved(self, seen: Seen, is_spoilt: Float[Tensor, ""] | None = None) -> Float[Tensor, " F"]:
+    def moved(self, seen: StepInput, is_nonfinite: Float[Tensor, ""] | None = None) -> Float[Tensor, " F"]:
         """The frame's moves after a step that saw it; see `learn`."""
         frame, row = seen.frame, seen.row
         assert seen.placed is not None and row is not None and self._factor is not None
-        freedom, moves = self._freedom_of(row), row.moves
+        parameterization, moves = self._freedom_of(row), row.moves
         # The loss is a mean over the frame; the misfit counts a number of observations on the head.
         area = frame.head_mask.sum().double()
         scale = OBSERVATIONS / PIXEL_SIGMA**2 * frame.head_mask.numel() / area
-        gradient = scale * seen.placed.gradient()[freedom.index] * freedom.unit + moves
+        gradient = scale * seen.placed.gradient()[parameterization.index] * parameterization.unit + moves
         direction = torch.cholesky_solve(gradient[:, None], self._factor)[:, 0]
-        low, high = freedom.bounds(0)
+        low, high = parameterization.bounds(0)
         moved = moves - row.rate * direction
         moved = torch.minimum(torch.maximum(moved, low), high)
         is_sound = torch.isfinite(gradient).all()
-        if is_spoilt is not None:
-            is_sound = is_sound & (is_spoilt == 0)
+        if is_nonfinite is not None:
+            is_sound = is_sound & (is_nonfinite == 0)
         return torch.where(is_sound, moved, moves)
 
-    def _freedom_of(self, row: Row) -> Freedom:
+    def _freedom_of(self, row: FrameCorrection) -> PoseParameterization:
         """Of one frame, number 0."""
         return replace(self._freedom_there, given=row.given[None], lowest=row.lowest[None], highest=row.highest[None])
 
@@ -245,7 +245,7 @@ class Alignment:
         if self._last_moves is None:
             self._last_moves = self._moves.cpu()
         if frame.index not in self._places:
-            values = self._freedom.values(frame.index, self._last_moves[frame.index])
+            values = self._parameterization.values(frame.index, self._last_moves[frame.index])
             given = HeadPose(*(part[frame.index] for part in self._given))
             self._places[frame.index] = moved_pose(values, given, self._centre), head_params(values).to(self._device)
         pose, params = self._places[frame.index]
@@ -255,7 +255,7 @@ class Alignment:
         trained_on = torch.zeros(len(self._moves), dtype=torch.bool)
         trained_on[list(self._train)] = True
         moves = self._moves.cpu()
-        centred = self._freedom.centred(moves, trained_on)
+        centred = self._parameterization.centred(moves, trained_on)
         self._moves = torch.where(trained_on[:, None], centred, moves).to(self._device)
 
     def _measure(self, step: int, loader: FrameLoader) -> None:

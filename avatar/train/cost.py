@@ -15,9 +15,9 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.tracking.likeness import Likeness
+from avatar.tracking.frame_fitter import FrameFitter
 from avatar.train.align import MOVING_SHARE
-from avatar.train.optim import make_optimizer
+from avatar.train.optimizer import make_optimizer
 from avatar.train.placed import moving_step
 from avatar.train.step import Objective, choose_perceptual, perceptual_start, training_step
 from avatar.types import Frame
@@ -57,7 +57,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     size = frame.camera.width, frame.camera.height
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
-    likeness = Likeness(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0))
+    fitter = FrameFitter(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0))
     vertices = avatar.mesh.vertices(frame.params)
 
     def seconds(step: int, moves: bool = False) -> float:
@@ -65,7 +65,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
         for _ in range(1 + MEASURED_STEPS):
             begin = time.perf_counter()
             if moves:
-                moving_step(likeness, optimizer, objective, step, frame)
+                moving_step(fitter, optimizer, objective, step, frame)
             else:
                 training_step(avatar, optimizer, objective, step, frame, vertices)
             taken.append(time.perf_counter() - begin)

@@ -2,8 +2,8 @@
 
 On a CPU the frame's camera moves, which the splatter does not differentiate: its gradient comes from those of what was
 drawn. On a GPU, which would have to hand a moved camera back, the head moves before it, and autograd does the rest. Both
-leave out how a turn of the head changes the colours that depend on the view and, with `model.facing`, what the network is
-told, which on a GPU is the given turn meanwhile.
+leave out how a turn of the head changes the colours that depend on the view and, with `model.head_rotation`,
+the network's input, which on a GPU is the given rotation meanwhile.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from avatar.compute.device import on_gpu
-from avatar.tracking.likeness import Likeness, before_camera, camera_gradient
+from avatar.tracking.frame_fitter import FrameFitter, before_camera, camera_gradient
 from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, values_of
 from avatar.train.step import Judge, Objective, sh_degree, training_step
 from avatar.types import Frame, Gaussians
 
 
-class Placed(Protocol):
+class AlignedFrame(Protocol):
     frame: Frame  # with its tracking where it was moved to; differentiable in the values of the face
 
     def watched(self, gaussians: Gaussians) -> Gaussians:
@@ -37,7 +37,7 @@ class Placed(Protocol):
 
 def place(
     frame: Frame, values: Float[Tensor, " P"], given: HeadPose, centre: Float[Tensor, 3], sh_degree: int
-) -> Placed:
+) -> AlignedFrame:
     """The frame with these values of its tracking, which has the head pose `given`; `centre` of the head, metres.
 
     All but the frame's camera are where the avatar is. `sh_degree` is that of the colours that take part in the step.
@@ -96,7 +96,7 @@ class _HeadPlaced:
 
 
 def moving_step(
-    likeness: Likeness,
+    fitter: FrameFitter,
     optimizer: torch.optim.Adam,
     objective: Objective,
     step: int,
@@ -104,12 +104,12 @@ def moving_step(
     judge: Judge | None = None,
 ) -> None:
     """What step number `step` (from 0) takes where it moves its frame's tracking, for who times it; by nothing."""
-    avatar, params = likeness.avatar, frame.params
+    avatar, params = fitter.avatar, frame.params
     given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world).on(avatar.code.device)
     tracks = {name: getattr(params, name)[None] for name in ("neck", "jaw", "eyes", "eyelids", "expression")}
     values = values_of(tracks | {"t": given.t[None]})[0]
     degree = sh_degree(step)
-    placed = place(frame, values, given, likeness.centre, degree)
-    posed = likeness.vertices(placed.frame.params)
+    placed = place(frame, values, given, fitter.centre, degree)
+    posed = fitter.vertices(placed.frame.params)
     training_step(avatar, optimizer, objective, step, placed.frame, posed, judge, placed.watched)
     placed.gradient()

@@ -30,7 +30,7 @@ from avatar.losses.photometric import (
 from avatar.model import SH_DEGREE, Avatar
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
-from avatar.train.optim import schedule, set_rates
+from avatar.train.optimizer import schedule, set_rates
 from avatar.train.points import move_points
 from avatar.types import Frame, Gaussians
 
@@ -144,12 +144,12 @@ def descend(
     vertices: Float[Tensor, "V 3"],
     judge: Judge | None = None,
     watched: Callable[[Gaussians], Gaussians] | None = None,
-    told: Float[Tensor, " 3"] | None = None,
+    head_rotation: Float[Tensor, " 3"] | None = None,
 ) -> Outcome:
-    """What of `training_step` a GPU does by itself, at the rates that the optimizer has; `told` as in `Avatar.forward`."""
+    """What of `training_step` a GPU does by itself, at the optimizer's rates; `head_rotation` as in `Avatar.forward`."""
     target = frame.composite(objective.background)
     try:
-        gaussians = avatar(frame.params, vertices, frame.camera.R_cam_world, told=told)
+        gaussians = avatar(frame.params, vertices, frame.camera.R_cam_world, head_rotation=head_rotation)
         gaussians = gaussians if watched is None else watched(gaussians)
         image = objective.draw(step, frame, gaussians, avatar)
     except CannotDraw as error:

@@ -10,8 +10,8 @@ from torch import Tensor
 from avatar.compute.device import CPU, on_gpu
 from avatar.compute.replay import own_stream
 from avatar.config import Config
+from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
-from avatar.data.shelf import Shelf, shelf_bytes
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.motion.rest import find_neutral
@@ -19,17 +19,17 @@ from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
-from avatar.train.ahead import Ahead, Prompt, Spoilt
 from avatar.train.align import make_alignment
-from avatar.train.colours import colour_from_frames
+from avatar.train.condition_noise import make_noise
+from avatar.train.init_colours import colour_from_frames
 from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
-from avatar.train.noise import make_noise
-from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
+from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
+from avatar.train.prune import prune_background_gaussians, prune_step
 from avatar.train.step import Objective, PerceptualTerm, stopped
-from avatar.train.steps import Steps
-from avatar.train.strays import remove_strays, strays_step
+from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor
+from avatar.train.step_runner import StepRunner
 
 
 def train(
@@ -59,7 +59,7 @@ def train(
         colour_from_frames(avatar, subject, config.data.size)
     recording = subject.recording
     if resume is None:
-        avatar.learn_facing(recording.tracks["R"][list(recording.split.train)])
+        avatar.learn_head_rotation(recording.tracks["R"][list(recording.split.train)])
     neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
     avatar.to(device)
     optimizer = make_optimizer(avatar, trainer)
@@ -84,28 +84,28 @@ def train(
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
-    shelf = Shelf(subject, device, shelf_bytes(device)) if is_gpu else None
+    frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None
     step = saved = start
     with (
         own_stream(device),
-        FrameLoader(subject, config.data.size, shelf=shelf) as loader,
+        FrameLoader(subject, config.data.size, frame_cache=frame_cache) as loader,
         TrainingLog(run, start, trainer.iterations) as log,
         interruption() as interrupted,
     ):
-        progress = Ahead(log, optimizer, device) if is_gpu else Prompt(log)
-        steps = Steps(avatar, optimizer, objective, make_noise(recording, trainer), alignment, log.say)
+        progress = AsyncStepMonitor(log, optimizer, device) if is_gpu else SyncStepMonitor(log)
+        steps = StepRunner(avatar, optimizer, objective, make_noise(recording, trainer), alignment, log.say)
         while step < trainer.iterations and not interrupted():
             order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
             try:
                 for frame in loader.frames(order):
                     if alignment is not None:
                         alignment.prepare(step, loader, log.say, progress.settle)
-                    outcome = steps.make(step, frame, progress.judge(step), progress.is_spoilt)
+                    outcome = steps.make(step, frame, progress.judge(step), progress.is_nonfinite)
                     step += 1
                     progress.note(step, outcome)
-                    if step == strays_step(trainer):
+                    if step == prune_step(trainer):
                         progress.settle()
-                        remove_strays(avatar, loader, subject.split.train, trainer.stray_share, step)
+                        prune_background_gaussians(avatar, loader, subject.split.train, trainer.prune_share, step)
                     saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
                     if saves or interrupted():
                         progress.settle()
@@ -115,14 +115,14 @@ def train(
                         saved = step
                     if interrupted():
                         break
-            except Spoilt as spoilt:
-                step = progress.go_back(spoilt)
+            except NonFiniteStep as nonfinite:
+                step = progress.go_back(nonfinite)
         if step > saved:
             save(step)
     return step
 
 
-def leave_avatar(
+def save_avatar(
     run: Path, avatar: Avatar, checkpoint: Checkpoint, subject: Subject, config: Config, perceptual: str
 ) -> None:
     """Write the avatar file of a checkpoint, as training does with each that it saves."""

@@ -99,7 +99,7 @@ class Stage:
 
     def distance(self, params: HeadParams) -> float:
         """From the training expressions: above 1 the avatar guesses."""
-        return float(self.trained.repertoire.expressions.distances([params])[0])
+        return float(self.trained.statistics.expressions.distances([params])[0])
 
     @torch.no_grad()
     def draw(

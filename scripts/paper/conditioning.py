@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from leave import leave, machine, run, table
+from write_report import machine, run, table, write_report
 
 from avatar.bench.hyper import (
     COVARIANCE_FLOATS,
@@ -228,7 +228,7 @@ def report(folder: Path, points: Sequence[Point], count: int) -> None:
         axes.set_xticks([], minor=True)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-    leave(folder, "conditioning", page, [fields, *([getattr(p, f) for f in fields] for p in points)], figure)
+    write_report(folder, "conditioning", page, [fields, *([getattr(p, f) for f in fields] for p in points)], figure)
 
 
 if __name__ == "__main__":

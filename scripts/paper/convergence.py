@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import torch
-from leave import leave, machine, run, table
 from systems import add_source_arguments, folders_and_overrides, systems
 from torch import Tensor
+from write_report import machine, run, table, write_report
 
 from avatar.bench.results import new_figure
 from avatar.config import Config, load_config
@@ -47,9 +47,9 @@ from avatar.runs.checkpoint import (
     module_tensors,
     save_checkpoint,
 )
-from avatar.train.optim import load_optimizer, make_optimizer, optimizer_tensors
+from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
-from avatar.train.posed import PosedMeshes
+from avatar.train.posed_mesh_cache import PosedMeshes
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
@@ -206,7 +206,7 @@ def report(
     rows = [["system", *fields]] + [
         [n, *(p[f] for f in fields)] for n, points in found.items() for p in points.values()
     ]
-    leave(folder, "convergence", page, rows, draw(learners, found, shown, truth))
+    write_report(folder, "convergence", page, rows, draw(learners, found, shown, truth))
 
 
 def draw(

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from leave import leave, run, table
 from systems import Request, add_arguments, is_measured, request_of, run_of, systems, train
 from torch import Tensor
+from write_report import run, table, write_report
 
 from avatar.bench.results import new_figure
 from avatar.data.source import Source
@@ -76,7 +76,7 @@ def main(words: Sequence[str]) -> int:
     rows += [
         [f.driver, f.avatar, n, float(f.distances[i])] for f in found for n, i in zip(f.frames, f.shown, strict=True)
     ]
-    leave(given.out, "cross", page(found), rows, draw(found, pictures))
+    write_report(given.out, "cross", page(found), rows, draw(found, pictures))
     return status
 
 

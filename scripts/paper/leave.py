@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 DPI = 100
 
 
-def leave(folder: Path, name: str, page: Sequence[str], rows: Iterable[Sequence[object]], figure: Figure) -> None:
+def write_report(
+    folder: Path, name: str, page: Sequence[str], rows: Iterable[Sequence[object]], figure: Figure
+) -> None:
     """Write and say where. `page` are the lines of the Markdown, `rows` those of the CSV, the first its header."""
     write_atomically(folder / f"{name}.md", ("\n".join(page) + "\n").encode())
     write_atomically(folder / f"{name}.csv", as_csv(rows).encode())

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from leave import leave, run, table
 from torch.distributions import MultivariateNormal
+from write_report import run, table, write_report
 
 from avatar.bench.results import new_figure
 from avatar.gaussians.hyper import HyperHead
@@ -73,7 +73,7 @@ def main(words: Sequence[str]) -> int:
         "",
         "The mean follows the latent; the deviation is the same in every slice.",
     ]
-    leave(parser.parse_args(words).out, "slicing", page, [Slice._fields, *found], draw(found))
+    write_report(parser.parse_args(words).out, "slicing", page, [Slice._fields, *found], draw(found))
     return 0
 
 

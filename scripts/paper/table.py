@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from leave import leave, run, table
 from systems import TABLES, Rows, add_arguments, is_measured, read_table, request_of, run_of, train, write_sweep
+from write_report import run, table, write_report
 
 from avatar.bench.render import inputs, stream_rate
 from avatar.bench.results import new_figure
@@ -72,7 +72,7 @@ def main(words: Sequence[str]) -> int:
     except UserError as error:
         print(f"No table: {error}", file=sys.stderr)
         return 1
-    leave(given.out, given.table, page(content["title"], rows, notes), as_rows(rows), draw(rows))
+    write_report(given.out, given.table, page(content["title"], rows, notes), as_rows(rows), draw(rows))
     return status
 
 

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from leave import leave, run, table
 from scipy.stats import spearmanr
 from systems import add_arguments, is_measured, request_of, run_of, systems, train
 from torch import Tensor
+from write_report import run, table, write_report
 
 from avatar.bench.quality import held_out_frames
 from avatar.bench.results import new_figure
@@ -90,7 +90,7 @@ def main(words: Sequence[str]) -> int:
     found = [examine(open_run(path, given.head), name, given.frames) for name, path in runs.items()]
     rows = [["run", "prediction", "mean prediction", "mean squared error"]]
     rows += [[f.name, name, *map(float, pair)] for f in found for name in PREDICTORS for pair in f.bins[name]]
-    leave(given.out, "uncertainty", page(found), rows, draw(found))
+    write_report(given.out, "uncertainty", page(found), rows, draw(found))
     return status
 
 

@@ -12,7 +12,7 @@ from avatar.bench import Request
 from avatar.bench.stages import StagedStep
 from avatar.bench.train_report import run
 from avatar.errors import UserError
-from avatar.train.optim import make_optimizer
+from avatar.train.optimizer import make_optimizer
 from avatar.train.step import Objective, choose_perceptual, training_step
 
 

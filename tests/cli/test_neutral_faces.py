@@ -13,7 +13,7 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
-from avatar.motion import reenact as reenact_module
+from avatar.pipeline import reenact as reenact_module
 
 
 @pytest.fixture(scope="module")

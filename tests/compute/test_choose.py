@@ -14,8 +14,9 @@ import pytest
 import torch
 
 from avatar.commands.doctor import find_gpu
-from avatar.compute import choose, self_test
 from avatar.errors import UserError
+from avatar.pipeline import device as choose
+from avatar.pipeline import self_test
 from avatar.pipeline.device import NoGpu, check_gpu, choose_device, sees_gpu
 from avatar.pipeline.self_test import WrongGpu
 

@@ -29,8 +29,8 @@ MODELS = {
     "no HyperGaussians": ("model=flashavatar",),
     "covariance": ("model=covariance",),
     "detail": ("model.uv_detail=2",),
-    "rigidity": ("model.rigidity=true",),
-    "facing": ("model.facing=true",),
+    "rigidity": ("model.skull_binding=true",),
+    "facing": ("model.head_rotation=true",),
     "blur": ("model.blur=1.5",),
     "teeth": ("model.teeth=true",),
 }

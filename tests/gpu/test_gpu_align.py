@@ -18,9 +18,9 @@ from avatar.compute.device import CPU
 from avatar.model import Avatar
 from avatar.runs.checkpoint import Checkpoint, list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.splat import splat
-from avatar.tracking.freedom import find_freedom
-from avatar.tracking.likeness import Likeness
+from avatar.tracking.frame_fitter import FrameFitter
 from avatar.tracking.motion import HeadPose
+from avatar.tracking.parameterization import find_parameterization
 from avatar.train import align as align_module
 from avatar.train.placed import place
 from avatar.train.step import choose_perceptual
@@ -35,7 +35,7 @@ TINY = (
     "trainer.iterations=10",
     "trainer.checkpoint_every=3",
     "trainer.keep_checkpoints=4",
-    "trainer.stray_share=0",
+    "trainer.prune_share=0",
 )
 
 
@@ -54,17 +54,17 @@ def clip(avatar: Avatar) -> Clip:
 def gradient(avatar: Avatar, clip: Clip, device: torch.device) -> tuple[Tensor, Tensor]:
     """Of a picture's squared error in the frame's values, in units; and the picture."""
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
-    freedom = find_freedom(tracks, clip.split.train, centre).on(device)
-    values = freedom.values(FRAME, torch.linspace(-0.4, 0.4, len(freedom.index), device=device))
-    likeness = Likeness(avatar, BACKGROUND.to(device), centre.to(device))
+    parameterization = find_parameterization(tracks, clip.split.train, centre).on(device)
+    values = parameterization.values(FRAME, torch.linspace(-0.4, 0.4, len(parameterization.index), device=device))
+    fitter = FrameFitter(avatar, BACKGROUND.to(device), centre.to(device))
     frame = clip.pictures[FRAME]
     given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world).on(device)
-    placed = place(frame, values, given, likeness.centre, DEGREE)
+    placed = place(frame, values, given, fitter.centre, DEGREE)
     params = placed.frame.params
-    drawn = placed.watched(avatar(params, likeness.vertices(params)))
-    image = splat(drawn, placed.frame.camera, likeness.background, sh_degree=DEGREE).image
+    drawn = placed.watched(avatar(params, fitter.vertices(params)))
+    image = splat(drawn, placed.frame.camera, fitter.background, sh_degree=DEGREE).image
     (image - frame.image.to(device)).square().mean().backward()
-    return placed.gradient()[freedom.index] * freedom.unit, image.detach()
+    return placed.gradient()[parameterization.index] * parameterization.unit, image.detach()
 
 
 def test_a_placed_frames_picture_and_gradient_are_those_of_the_cpu(avatar: Avatar, clip: Clip) -> None:

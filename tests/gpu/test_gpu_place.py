@@ -15,7 +15,7 @@ from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import latent_grid
-from avatar.gaussians.rigidity import Hold, Skull, held
+from avatar.gaussians.skull_binding import Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel
 from avatar.types import Gaussians
@@ -57,7 +57,7 @@ class Scene:
             "log_scales": torch.randn(N, 3, generator=g) - 4,
             "opacity_logits": 3 * torch.randn(N, generator=g),
             "neck": random_params().neck if has_skull else None,
-            "rigidity_logits": torch.randn(N, generator=g) if has_skull else None,
+            "skull_logits": torch.randn(N, generator=g) if has_skull else None,
         }
         self.skull = Skull.of(head, self.embedding)
         self.heads = heads
@@ -71,8 +71,8 @@ class Scene:
                 values = self.grid(values)
             if packed is not None:
                 values = torch.func.functional_call(self.heads, {"packed": packed}, (values,))
-            hold = None if logits is None else Hold(self.skull, neck, logits)
-            points = held(self.embedding.points(vertices), hold)
+            skull_binding = None if logits is None else SkullBinding(self.skull, neck, logits)
+            points = bind_to_skull(self.embedding.points(vertices), skull_binding)
             return compose_raw(points, *base, self.sh, values)
 
     def found(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
@@ -83,8 +83,8 @@ class Scene:
             self.grid.move(DEVICE)
         *base, neck, logits = rest
         skull = Skull(self.skull.at_rest.to(DEVICE), self.skull.arms.to(DEVICE))
-        hold = None if logits is None else Hold(skull, neck, logits)
-        return place_gpu(vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, hold)
+        skull_binding = None if logits is None else SkullBinding(skull, neck, logits)
+        return place_gpu(vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, skull_binding)
 
     def run(self, function: Callable[..., Gaussians], device: torch.device) -> tuple[Gaussians, dict[str, Tensor]]:
         leaves = {n: None if t is None else t.to(device).requires_grad_() for n, t in self.inputs.items()}
@@ -144,7 +144,7 @@ def test_zero_quaternions_and_saturated_offsets_have_finite_gradients() -> None:
         ("quats", (7, 4), "log_scales has N = |quats has N = 7"),
         ("opacity_logits", (7,), "opacity_logits has N = 7"),
         ("neck", (5,), "neck"),
-        ("rigidity_logits", (7,), "rigidity_logits has N = 7"),
+        ("skull_logits", (7,), "skull_logits has N = 7"),
     ],
 )
 def test_wrong_sizes_are_named(name: str, shape: tuple[int, ...], message: str) -> None:

@@ -50,25 +50,25 @@ def on_cpu(avatar: Avatar, clip: Clip) -> _Work:
 
 
 def test_picture_misfit_and_gradient_are_those_of_the_cpu(avatar: Avatar, clip: Clip, on_cpu: _Work) -> None:
-    moves = 0.3 * torch.randn(len(on_cpu.freedom.index), generator=torch.Generator().manual_seed(0))
+    moves = 0.3 * torch.randn(len(on_cpu.parameterization.index), generator=torch.Generator().manual_seed(0))
     with the_cpus_way():
         made = on_cpu.targets(FRAME, 1)
         assert made is not None
-        values = on_cpu.freedom.values(FRAME, moves)
-        expected = on_cpu.likeness.fit(values, on_cpu.pose(FRAME), made[0])
-        figures = on_cpu.likeness.figures(values, on_cpu.pose(FRAME), made[0])
-        picture = on_cpu.likeness.picture(values, on_cpu.pose(FRAME), made[0])
+        values = on_cpu.parameterization.values(FRAME, moves)
+        expected = on_cpu.fitter.fit(values, on_cpu.pose(FRAME), made[0])
+        figures = on_cpu.fitter.figures(values, on_cpu.pose(FRAME), made[0])
+        picture = on_cpu.fitter.picture(values, on_cpu.pose(FRAME), made[0])
     work = work_on(avatar.to(DEVICE), clip)
     found_targets = work.targets(FRAME, 1)
     assert not work.waits and found_targets is not None
     values = work.there.values(FRAME, moves.to(DEVICE))
-    found = work.likeness.fit(values, work.pose(FRAME), found_targets[0])
+    found = work.fitter.fit(values, work.pose(FRAME), found_targets[0])
     assert float(found.misfit) == pytest.approx(float(expected.misfit), rel=1e-4)
     assert error(found.gradient, expected.gradient) < 1e-3
     assert (found.picture.cpu() - expected.picture).abs().mean() < 1e-5
-    seen = work.likeness.picture(values, work.pose(FRAME), found_targets[0])
+    seen = work.fitter.picture(values, work.pose(FRAME), found_targets[0])
     assert (seen.cpu() - picture).abs().mean() < 1e-5
-    own = work.likeness.figures(values, work.pose(FRAME), found_targets[0])
+    own = work.fitter.figures(values, work.pose(FRAME), found_targets[0])
     assert own.tolist() == pytest.approx(figures.tolist(), rel=1e-4)
 
 
@@ -77,7 +77,7 @@ def test_the_way_down_is_that_of_the_cpu(
 ) -> None:
     """A curvature that is too small: the first step goes too far and is not taken, the others are."""
     monkeypatch.setattr(refine_module, "FINE_STEPS", 3)
-    factor = 0.5 * torch.eye(len(on_cpu.freedom.index))
+    factor = 0.5 * torch.eye(len(on_cpu.parameterization.index))
     with the_cpus_way():
         expected = on_cpu.refine(FRAME, [factor])
     (found,) = work_on(avatar.to(DEVICE), clip).refined([FRAME], [factor.to(DEVICE)])
@@ -93,7 +93,7 @@ def test_a_frame_reads_nothing_back(avatar: Avatar, clip: Clip) -> None:
     avatar.embedding.touching(avatar.head.assets.num_vertices)  # counted once, on the CPU: only numbers can be counted
     work = work_on(avatar.to("meta"), clip)
     work.levels = 2
-    factor = torch.eye(len(work.freedom.index), device="meta")
+    factor = torch.eye(len(work.parameterization.index), device="meta")
     with fixed_capacity(10_000):
         begun = work.begin(FRAME, [factor, factor])
         curvatures = work._stacked_curvatures(FRAME)

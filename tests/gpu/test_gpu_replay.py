@@ -21,10 +21,10 @@ from avatar.splat import splat
 from avatar.splat.capacity import CAPACITIES, Capacities, Kind, fixed_capacity
 from avatar.train import align as align_module
 from avatar.train import step as step_module
-from avatar.train import steps as steps_module
+from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import choose_perceptual
-from avatar.train.steps import Steps
+from avatar.train.step_runner import StepRunner
 from avatar.train.trainer import train
 from avatar.types import Gaussians
 
@@ -36,21 +36,21 @@ TINY = (
     "trainer.perceptual=dssim",
     "trainer.iterations=20",
     "trainer.checkpoint_every=8",
-    "trainer.stray_share=0",
+    "trainer.prune_share=0",
 )
 STILL = (*TINY, "trainer.align_rate=0")
 
 
 def trained(
     folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int, degree_every: int = 7
-) -> tuple[Checkpoint, Steps, list[float]]:
+) -> tuple[Checkpoint, StepRunner, list[float]]:
     """The last checkpoint, what made the steps, and the loss of each."""
     config = small_config(*overrides)
     _, subject, assets = open_small(folder, config)
     losses: list[float] = []
-    makers: list[Steps] = []
+    makers: list[StepRunner] = []
 
-    class Noting(Steps):
+    class Noting(StepRunner):
         def __init__(self, *arguments: object, **named: object) -> None:
             super().__init__(*arguments, **named)  # type: ignore[arg-type]
             makers.append(self)
@@ -62,8 +62,8 @@ def trained(
 
     with monkeypatch.context() as patch:
         patch.setattr(step_module, "SH_INTERVAL", degree_every)
-        patch.setattr(trainer_module, "Steps", Noting)
-        patch.setattr(steps_module, "WARM", warm)
+        patch.setattr(trainer_module, "StepRunner", Noting)
+        patch.setattr(step_runner_module, "WARM", warm)
         term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
         train(new_avatar(assets, subject, config), subject, config, run, term, device=DEVICE)
     return newest_checkpoint(run), makers[0], losses
@@ -76,7 +76,9 @@ def assert_same(found: Checkpoint, expected: Checkpoint) -> None:
 
 
 @pytest.mark.parametrize(
-    "overrides", [(), ("trainer.condition_noise=0.3", "model.facing=true", "model.rigidity=true")], ids=["plain", "all"]
+    "overrides",
+    [(), ("trainer.condition_noise=0.3", "model.head_rotation=true", "model.skull_binding=true")],
+    ids=["plain", "all"],
 )
 def test_replayed_steps_have_the_bits_of_launched_ones(
     overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -112,7 +114,7 @@ def test_what_cannot_be_captured_is_launched_and_said(
     def refuse(*_: object) -> None:
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    monkeypatch.setattr(steps_module, "Replay", refuse)
+    monkeypatch.setattr(step_runner_module, "Replay", refuse)
     found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *STILL, warm=1)
     said = capsys.readouterr().err
     assert said.count("because they cannot be replayed: operation not permitted") == 1
@@ -134,7 +136,7 @@ def test_a_script_without_todays_room_is_written_anew(
         return 4096 if asked["times"] < 12 else 8192
 
     written: list[int | None] = []
-    replay = steps_module.Replay
+    replay = step_runner_module.Replay
 
     def counting(*arguments: object) -> object:
         written.append(CAPACITIES.known(CAPACITIES.last_kind))
@@ -142,7 +144,7 @@ def test_a_script_without_todays_room_is_written_anew(
 
     expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)
     monkeypatch.setattr(Capacities, "known", growing)
-    monkeypatch.setattr(steps_module, "Replay", counting)
+    monkeypatch.setattr(step_runner_module, "Replay", counting)
     monkeypatch.setattr(step_module, "PERCEPTUAL_START", 1.0)
     found, steps, _ = trained(
         tracked_folder, tmp_path / "run", monkeypatch, *STILL, "trainer.iterations=12", warm=1, degree_every=99

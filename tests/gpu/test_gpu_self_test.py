@@ -13,7 +13,7 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from avatar.compute import self_test as module
+from avatar.pipeline import self_test as module
 from avatar.pipeline.self_test import TOLERANCE, WrongGpu, self_test
 from avatar.splat import gpu
 from avatar.types import Gaussians

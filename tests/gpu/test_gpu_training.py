@@ -18,7 +18,7 @@ from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.splat import capacity as capacity_module
 from avatar.splat import gpu_draw
-from avatar.train import steps as steps_module
+from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
@@ -77,7 +77,7 @@ def test_thirty_steps_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path:
 @pytest.fixture
 def launched(monkeypatch: pytest.MonkeyPatch) -> None:
     """No step is replayed, so that Python sees what each does."""
-    monkeypatch.setattr(steps_module, "WARM", 1000)
+    monkeypatch.setattr(step_runner_module, "WARM", 1000)
 
 
 def poison_gradient_at(step: int) -> Callable[[Avatar], object]:

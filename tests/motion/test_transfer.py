@@ -9,8 +9,8 @@ from heads import grid_head, rest_params
 
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.expression_space import fit_expressions
-from avatar.motion.repertoire import Repertoire, learn_repertoire
 from avatar.motion.rest import RestPose, find_mean, find_neutral
+from avatar.motion.statistics import MotionStatistics, learn_repertoire
 from avatar.motion.transfer import TRANSFERS, departed, transfer_motion
 from avatar.tracking.motion import rotation
 from avatar.types import HeadParams
@@ -40,7 +40,7 @@ HEAD = HeadModel(grid_head(), torch.zeros(0))
 REST_A, REST_B = torch.tensor([0.4, 0, 0.2, 0, 0]), torch.tensor([0, -0.3, 0, 0.5, 0])
 
 
-def learned(motion: list[HeadParams]) -> Repertoire:
+def learned(motion: list[HeadParams]) -> MotionStatistics:
     return learn_repertoire(motion, HEAD)
 
 

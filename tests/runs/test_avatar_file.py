@@ -92,10 +92,10 @@ def test_the_neutral_frame_is_counted_among_those_of_the_training(trained: Train
 def test_a_repertoire_is_that_of_the_training_frames(trained: TrainedAvatar) -> None:
     one = later(trained)
     training = one.recording.motion(one.recording.split.train)
-    assert torch.equal(one.repertoire.mean.expression, find_mean(training).expression)
+    assert torch.equal(one.statistics.mean.expression, find_mean(training).expression)
     space = fit_expressions(training)
-    assert torch.equal(one.repertoire.expressions.lowest, space.lowest)
-    assert not torch.equal(one.repertoire.expressions.lowest, trained.repertoire.expressions.lowest)
+    assert torch.equal(one.statistics.expressions.lowest, space.lowest)
+    assert not torch.equal(one.statistics.expressions.lowest, trained.statistics.expressions.lowest)
 
 
 def test_a_file_with_its_head_needs_nothing_else(run: Path, trained: TrainedAvatar, tmp_path: Path) -> None:

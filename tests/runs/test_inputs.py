@@ -92,4 +92,4 @@ def test_the_cameras_width_is_a_whole_number_of_pixels(anna: TrainedAvatar) -> N
 
 def test_an_avatar_is_shown_in_one_line(anna: TrainedAvatar) -> None:
     assert re.fullmatch(r"<avatar of someone: [0-9,]+ Gaussians \(hypergaussians\), .* 24 frames, .*>", repr(anna))
-    assert all(len(repr(part)) < 300 for part in (anna, anna.recording, anna.repertoire, anna.assets))
+    assert all(len(repr(part)) < 300 for part in (anna, anna.recording, anna.statistics, anna.assets))

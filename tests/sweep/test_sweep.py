@@ -79,7 +79,7 @@ def test_a_sweep_on_every_engine(engine: str, place: Path, tables: dict[str, str
     states = {path.name: read_state(path) for path in (folder / "jobs").iterdir()}
     assert len(states) == 6
     (broken,) = [name for name, state in states.items() if state.status == "failed"]
-    assert "500 training frames cannot be taken from 12" in states[broken].sentence
+    assert "500 test frames cannot be held out of 12" in states[broken].sentence
     assert states[broken].is_final and states[broken].attempts == 1, "a sentence is an answer"
     assert [state.status for state in states.values()].count("done") == 5 and len(killed) == 1
     assert states[killed[0]].attempts == 2, "the job whose worker was killed went on in another"
@@ -103,12 +103,12 @@ def test_status_and_another_try(place: Path, tmp_path: Path) -> None:
     assert "holds no sweep; start one with" in avatar("sweep", broken, "--out", folder, "--status", status=1)
     assert "No table" in avatar("sweep", broken, "--out", folder, "--workers", 1, status=1)
     shown = avatar("sweep", "--out", folder, "--status", status=1)
-    assert "1 jobs: 0 done, 1 failed" in shown and shown.count("500 training frames cannot be taken") == 2
+    assert "1 jobs: 0 done, 1 failed" in shown and shown.count("500 test frames cannot be held") == 2
     (job,) = (folder / "jobs").iterdir()
     assert read_state(job).is_final
     write_state(job, State("failed", 1, sentence="x", is_final=True))
     avatar("sweep", "--out", folder, "--retry-failed", status=1)
-    assert "500 training frames" in read_state(job).sentence
+    assert "500 test frames" in read_state(job).sentence
 
     another = write_spec(place, "another.yaml", variants=[BROKEN], protocols=["hypergaussians"])
     assert "holds a sweep in which" in avatar("sweep", another, "--out", folder, status=1)

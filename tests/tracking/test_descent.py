@@ -13,9 +13,9 @@ from avatar.data.recording import Recording
 from avatar.model import Avatar
 from avatar.refine.refine import frozen
 from avatar.tracking.descent import Problem, curvature, descend
-from avatar.tracking.freedom import find_freedom
-from avatar.tracking.likeness import HUBER_DELTA, Likeness, targets
+from avatar.tracking.frame_fitter import HUBER_DELTA, FrameFitter, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
+from avatar.tracking.parameterization import find_parameterization
 
 
 @pytest.fixture(scope="module")
@@ -30,33 +30,33 @@ def clip(avatar: Avatar) -> Clip:
     return drawn_clip(avatar, frames=10, train=8)
 
 
-def likeness_of(avatar: Avatar) -> Likeness:
-    return Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
+def likeness_of(avatar: Avatar) -> FrameFitter:
+    return FrameFitter(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
 
 
-def problem(clip: Clip, likeness: Likeness, frame: int, levels: int = 1) -> Problem:
+def problem(clip: Clip, fitter: FrameFitter, frame: int, levels: int = 1) -> Problem:
     tracks = clip.recording.tracks
     made = targets(clip.pictures[frame], BACKGROUND, levels)
     assert made is not None
     given = HeadPose(tracks["R"][frame], tracks["t"][frame])
-    return Problem(given, made, frame, find_freedom(tracks, clip.split.train, likeness.centre))
+    return Problem(given, made, frame, find_parameterization(tracks, clip.split.train, fitter.centre))
 
 
-def factors(clip: Clip, likeness: Likeness, levels: int = 1) -> list[torch.Tensor]:
-    made = problem(clip, likeness, 0, levels)
-    prior = torch.eye(len(made.freedom.index))
-    return [torch.linalg.cholesky(curvature(likeness, made, level) + prior) for level in range(levels)]
+def factors(clip: Clip, fitter: FrameFitter, levels: int = 1) -> list[torch.Tensor]:
+    made = problem(clip, fitter, 0, levels)
+    prior = torch.eye(len(made.parameterization.index))
+    return [torch.linalg.cholesky(curvature(fitter, made, level) + prior) for level in range(levels)]
 
 
 def test_where_the_picture_fits_the_curvature_is_the_misfits_own(avatar: Avatar, clip: Clip) -> None:
-    likeness = likeness_of(avatar)
-    made = problem(clip, likeness, 2)
-    matrix = curvature(likeness, made, 0)
+    fitter = likeness_of(avatar)
+    made = problem(clip, fitter, 2)
+    matrix = curvature(fitter, made, 0)
     assert torch.allclose(matrix, matrix.T)
-    still = torch.zeros(len(made.freedom.index))
+    still = torch.zeros(len(made.parameterization.index))
 
     def misfit(moves: torch.Tensor) -> float:
-        return likeness.measure(made.freedom.values(2, moves), made.given, made.targets[0]).misfit
+        return fitter.measure(made.parameterization.values(2, moves), made.given, made.targets[0]).misfit
 
     base = misfit(still)
     for k in (2, 3, 4, 8, len(still) - 1):  # the other turns change which splat is in front of which, in jumps
@@ -74,63 +74,63 @@ def test_where_the_picture_fits_the_curvature_is_the_misfits_own(avatar: Avatar,
 
 def test_pixels_that_are_far_off_count_less_in_the_curvature(avatar: Avatar, clip: Clip) -> None:
     """By as much as in the Huber loss, whose slope is a quarter of the error there; and by their weight."""
-    likeness = likeness_of(avatar)
-    made = problem(clip, likeness, 2)
+    fitter = likeness_of(avatar)
+    made = problem(clip, fitter, 2)
     (target,) = made.targets
-    still = torch.zeros(len(made.freedom.index))
-    picture = likeness.picture(made.freedom.values(2, still), made.given, target)
+    still = torch.zeros(len(made.parameterization.index))
+    picture = fitter.picture(made.parameterization.values(2, still), made.given, target)
     fits, off = (replace(made, targets=[target._replace(picture=picture + error)]) for error in (0.0, 4 * HUBER_DELTA))
-    whole = curvature(likeness, fits, 0)
-    torch.testing.assert_close(
-        curvature(likeness, off, 0), 0.25 * whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max())
-    )
-    weighted = curvature(likeness, fits, 0, weight=torch.full(target.mask.shape, 3.0))
+    whole = curvature(fitter, fits, 0)
+    torch.testing.assert_close(curvature(fitter, off, 0), 0.25 * whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()))
+    weighted = curvature(fitter, fits, 0, weight=torch.full(target.mask.shape, 3.0))
     torch.testing.assert_close(weighted, 3.0 * whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()))
 
 
 @pytest.mark.parametrize("levels", [1, 2])
 def test_a_disturbed_frame_comes_back(avatar: Avatar, clip: Clip, levels: int) -> None:
-    wrong, likeness = wrongly_tracked(clip, degrees=1.0, mm=2.0), likeness_of(avatar)
-    common = factors(wrong, likeness, levels)
+    wrong, fitter = wrongly_tracked(clip, degrees=1.0, mm=2.0), likeness_of(avatar)
+    common = factors(wrong, fitter, levels)
     for frame in (1, 9):
-        made = problem(wrong, likeness, frame, levels)
-        found = descend(likeness, made, common, [6, 3][:levels])
+        made = problem(wrong, fitter, frame, levels)
+        found = descend(fitter, made, common, [6, 3][:levels])
         assert found.picture.shape == made.targets[0].picture.shape
         moves = torch.zeros(len(wrong), len(found.moves))
         moves[frame] = found.moves
         before, after = (
             screen_errors(avatar, recording, clip.recording, [frame])
-            for recording in (wrong.recording, moved(wrong, made, moves, likeness))
+            for recording in (wrong.recording, moved(wrong, made, moves, fitter))
         )
         assert before > 0.25 and after < 0.12 * before
 
 
-def moved(clip: Clip, made: Problem, moves: torch.Tensor, likeness: Likeness) -> Recording:
-    freedom = made.freedom
-    tracks = moved_tracks(clip.recording.tracks, freedom.all_values(moves), freedom.changed(), likeness.centre)
+def moved(clip: Clip, made: Problem, moves: torch.Tensor, fitter: FrameFitter) -> Recording:
+    parameterization = made.parameterization
+    tracks = moved_tracks(
+        clip.recording.tracks, parameterization.all_values(moves), parameterization.changed(), fitter.centre
+    )
     return replace(clip.recording, tracks=tracks)
 
 
 def test_the_last_picture_is_that_of_the_moves_and_no_worse_than_the_first(avatar: Avatar, clip: Clip) -> None:
-    wrong, likeness = wrongly_tracked(clip), likeness_of(avatar)
-    made = problem(wrong, likeness, 4)
-    found = descend(likeness, made, factors(wrong, likeness), [2])
-    values = made.freedom.values(4, found.moves)
-    assert torch.allclose(found.picture, likeness.picture(values, made.given, made.targets[0]), atol=1e-5)
+    wrong, fitter = wrongly_tracked(clip), likeness_of(avatar)
+    made = problem(wrong, fitter, 4)
+    found = descend(fitter, made, factors(wrong, fitter), [2])
+    values = made.parameterization.values(4, found.moves)
+    assert torch.allclose(found.picture, fitter.picture(values, made.given, made.targets[0]), atol=1e-5)
 
     def energy(moves: torch.Tensor) -> float:
-        misfit = likeness.measure(made.freedom.values(4, moves), made.given, made.targets[0]).misfit
+        misfit = fitter.measure(made.parameterization.values(4, moves), made.given, made.targets[0]).misfit
         return misfit + 0.5 * float(moves @ moves)
 
     assert energy(found.moves) < 0.5 * energy(torch.zeros_like(found.moves))
-    stuck = descend(likeness, made, [1e-6 * factor for factor in factors(wrong, likeness)], [3])
+    stuck = descend(fitter, made, [1e-6 * factor for factor in factors(wrong, fitter)], [3])
     # Steps far too long: none is taken.
     assert energy(stuck.moves) <= energy(torch.zeros_like(found.moves)) * (1 + 1e-6)
 
 
 def test_moves_stay_within_their_bounds(avatar: Avatar, clip: Clip) -> None:
     """A coefficient whose truth lies beyond what training showed goes to the edge of that and no farther."""
-    wrong, likeness = wrongly_tracked(clip), likeness_of(avatar)
+    wrong, fitter = wrongly_tracked(clip), likeness_of(avatar)
     tracks = dict(wrong.recording.tracks)
     k = 0
     tracks["expression"] = tracks["expression"].clone()
@@ -139,9 +139,9 @@ def test_moves_stay_within_their_bounds(avatar: Avatar, clip: Clip) -> None:
     truth = clip.recording.tracks["expression"][:, k]
     frame = int(truth.argmax())
     assert float(truth[frame]) > 0.3
-    made = problem(narrow, likeness, frame)
-    found = descend(likeness, made, factors(narrow, likeness), [8])
-    low, high = made.freedom.bounds(frame)
+    made = problem(narrow, fitter, frame)
+    found = descend(fitter, made, factors(narrow, fitter), [8])
+    low, high = made.parameterization.bounds(frame)
     assert bool((found.moves >= low).all()) and bool((found.moves <= high).all())
-    place = int((made.freedom.index == 20 + k).nonzero())
+    place = int((made.parameterization.index == 20 + k).nonzero())
     assert float(found.moves[place]) == float(high[place])

@@ -18,12 +18,12 @@ from avatar.errors import UserError
 from avatar.model import SH_DEGREE, Avatar
 from avatar.refine.refine import frozen
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
-from avatar.tracking.freedom import find_freedom
-from avatar.tracking.likeness import Likeness, misfit, targets
+from avatar.tracking.frame_fitter import FrameFitter, misfit, targets
 from avatar.tracking.motion import HeadPose, moved_tracks
+from avatar.tracking.parameterization import find_parameterization
 from avatar.train import align as align_module
 from avatar.train.align import Alignment, make_alignment
-from avatar.train.optim import make_optimizer
+from avatar.train.optimizer import make_optimizer
 from avatar.train.placed import place
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
@@ -54,8 +54,11 @@ def test_the_gradient_is_that_of_refinement(avatar: Avatar, view_dependent: floa
         avatar.sh_rest.mul_(view_dependent)
     (target,) = targets(clip.pictures[3], BACKGROUND, 1) or ()
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
-    given, freedom = HeadPose(tracks["R"][3], tracks["t"][3]), find_freedom(tracks, clip.split.train, centre)
-    values = freedom.values(3, torch.full((len(freedom.index),), 0.3))
+    given, parameterization = (
+        HeadPose(tracks["R"][3], tracks["t"][3]),
+        find_parameterization(tracks, clip.split.train, centre),
+    )
+    values = parameterization.values(3, torch.full((len(parameterization.index),), 0.3))
     placed = place(clip.pictures[3], values, given, centre, SH_DEGREE)
     params = placed.frame.params
     camera = placed.frame.camera
@@ -63,10 +66,10 @@ def test_the_gradient_is_that_of_refinement(avatar: Avatar, view_dependent: floa
     picture = avatar.draw(gaussians, camera, BACKGROUND, region=target.box).image[target.box]
     misfit(picture, target).backward()
     with frozen(avatar):
-        expected = Likeness(avatar, BACKGROUND, centre).fit(values, given, target).gradient
+        expected = FrameFitter(avatar, BACKGROUND, centre).fit(values, given, target).gradient
     found = placed.gradient()
-    assert float((found - expected)[freedom.index].mul(freedom.unit).norm()) < tolerance * float(
-        expected[freedom.index].mul(freedom.unit).norm()
+    assert float((found - expected)[parameterization.index].mul(parameterization.unit).norm()) < tolerance * float(
+        expected[parameterization.index].mul(parameterization.unit).norm()
     )
 
 
@@ -85,8 +88,8 @@ def aligned(avatar: Avatar, clip: Clip) -> tuple[Alignment, Clip, list[str]]:
         alignment.learn(seen)
     moves = alignment.tensors()["align.moves"]
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
-    freedom = find_freedom(tracks, clip.split.train, centre)
-    moved = moved_tracks(tracks, freedom.all_values(moves), freedom.changed(), centre)
+    parameterization = find_parameterization(tracks, clip.split.train, centre)
+    moved = moved_tracks(tracks, parameterization.all_values(moves), parameterization.changed(), centre)
     return alignment, replace(clip, recording=replace(clip.recording, tracks=moved)), said
 
 
@@ -212,11 +215,16 @@ def test_a_step_moves_a_frame_by_its_share_of_a_gauss_newton_step(avatar: Avatar
     found = alignment.tensors()["align.moves"][3]
 
     tracks, centre = clip.recording.tracks, avatar.head.neutral_vertices().mean(dim=0)
-    given, freedom = HeadPose(tracks["R"][3], tracks["t"][3]), find_freedom(tracks, clip.split.train, centre)
+    given, parameterization = (
+        HeadPose(tracks["R"][3], tracks["t"][3]),
+        find_parameterization(tracks, clip.split.train, centre),
+    )
     (target,) = targets(frame, BACKGROUND, 1) or ()
     with frozen(avatar):
-        slope = Likeness(avatar, BACKGROUND, centre).fit(freedom.given[3], given, target).gradient
-    whole = torch.cholesky_solve((slope[freedom.index] * freedom.unit)[:, None], alignment.tensors()["align.factor"])
+        slope = FrameFitter(avatar, BACKGROUND, centre).fit(parameterization.given[3], given, target).gradient
+    whole = torch.cholesky_solve(
+        (slope[parameterization.index] * parameterization.unit)[:, None], alignment.tensors()["align.factor"]
+    )
     assert float((found + 0.5 * whole[:, 0]).norm()) < 0.02 * float(found.norm()) and float(found.norm()) > 1e-3
 
 
@@ -226,11 +234,13 @@ def test_moves_stay_within_their_bounds(avatar: Avatar) -> None:
     alignment, frame = begun(avatar, clip), clip.pictures[3]
     seen = alignment.see(10, frame, Pictures(clip), print)  # type: ignore[arg-type]
     assert seen.placed is not None
-    freedom = find_freedom(clip.recording.tracks, clip.split.train, avatar.head.neutral_vertices().mean(dim=0))
-    slope = torch.where(torch.arange(freedom.given.shape[1]) % 2 == 0, 1e9, -1e9)
+    parameterization = find_parameterization(
+        clip.recording.tracks, clip.split.train, avatar.head.neutral_vertices().mean(dim=0)
+    )
+    slope = torch.where(torch.arange(parameterization.given.shape[1]) % 2 == 0, 1e9, -1e9)
     seen.placed.gradient = lambda: slope  # type: ignore[method-assign]
     alignment.learn(seen)
-    moves, (low, high) = alignment.tensors()["align.moves"][3], freedom.bounds(3)
+    moves, (low, high) = alignment.tensors()["align.moves"][3], parameterization.bounds(3)
     assert bool((moves >= low).all()) and bool((moves <= high).all()) and bool(((moves == low) | (moves == high)).all())
 
 
@@ -241,7 +251,7 @@ def test_mouths_count_in_the_curvature_as_in_the_loss(avatar: Avatar, monkeypatc
     clip = replace(clip, pictures=tuple(replace(picture, mouth_mask=mouth) for picture in clip.pictures))
 
     def curvature(weight: float) -> torch.Tensor:
-        monkeypatch.setattr("avatar.train.inquiry.MOUTH_WEIGHT", weight)
+        monkeypatch.setattr("avatar.train.alignment_statistics.MOUTH_WEIGHT", weight)
         factor = begun(avatar, clip).tensors()["align.factor"]
         return factor @ factor.T
 
@@ -269,14 +279,14 @@ def test_what_was_not_finite_moves_nothing_and_is_waited_for(avatar: Avatar) -> 
     optimizer = make_optimizer(avatar, config.trainer)
     alignment.see(10, clip.pictures[0], loader, print)  # type: ignore[arg-type]
 
-    def moved(is_spoilt: torch.Tensor | None, factor: float = 1.0) -> bool:
+    def moved(is_nonfinite: torch.Tensor | None, factor: float = 1.0) -> bool:
         seen = alignment.see(11, clip.pictures[1], loader, print, wait)  # type: ignore[arg-type]
         training_step(avatar, optimizer, objective, 11, seen.frame, seen.vertices, None, seen.watched)
         assert seen.placed is not None
         gradient = factor * seen.placed.gradient()
         seen.placed.gradient = lambda: gradient  # type: ignore[method-assign]
         before = alignment.tensors()["align.moves"]
-        alignment.learn(seen, is_spoilt)
+        alignment.learn(seen, is_nonfinite)
         return not torch.equal(alignment.tensors()["align.moves"], before)
 
     assert not moved(torch.ones(()))

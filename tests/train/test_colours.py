@@ -12,8 +12,8 @@ from small_runs import new_avatar, open_small, small_config
 
 from avatar.model import Avatar
 from avatar.splat.sh import C0
-from avatar.train import colours as colours_module
-from avatar.train.colours import colour_from_frames, sample, seen_colours
+from avatar.train import init_colours as colours_module
+from avatar.train.init_colours import colour_from_frames, sample, seen_colours
 from avatar.types import Camera, Frame
 
 

@@ -12,7 +12,7 @@ from small_runs import new_avatar, open_small, small_config
 
 from avatar.data.split import Split
 from avatar.data.subject import FramePixels, Subject
-from avatar.gaussians.facing import learned_turning
+from avatar.gaussians.head_rotation import learned_turning
 from avatar.head.assets import HeadAssets
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE
@@ -103,9 +103,9 @@ def test_the_neutral_face_is_a_training_frames(tracked_folder: Path, tmp_path: P
 
 def same_rest(a: TrainedAvatar, b: TrainedAvatar) -> None:
     """Neutral face, mean and range of the expressions, by which other people's motion is measured."""
-    for one, two in ((a.neutral, b.neutral), (a.repertoire.mean, b.repertoire.mean)):
+    for one, two in ((a.neutral, b.neutral), (a.statistics.mean, b.statistics.mean)):
         assert one.frame == two.frame
         assert torch.equal(one.expression, two.expression) and torch.equal(one.jaw, two.jaw)
     for name in ("mean", "components", "deviations", "lowest", "highest"):
-        one, two = (getattr(which.repertoire.expressions, name) for which in (a, b))
+        one, two = (getattr(which.statistics.expressions, name) for which in (a, b))
         assert torch.equal(one, two), name

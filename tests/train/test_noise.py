@@ -12,7 +12,7 @@ from small_runs import open_small, small_config, train_small
 
 from avatar.data.subject import Subject
 from avatar.model import Avatar
-from avatar.train.noise import ConditionNoise, make_noise
+from avatar.train.condition_noise import ConditionNoise, make_noise
 
 SHARE = 0.3
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_runs import new_avatar, open_small, small_config
 
-from avatar.train.optim import make_optimizer, schedule, set_rates
+from avatar.train.optimizer import make_optimizer, schedule, set_rates
 
 
 def test_without_schedule_every_step_has_the_full_rates() -> None:

@@ -16,7 +16,7 @@ from avatar.gaussians.growth import alive_after
 from avatar.model import Avatar
 from avatar.runs.checkpoint import load_module, module_tensors, newest_checkpoint
 from avatar.runs.trained import load_avatar
-from avatar.train.optim import make_optimizer
+from avatar.train.optimizer import make_optimizer
 from avatar.train.points import drawn, move_points
 from avatar.types import HeadParams
 

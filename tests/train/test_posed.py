@@ -6,7 +6,7 @@ import torch
 from small_runs import open_small, small_config
 
 from avatar.head.model import HeadModel
-from avatar.train.posed import PosedMeshes
+from avatar.train.posed_mesh_cache import PosedMeshes
 
 
 def test_meshes_are_those_of_the_head_and_are_kept_while_there_is_room(tracked_folder: Path) -> None:

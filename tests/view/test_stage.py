@@ -81,7 +81,7 @@ def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, stage: St
 def test_the_distance_is_that_of_the_repertoire(stage: Stage, trained: TrainedAvatar) -> None:
     rest = trained.rest_params()
     far = replace(rest, expression=rest.expression + 20)
-    own = trained.repertoire.expressions.distances([trained.recording.params(3)])
+    own = trained.statistics.expressions.distances([trained.recording.params(3)])
     assert stage.distance(trained.recording.params(3)) == float(own[0])
     assert stage.distance(far) > 2 * stage.distance(rest)
 

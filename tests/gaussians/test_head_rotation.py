@@ -11,7 +11,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.config import load_config
-from avatar.gaussians.facing import LIMIT, VALUES, facing, learned_turning
+from avatar.gaussians.head_rotation import LIMIT, VALUES, head_rotation_input, learned_turning
 from avatar.model import Avatar
 from avatar.render import Renderer
 from avatar.types import Camera
@@ -37,7 +37,7 @@ def small_avatar(told: bool = True, **options: object) -> Avatar:
     extra = [f"{key}={value}" for key, value in options.items()]
     torch.manual_seed(2)
     avatar = Avatar(
-        grid_head(), torch.zeros(3), load_config([*SMALL, f"model.facing={str(told).lower()}", *extra]).model
+        grid_head(), torch.zeros(3), load_config([*SMALL, f"model.head_rotation={str(told).lower()}", *extra]).model
     )
     assert avatar.hyper is not None
     with torch.no_grad():
@@ -54,23 +54,23 @@ def test_it_is_the_sines_of_the_turn_in_units_of_their_spread() -> None:
     vectors, mean = turns(), a_mean()
     R = rotations(vectors, mean)
     turning = learned_turning(R)
-    told = torch.stack([facing(turning, r) for r in R])
+    told = torch.stack([head_rotation_input(turning, r) for r in R])
     angle = vectors.norm(dim=1, keepdim=True)
     sines = vectors / angle * angle.sin()
     expected = sines / sines.square().mean().sqrt()
     torch.testing.assert_close(told, expected.clamp(-LIMIT, LIMIT), rtol=0, atol=1e-4)
     assert (told.abs() == LIMIT).any(), "some are turned farther than is told"
-    torch.testing.assert_close(facing(turning, mean), torch.zeros(3), rtol=0, atol=1e-5)
+    torch.testing.assert_close(head_rotation_input(turning, mean), torch.zeros(3), rtol=0, atol=1e-5)
 
 
 def test_a_head_that_never_turns_is_told_nothing() -> None:
     turning = learned_turning(a_mean().repeat(10, 1, 1))
-    assert (turning == 0).all() and (facing(turning, a_mean()) == 0).all()
+    assert (turning == 0).all() and (head_rotation_input(turning, a_mean()) == 0).all()
 
 
 def test_the_network_hears_it_and_the_mesh_does_not() -> None:
     avatar, params = small_avatar(), random_params()
-    avatar.learn_facing(rotations(turns(), a_mean()))
+    avatar.learn_head_rotation(rotations(turns(), a_mean()))
     side = rotations(torch.tensor([[0.0, 0.1, 0.0]]), a_mean())[0]
     unturned, turned, unknown = avatar(params, None, a_mean()), avatar(params, None, side), avatar(params)
     torch.testing.assert_close(unknown.means, unturned.means, rtol=0, atol=1e-6)
@@ -81,7 +81,7 @@ def test_the_network_hears_it_and_the_mesh_does_not() -> None:
 
 def test_without_it_the_camera_makes_no_difference() -> None:
     avatar, params = small_avatar(told=False), random_params()
-    avatar.learn_facing(rotations(turns(), a_mean()))
+    avatar.learn_head_rotation(rotations(turns(), a_mean()))
     side = rotations(torch.tensor([[0.0, 0.1, 0.0]]), a_mean())[0]
     assert avatar.turning is None and not any("turning" in name for name in avatar.state_dict())
     assert all((a == b).all() for a, b in zip(avatar(params, None, side), avatar(params), strict=True))
@@ -89,8 +89,10 @@ def test_without_it_the_camera_makes_no_difference() -> None:
 
 @pytest.mark.parametrize("model", ["flashavatar", "monogaussianavatar", "ndgs"])
 def test_other_networks_can_be_told_too(model: str) -> None:
-    avatar = Avatar(grid_head(), torch.zeros(3), load_config([*SMALL, f"model={model}", "model.facing=true"]).model)
-    avatar.learn_facing(rotations(turns(), a_mean()))
+    avatar = Avatar(
+        grid_head(), torch.zeros(3), load_config([*SMALL, f"model={model}", "model.head_rotation=true"]).model
+    )
+    avatar.learn_head_rotation(rotations(turns(), a_mean()))
     assert avatar.turning is not None and (avatar.turning != 0).any()
     avatar(random_params(), None, a_mean())
 
@@ -102,7 +104,7 @@ def test_where_there_is_no_network_nobody_is_told() -> None:
 
 def test_the_renderer_tells_it_what_the_camera_sees() -> None:
     avatar, params = small_avatar(), random_params()
-    avatar.learn_facing(rotations(turns(), a_mean()))
+    avatar.learn_head_rotation(rotations(turns(), a_mean()))
     background = torch.ones(3)
     renderer = Renderer(avatar, background)
     for vector in ([0.0, 0.1, 0.0], [0.03, -0.2, 0.0]):
@@ -126,15 +128,15 @@ def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.Mon
 
     R = rotations(turns(), a_mean())
     avatar_there = small_avatar()
-    avatar_there.learn_facing(R)
-    expected = facing(torch.as_tensor(avatar_there.turning), R[3])
+    avatar_there.learn_head_rotation(R)
+    expected = head_rotation_input(torch.as_tensor(avatar_there.turning), R[3])
     told: list[Tensor] = []
 
     def recorded(turning: Tensor, rotation: Tensor) -> Tensor:
-        told.append(facing(turning, rotation))
+        told.append(head_rotation_input(turning, rotation))
         return told[-1]
 
-    monkeypatch.setattr(avatar.model, "facing", recorded)
+    monkeypatch.setattr(avatar.model, "head_rotation_input", recorded)
     avatar_there.to("meta")
     condition = avatar_there.condition(random_params(), R[3])
     assert condition.is_meta and told[0].is_cpu

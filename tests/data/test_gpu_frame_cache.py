@@ -9,8 +9,8 @@ import pytest
 import torch
 from small_runs import open_small, small_config
 
+from avatar.data.gpu_frame_cache import GpuFrameCache, box_of, frame_cache_bytes
 from avatar.data.loader import FrameLoader
-from avatar.data.shelf import Shelf, box_of, shelf_bytes
 from avatar.data.subject import Subject
 from avatar.losses.metrics import bounding_box
 
@@ -28,8 +28,8 @@ def bytes_of(subject: Subject, size: int | None = None) -> int:
 
 @pytest.mark.parametrize("size", [None, 24])
 def test_frames_are_those_of_the_subject(subject: Subject, size: int | None) -> None:
-    shelf = Shelf(subject, CPU, 10 * bytes_of(subject))
-    with FrameLoader(subject, size, shelf=shelf) as loader:
+    frame_cache = GpuFrameCache(subject, CPU, 10 * bytes_of(subject))
+    with FrameLoader(subject, size, frame_cache=frame_cache) as loader:
         for index, found in zip([3, 0, 3], loader.frames([3, 0, 3]), strict=True):
             expected = subject.frame(index, size)
             assert (found.index, found.name) == (expected.index, expected.name)
@@ -52,13 +52,13 @@ def test_what_fits_is_decoded_once_and_kept_in_one_place(subject: Subject, monke
 
     one = bytes_of(subject)
     monkeypatch.setattr(Subject, "pixels", counted)
-    shelf = Shelf(subject, CPU, 2 * one)
-    with FrameLoader(subject, cache_bytes=0, workers=1, shelf=shelf) as loader:
+    frame_cache = GpuFrameCache(subject, CPU, 2 * one)
+    with FrameLoader(subject, cache_bytes=0, workers=1, frame_cache=frame_cache) as loader:
         for _ in range(3):
             list(loader.frames([0, 1, 2]))
     assert sorted(decoded) == [0, 1, 2, 2, 2]
-    assert [index in shelf for index in (0, 1, 2)] == [True, True, False]
-    with FrameLoader(subject, cache_bytes=10 * one, shelf=Shelf(subject, CPU, one)) as loader:
+    assert [index in frame_cache for index in (0, 1, 2)] == [True, True, False]
+    with FrameLoader(subject, cache_bytes=10 * one, frame_cache=GpuFrameCache(subject, CPU, one)) as loader:
         list(loader.frames([0, 1]))
         assert loader.cached_bytes == one
 
@@ -71,4 +71,4 @@ def test_the_box_of_a_mask() -> None:
 
 
 def test_a_cpu_has_no_shelf_of_its_own() -> None:
-    assert shelf_bytes(CPU) == 0
+    assert frame_cache_bytes(CPU) == 0

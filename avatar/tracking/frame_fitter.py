@@ -18,7 +18,7 @@ from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor
 from torch.nn.functional import huber_loss, normalize
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.model import SH_DEGREE, Avatar
@@ -47,7 +47,7 @@ class Target(NamedTuple):
     def on(self, device: torch.device, given: HeadPose) -> Target:
         """There, but for the camera, which takes the given pose of the head (on the CPU)."""
         camera = replace(self.camera, R_cam_world=given.R, t_cam_world=given.t)
-        return self._replace(camera=camera, picture=brought(self.picture, device), mask=brought(self.mask, device))
+        return self._replace(camera=camera, picture=to_device(self.picture, device), mask=to_device(self.mask, device))
 
 
 def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Target] | None:
@@ -112,7 +112,7 @@ class Fit(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Likeness:
+class FrameFitter:
     """An avatar that is not trained any more, over a background; all where the avatar is. Any number of threads may use it.
 
     On a GPU nothing is read back: what the methods give is there, but for what `measure` gives.

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from avatar.losses.photometric import PhotometricLoss
-from avatar.train import ahead as ahead_module
-from avatar.train.ahead import Ahead, Guard, Spoilt
+from avatar.train import step_monitor as step_monitor_module
 from avatar.train.step import Outcome
+from avatar.train.step_monitor import AsyncStepMonitor, Guard, NonFiniteStep
 
 
 class Log:
@@ -64,7 +64,7 @@ def test_from_a_step_that_is_not_finite_on_nothing_moves_until_it_is_forgiven(
         assert moved == [step < 2] * 2, step
         for weight in weights:
             assert float(optimizer.state[weight]["step"]) == float(counted[id(weight)]) + (step < 2)
-    guard.forgive()
+    guard.reset()
     guard.judge(loss_of(1.0), [torch.ones(3)])
     weights[0].grad = torch.ones(3)
     before = weights[0].detach().clone()
@@ -90,7 +90,7 @@ def test_a_guard_changes_no_bit_of_a_step(weights: list[Tensor]) -> None:
 
 def test_numbers_are_logged_in_order_with_all_terms(weights: list[Tensor]) -> None:
     log = Log()
-    ahead = Ahead(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
+    ahead = AsyncStepMonitor(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
     for step in (1, 2, 3):
         ahead.note(step, outcome_of(float(step)))
     ahead.settle()
@@ -101,14 +101,14 @@ def test_numbers_are_logged_in_order_with_all_terms(weights: list[Tensor]) -> No
 
 def test_a_spoilt_step_is_named_and_repeated_with_care(weights: list[Tensor]) -> None:
     log = Log()
-    ahead = Ahead(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
+    ahead = AsyncStepMonitor(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
     for step, value in enumerate((1.0, float("nan"))):
         judge = ahead.judge(step)
         assert judge is not None
         judge(loss_of(value), [torch.ones(3)])
         if step == 0:
             ahead.note(step + 1, outcome_of(value))
-    with pytest.raises(Spoilt) as caught:
+    with pytest.raises(NonFiniteStep) as caught:
         ahead.note(2, outcome_of(float("nan")))
     assert caught.value.step == 1 and [step for step, *_ in log.noted] == [1]
     assert ahead.go_back(caught.value) == 1
@@ -121,13 +121,13 @@ def test_only_so_many_steps_are_ahead(weights: list[Tensor], monkeypatch: pytest
     """As on a GPU that takes its time: a note arrives only when somebody waits for it."""
     log, waited = Log(), []
 
-    def arrives_late(note: ahead_module._Note, wait: bool) -> bool:
+    def arrives_late(note: step_monitor_module._Note, wait: bool) -> bool:
         waited.append(note.step) if wait else None
         return wait
 
-    monkeypatch.setattr(ahead_module._Note, "has_arrived", arrives_late)
-    monkeypatch.setattr(ahead_module, "MOST_AHEAD", 3)
-    ahead = Ahead(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
+    monkeypatch.setattr(step_monitor_module._Note, "has_arrived", arrives_late)
+    monkeypatch.setattr(step_monitor_module, "MOST_AHEAD", 3)
+    ahead = AsyncStepMonitor(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
     for step in range(1, 6):
         ahead.note(step, outcome_of(1.0))
         assert len(log.noted) == max(step - 3, 0)

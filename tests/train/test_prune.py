@@ -9,7 +9,7 @@ from small_runs import new_avatar, open_small, small_config, train_small
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.train import trainer as trainer_module
-from avatar.train.strays import HIDDEN, cover, remove_strays, strays_step
+from avatar.train.prune import HIDDEN, coverage, prune_background_gaussians, prune_step
 
 SIZE = 24
 
@@ -20,7 +20,7 @@ def test_cover_is_the_weight_in_the_pixels(tracked_folder: Path) -> None:
     avatar = new_avatar(assets, subject, small_config())
     frame = subject.frame(0, SIZE)
     head = frame.alpha * frame.head_mask
-    found = cover(avatar, frame, 1)
+    found = coverage(avatar, frame, 1)
     with torch.no_grad():
         gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
         alpha = avatar.draw(gaussians, frame.camera, torch.zeros(3)).alpha
@@ -42,32 +42,32 @@ def test_only_what_covers_no_head_is_hidden(tracked_folder: Path) -> None:
     train = list(subject.split.train)
     before = {name: value.clone() for name, value in avatar.state_dict().items()}
     with FrameLoader(subject, SIZE) as loader:
-        covers = torch.stack([cover(avatar, frame, 1) for frame in loader.frames(train)]).sum(dim=0)
+        covers = torch.stack([coverage(avatar, frame, 1) for frame in loader.frames(train)]).sum(dim=0)
         on_head = covers[:, 0] / covers.sum(dim=1)
         share = float(on_head[covers.sum(dim=1) > 1.0].quantile(0.3))
         expected = (on_head < share) & (covers.sum(dim=1) > 0.01 * len(train))
         assert 0 < expected.sum() < len(avatar) / 2
-        assert remove_strays(avatar, loader, train, share, 1) == int(expected.sum())
-        assert remove_strays(avatar, loader, train, 1e-6, 1) == 0
+        assert prune_background_gaussians(avatar, loader, train, share, 1) == int(expected.sum())
+        assert prune_background_gaussians(avatar, loader, train, 1e-6, 1) == 0
     assert torch.equal(avatar.opacity_logits == HIDDEN, expected)
     assert torch.equal(avatar.opacity_logits[~expected], before["opacity_logits"][~expected])
     assert all(torch.equal(v, before[name]) for name, v in avatar.state_dict().items() if name != "opacity_logits")
     frame = subject.frame(train[0], SIZE)
-    assert not cover(avatar, frame, 1)[expected].any()  # never drawn
+    assert not coverage(avatar, frame, 1)[expected].any()  # never drawn
 
 
 def test_training_frames_judge_strays_once(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
-    monkeypatch.setattr(trainer_module, "remove_strays", lambda *words: calls.append(words[2:]))
-    train_small(tracked_folder, tmp_path / "off", ["trainer.stray_share=0"])
+    monkeypatch.setattr(trainer_module, "prune_background_gaussians", lambda *words: calls.append(words[2:]))
+    train_small(tracked_folder, tmp_path / "off", ["trainer.prune_share=0"])
     assert not calls
-    trainer = small_config("trainer.stray_share=0.2").trainer
-    train_small(tracked_folder, tmp_path / "on", ["trainer.stray_share=0.2"])
+    trainer = small_config("trainer.prune_share=0.2").trainer
+    train_small(tracked_folder, tmp_path / "on", ["trainer.prune_share=0.2"])
     ((frames, share, step),) = calls
     assert tuple(frames) == open_small(tracked_folder, small_config())[1].split.train
-    assert (share, step) == (0.2, strays_step(trainer)) and 0 < step < trainer.iterations
+    assert (share, step) == (0.2, prune_step(trainer)) and 0 < step < trainer.iterations
 
 
 def test_a_scene_that_cannot_be_drawn_is_named(tracked_folder: Path) -> None:
@@ -76,4 +76,4 @@ def test_a_scene_that_cannot_be_drawn_is_named(tracked_folder: Path) -> None:
     with torch.no_grad():
         avatar.log_scales[0] = float("nan")
     with pytest.raises(UserError, match="training stopped at step 7, frame"):
-        cover(avatar, subject.frame(0, SIZE), 7)
+        coverage(avatar, subject.frame(0, SIZE), 7)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.model import Avatar
@@ -25,7 +25,7 @@ FINAL_SHARE = 0.05  # of the learning rates, at the last step
 def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     """Adam with the paper's groups: colour, opacity, scale, rotation, deformation network, HyperGaussian heads."""
     rates = config.learning_rates
-    logits = [avatar.opacity_logits] + ([] if avatar.rigidity_logits is None else [avatar.rigidity_logits])
+    logits = [avatar.opacity_logits] + ([] if avatar.skull_logits is None else [avatar.skull_logits])
     groups: list[dict[str, Any]] = [
         {"params": [avatar.sh_dc], "lr": rates.sh_dc},
         {"params": [avatar.sh_rest], "lr": rates.sh_rest},
@@ -70,7 +70,7 @@ def set_rates(optimizer: torch.optim.Adam, share: float) -> None:
     rates = [group["full_lr"] * share for group in groups]
     if isinstance(first := groups[0]["lr"], Tensor):
         assert first._base is not None  # the groups' rates are views of one tensor
-        first._base.copy_(brought(torch.tensor(rates), first.device))
+        first._base.copy_(to_device(torch.tensor(rates), first.device))
         return
     for group, rate in zip(groups, rates, strict=True):
         group["lr"] = rate

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.config import TrainerConfig
 from avatar.data.recording import Recording
 from avatar.types import Frame
@@ -31,7 +31,7 @@ class ConditionNoise:
 
     def on(self, step: int, frame: Frame) -> Frame:
         """The frame as step `step` (from 0) tells the network of it: a function of seed and step."""
-        return noisy(frame, brought(self.of(step), frame.params.expression.device))
+        return noisy(frame, to_device(self.of(step), frame.params.expression.device))
 
     def of(self, step: int) -> Float[Tensor, " C"]:
         """What is added in step `step`; on the CPU."""

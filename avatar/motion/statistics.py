@@ -12,7 +12,7 @@ from avatar.types import HeadParams
 
 
 @dataclass(frozen=True, repr=False)
-class Repertoire:
+class MotionStatistics:
     """Of the training frames."""
 
     neutral: RestPose
@@ -20,11 +20,13 @@ class Repertoire:
     expressions: ExpressionSpace
 
 
-def learn_repertoire(training: Sequence[HeadParams], head: HeadModel, neutral: RestPose | None = None) -> Repertoire:
+def learn_repertoire(
+    training: Sequence[HeadParams], head: HeadModel, neutral: RestPose | None = None
+) -> MotionStatistics:
     """The repertoire of the frames that an avatar is trained on; `head` has their person's identity.
 
     The neutral face is searched for among the frames where it is not given. Raises ValueError when there is no frame.
     """
     if not training:
         raise ValueError("a repertoire needs training frames, got none")
-    return Repertoire(neutral or find_neutral(training, head), find_mean(training), fit_expressions(training))
+    return MotionStatistics(neutral or find_neutral(training, head), find_mean(training), fit_expressions(training))

@@ -16,9 +16,9 @@ from avatar.losses.metrics import psnr
 from avatar.model import Avatar
 from avatar.refine.refine import frozen
 from avatar.splat import splat
-from avatar.tracking import likeness as likeness_module
-from avatar.tracking.likeness import OBSERVATIONS, PIXEL_SIGMA, Likeness, camera_gradient, head_psnr, targets
-from avatar.tracking.likeness import misfit as misfit_of
+from avatar.tracking import frame_fitter as fitter_module
+from avatar.tracking.frame_fitter import OBSERVATIONS, PIXEL_SIGMA, FrameFitter, camera_gradient, head_psnr, targets
+from avatar.tracking.frame_fitter import misfit as misfit_of
 from avatar.tracking.motion import HeadPose, head_params, moved_pose, rotation, values_of
 from avatar.types import Camera, Gaussians
 
@@ -38,8 +38,8 @@ def clip(avatar: Avatar) -> Clip:
 
 
 @pytest.fixture
-def likeness(avatar: Avatar) -> Likeness:
-    return Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
+def fitter(avatar: Avatar) -> FrameFitter:
+    return FrameFitter(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
 
 
 def given(clip: Clip, index: int) -> HeadPose:
@@ -82,9 +82,9 @@ def mistracked(clip: Clip) -> tuple[torch.Tensor, HeadPose]:
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_the_gradient_is_that_through_the_reference(likeness: Likeness, clip: Clip, level: int) -> None:
+def test_the_gradient_is_that_through_the_reference(fitter: FrameFitter, clip: Clip, level: int) -> None:
     """The reference splatter is differentiable in its camera and computes the colours itself."""
-    check_gradient(likeness, clip, level)
+    check_gradient(fitter, clip, level)
 
 
 def test_the_gradient_of_gaussians_that_never_turn_is_that_through_the_reference(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_the_gradient_of_gaussians_that_never_turn_is_that_through_the_reference
             parameter += 0.02 * torch.randn_like(parameter)
     with frozen(avatar):
         check_gradient(
-            Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0)), drawn_clip(avatar, 4, 3)
+            FrameFitter(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0)), drawn_clip(avatar, 4, 3)
         )
 
 
@@ -102,39 +102,39 @@ def test_the_gradient_of_gaussians_that_the_mesh_turns_is_that_through_the_refer
     avatar = patterned_avatar(tmp_path, "model=splattingavatar")
     with frozen(avatar):
         check_gradient(
-            Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0)), drawn_clip(avatar, 4, 3)
+            FrameFitter(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0)), drawn_clip(avatar, 4, 3)
         )
 
 
 def test_the_gradient_knows_what_the_network_is_told_of_a_turn(tmp_path: Path) -> None:
-    avatar = patterned_avatar(tmp_path, "model.facing=true")
+    avatar = patterned_avatar(tmp_path, "model.head_rotation=true")
     clip = drawn_clip(avatar, 4, 3)
-    avatar.learn_facing(clip.recording.tracks["R"])
+    avatar.learn_head_rotation(clip.recording.tracks["R"])
     assert avatar.deformation is not None and avatar.hyper is not None
     with torch.no_grad():
         for parameter in (*avatar.hyper.parameters(), *avatar.deformation.parameters()):
             parameter += 0.03 * torch.randn_like(parameter)
-    likeness = Likeness(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
+    fitter = FrameFitter(avatar, BACKGROUND, avatar.head.neutral_vertices().mean(dim=0))
     (values, pose), target = mistracked(clip), targets(clip.pictures[2], BACKGROUND, 1)
     assert target is not None
     with frozen(avatar):
-        check_gradient(likeness, clip)
-        told = likeness.fit(values, pose, target[0]).gradient[:3]
+        check_gradient(fitter, clip)
+        told = fitter.fit(values, pose, target[0]).gradient[:3]
         avatar.turning *= 0.0
-        untold = likeness.fit(values, pose, target[0]).gradient[:3]
+        untold = fitter.fit(values, pose, target[0]).gradient[:3]
     assert float((told - untold).norm()) > 0.02 * float(told.norm())
 
 
-def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
+def check_gradient(fitter: FrameFitter, clip: Clip, level: int = 0) -> None:
     target = targets(clip.pictures[2], BACKGROUND, 2)[level]
     values, pose = mistracked(clip)
-    found = likeness.fit(values, pose, target)
+    found = fitter.fit(values, pose, target)
 
     moving = values.clone().requires_grad_()
-    moved = moved_pose(moving, pose, likeness.centre)
+    moved = moved_pose(moving, pose, fitter.centre)
     camera = replace(target.camera, R_cam_world=moved.R, t_cam_world=moved.t)
-    gaussians = likeness.avatar(head_params(moving), None, moved.R)
-    blur = target.shrink * likeness.avatar.config.blur
+    gaussians = fitter.avatar(head_params(moving), None, moved.R)
+    blur = target.shrink * fitter.avatar.config.blur
     options = {"backend": "reference", "region": target.box, "blur": blur}
     image = splat(gaussians, camera, BACKGROUND, **options).image[target.box]
     misfit = misfit_of(image, target)
@@ -145,35 +145,35 @@ def check_gradient(likeness: Likeness, clip: Clip, level: int = 0) -> None:
     assert float(expected[:3].abs().min()) > 1.0
 
 
-def test_the_gradient_is_the_slope(likeness: Likeness, clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gradient_is_the_slope(fitter: FrameFitter, clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     # Where a splat ends makes finite differences jump; without the cut-off they do not.
     monkeypatch.setattr(Avatar, "draw", partialmethod(Avatar.draw, alpha_min=0.0, t_min=0.0))
     target = targets(clip.pictures[2], BACKGROUND, 1)[0]
     values, pose = mistracked(clip)
-    found = likeness.fit(values, pose, target)
-    assert found.misfit == pytest.approx(likeness.measure(values, pose, target).misfit, rel=1e-5)
+    found = fitter.fit(values, pose, target)
+    assert found.misfit == pytest.approx(fitter.measure(values, pose, target).misfit, rel=1e-5)
     # Turns out of the picture's plane also change which splat is in front of which, in jumps.
     for k, length in ((2, 1e-3), (3, 2e-4), (4, 2e-4), (5, 2e-4), (9, 1e-4), (20, 1e-3), (21, 1e-3)):
         step = torch.zeros(VALUES)
         step[k] = length
-        high, low = (likeness.measure(values + sign * step, pose, target).misfit for sign in (1, -1))
+        high, low = (fitter.measure(values + sign * step, pose, target).misfit for sign in (1, -1))
         assert float(found.gradient[k]) == pytest.approx((high - low) / (2 * length), rel=0.03, abs=0.1), k
 
 
-def test_the_misfit_counts_squares_in_observations(likeness: Likeness, clip: Clip) -> None:
+def test_the_misfit_counts_squares_in_observations(fitter: FrameFitter, clip: Clip) -> None:
     target = targets(clip.pictures[0], BACKGROUND, 1)[0]
     values = values_of(clip.recording.tracks)[0]
-    fits = likeness.measure(values, given(clip, 0), target).misfit
-    grey = replace_picture(target, likeness.picture(values, given(clip, 0), target) + 0.02)
+    fits = fitter.measure(values, given(clip, 0), target).misfit
+    grey = replace_picture(target, fitter.picture(values, given(clip, 0), target) + 0.02)
     expected = 0.5 * OBSERVATIONS * (0.02 / PIXEL_SIGMA) ** 2 * target.picture[..., 0].numel() / target.area
-    assert likeness.measure(values, given(clip, 0), grey).misfit == pytest.approx(expected, rel=1e-3)
+    assert fitter.measure(values, given(clip, 0), grey).misfit == pytest.approx(expected, rel=1e-3)
     assert fits < 0.1 * expected  # the clip is the avatar's own picture
-    far = replace_picture(target, likeness.picture(values, given(clip, 0), target) + 0.4)
+    far = replace_picture(target, fitter.picture(values, given(clip, 0), target) + 0.4)
     # An outlier counts less than its square.
-    assert likeness.measure(values, given(clip, 0), far).misfit < 400 * 0.5 * expected
+    assert fitter.measure(values, given(clip, 0), far).misfit < 400 * 0.5 * expected
 
 
-def replace_picture(target: likeness_module.Target, picture: torch.Tensor) -> likeness_module.Target:
+def replace_picture(target: fitter_module.Target, picture: torch.Tensor) -> fitter_module.Target:
     return target._replace(picture=picture)
 
 
@@ -188,16 +188,15 @@ def test_targets_are_the_head_with_a_margin_at_every_size(clip: Clip) -> None:
     assert targets(replace(frame, head_mask=torch.zeros(SIZE, SIZE)), BACKGROUND, 2) is None
 
 
-def test_a_half_size_picture_looks_like_the_full_one(likeness: Likeness, clip: Clip) -> None:
+def test_a_half_size_picture_looks_like_the_full_one(fitter: FrameFitter, clip: Clip) -> None:
     """The splatter's blur is in pixels: at half the size it would thicken every splat twice as much."""
     full, half = targets(clip.pictures[1], BACKGROUND, 2)
     values = values_of(clip.recording.tracks)[1]
     sharp, thick = (
-        head_psnr(likeness.picture(values, given(clip, 1), half._replace(shrink=shrink)), half)
-        for shrink in (0.25, 1.0)
+        head_psnr(fitter.picture(values, given(clip, 1), half._replace(shrink=shrink)), half) for shrink in (0.25, 1.0)
     )
     assert sharp > thick + 3.0
-    assert head_psnr(likeness.picture(values, given(clip, 1), full), full) > 45.0
+    assert head_psnr(fitter.picture(values, given(clip, 1), full), full) > 45.0
 
 
 def test_psnr_is_of_the_head_alone(clip: Clip) -> None:
@@ -208,7 +207,7 @@ def test_psnr_is_of_the_head_alone(clip: Clip) -> None:
     assert head_psnr(grey, target) == pytest.approx(float(psnr(grey, target.picture, target.mask)))
 
 
-def test_the_pose_is_that_of_the_values(likeness: Likeness, clip: Clip) -> None:
+def test_the_pose_is_that_of_the_values(fitter: FrameFitter, clip: Clip) -> None:
     """Moving by the difference of two trackings gives the other's picture."""
     wrong = wrongly_tracked(clip)
     target = targets(clip.pictures[1], BACKGROUND, 1)[0]
@@ -216,8 +215,8 @@ def test_the_pose_is_that_of_the_values(likeness: Likeness, clip: Clip) -> None:
     turn = right.R @ off.R.T
     values = values_of(clip.recording.tracks)[1]
     values[:3] = rotation_matrix_to_axis_angle(turn[None])[0]
-    centre = likeness.centre
+    centre = fitter.centre
     values[3:6] = (right.R @ centre + right.t) - (off.R @ centre + off.t)
     moved = moved_pose(values, off, centre)
     assert torch.allclose(moved.R, right.R, atol=1e-5) and torch.allclose(moved.t, right.t, atol=1e-6)
-    assert head_psnr(likeness.picture(values, off, target), target) > 45.0
+    assert head_psnr(fitter.picture(values, off, target), target) > 45.0

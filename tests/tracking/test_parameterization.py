@@ -9,7 +9,8 @@ import torch
 from drawn_clip import EXPRESSIONS, true_tracks
 from poison import poisoned_tracks
 
-from avatar.tracking.freedom import (
+from avatar.tracking.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
+from avatar.tracking.parameterization import (
     DEPTH_UNIT,
     FACE_CALM,
     HEAD_CALM,
@@ -19,9 +20,8 @@ from avatar.tracking.freedom import (
     SHIFT_UNIT,
     SPREAD_SHARE,
     TURN_UNIT,
-    find_freedom,
+    find_parameterization,
 )
-from avatar.tracking.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
 
 CENTRE = torch.zeros(3)
 TRAIN = tuple(range(20))
@@ -36,19 +36,19 @@ def tracks() -> dict[str, torch.Tensor]:
 
 
 def test_what_never_moves_is_not_free() -> None:
-    freedom = find_freedom(tracks(), TRAIN, CENTRE)
-    free = freedom.changed()
+    parameterization = find_parameterization(tracks(), TRAIN, CENTRE)
+    free = parameterization.changed()
     assert free[:9].all()  # the head, and its neck although it is at rest
     assert free[JAW].tolist() == [True, False, False]
     assert free[EYES].tolist() == [True, True, False] * 2 and free[EYELIDS].all()
     assert free[EXPRESSION].tolist() == [True] * 4 + [False, True]
-    assert torch.equal(freedom.index, free.nonzero()[:, 0])
+    assert torch.equal(parameterization.index, free.nonzero()[:, 0])
 
 
 def test_units_are_what_trackers_err_by() -> None:
     made = tracks()
-    freedom = find_freedom(made, TRAIN, CENTRE)
-    unit = torch.zeros(20 + EXPRESSIONS).index_put((freedom.index,), freedom.unit)
+    parameterization = find_parameterization(made, TRAIN, CENTRE)
+    unit = torch.zeros(20 + EXPRESSIONS).index_put((parameterization.index,), parameterization.unit)
     spread = values_of(made)[:20].std(dim=0, unbiased=False)
     assert torch.allclose(unit[EXPRESSION.start], SPREAD_SHARE * spread[EXPRESSION.start])
     assert unit[3:6].tolist() == pytest.approx([SHIFT_UNIT, SHIFT_UNIT, DEPTH_UNIT])
@@ -59,80 +59,82 @@ def test_a_head_that_jitters_may_move_farther() -> None:
     made = true_tracks(400)
     generator = torch.Generator().manual_seed(0)
     made["t"] = made["t"] + torch.tensor([0, 0, 0.002]) * torch.randn(400, 3, generator=generator)
-    freedom = find_freedom(made, tuple(range(400)), CENTRE)
-    assert float(freedom.unit[5]) == pytest.approx(0.002 / JITTER_SHARE, rel=0.15)
-    assert float(freedom.unit[3]) == pytest.approx(SHIFT_UNIT)
+    parameterization = find_parameterization(made, tuple(range(400)), CENTRE)
+    assert float(parameterization.unit[5]) == pytest.approx(0.002 / JITTER_SHARE, rel=0.15)
+    assert float(parameterization.unit[3]) == pytest.approx(SHIFT_UNIT)
 
 
 def test_values_stay_where_training_has_been() -> None:
     made = tracks()
-    freedom = find_freedom(made, TRAIN, CENTRE)
+    parameterization = find_parameterization(made, TRAIN, CENTRE)
     training = values_of(made)[list(TRAIN)]
     for sign in (1.0, -1.0):
-        values = freedom.all_values(sign * torch.full((30, len(freedom.index)), 1e3))
+        values = parameterization.all_values(sign * torch.full((30, len(parameterization.index)), 1e3))
         bound = training.amax(dim=0) if sign > 0 else training.amin(dim=0)
         assert torch.equal(values[3, EXPRESSION][:4], bound[EXPRESSION][:4])
         assert float(values[3, JAW.start]) == float(bound[JAW.start])
         assert float(values[3, SHIFT.start]) == pytest.approx(sign * HEAD_REACH * SHIFT_UNIT)
         assert float(values[3, EXPRESSION][4]) == pytest.approx(0.3)
     # What was outside already may stay, and go no farther.
-    outside = freedom.all_values(torch.full((30, len(freedom.index)), 1e3))[25, EXPRESSION][5]
+    outside = parameterization.all_values(torch.full((30, len(parameterization.index)), 1e3))[25, EXPRESSION][5]
     assert float(outside) == 9.0
 
 
 def test_bounds_and_moves_speak_of_the_same() -> None:
-    freedom = find_freedom(tracks(), TRAIN, CENTRE)
-    low, high = freedom.bounds(7)
+    parameterization = find_parameterization(tracks(), TRAIN, CENTRE)
+    low, high = parameterization.bounds(7)
     assert bool((low <= 0).all()) and bool((high >= 0).all())
     # float32 has fewer digits for a move in units than for the value: all_values settles the rest
-    values = freedom.values(7, torch.where(torch.isfinite(high), high, 0.0))
-    at = freedom.index[torch.isfinite(high)]
-    assert torch.allclose(values[at], freedom.highest[7][at], atol=1e-6)
-    untouched = ~freedom.changed()
-    assert torch.equal(values[untouched], freedom.given[7][untouched])
+    values = parameterization.values(7, torch.where(torch.isfinite(high), high, 0.0))
+    at = parameterization.index[torch.isfinite(high)]
+    assert torch.allclose(values[at], parameterization.highest[7][at], atol=1e-6)
+    untouched = ~parameterization.changed()
+    assert torch.equal(values[untouched], parameterization.given[7][untouched])
 
 
 def test_the_head_is_calmer_than_the_face() -> None:
     made = tracks()
-    freedom = find_freedom(made, TRAIN, CENTRE)
+    parameterization = find_parameterization(made, TRAIN, CENTRE)
     motion = accelerations(made, values_of(made), CENTRE)
-    assert torch.equal(freedom.acceleration, motion[:, freedom.index] / freedom.unit)
-    typical = (motion[1:19].square().mean(dim=0).sqrt()[freedom.index] / freedom.unit).tolist()
-    assert float(freedom.calm[0]) == pytest.approx(HEAD_CALM / typical[0] ** 2, rel=1e-5)
-    jaw = int((freedom.index == JAW.start).nonzero())
-    assert float(freedom.calm[jaw]) == pytest.approx(FACE_CALM / typical[jaw] ** 2, rel=1e-5)
+    assert torch.equal(parameterization.acceleration, motion[:, parameterization.index] / parameterization.unit)
+    typical = (motion[1:19].square().mean(dim=0).sqrt()[parameterization.index] / parameterization.unit).tolist()
+    assert float(parameterization.calm[0]) == pytest.approx(HEAD_CALM / typical[0] ** 2, rel=1e-5)
+    jaw = int((parameterization.index == JAW.start).nonzero())
+    assert float(parameterization.calm[jaw]) == pytest.approx(FACE_CALM / typical[jaw] ** 2, rel=1e-5)
     # the neck is at rest here, and turns with the head
-    scale = motion[1:19, 1].square().mean().sqrt() / freedom.unit[7]
-    assert float(freedom.calm[7]) == pytest.approx(HEAD_CALM / float(scale) ** 2, rel=1e-5)
+    scale = motion[1:19, 1].square().mean().sqrt() / parameterization.unit[7]
+    assert float(parameterization.calm[7]) == pytest.approx(HEAD_CALM / float(scale) ** 2, rel=1e-5)
 
 
 def test_held_out_frames_say_nothing_of_what_may_move() -> None:
     made = true_tracks(30)
-    freedom, other = (find_freedom(one, TRAIN, CENTRE) for one in (made, poisoned_tracks(made, range(20, 30))))
+    parameterization, other = (
+        find_parameterization(one, TRAIN, CENTRE) for one in (made, poisoned_tracks(made, range(20, 30)))
+    )
     for name in ("index", "unit", "calm"):
-        assert torch.equal(getattr(freedom, name), getattr(other, name)), name
+        assert torch.equal(getattr(parameterization, name), getattr(other, name)), name
     for name in ("given", "lowest", "highest"):
-        assert torch.equal(getattr(freedom, name)[:20], getattr(other, name)[:20]), name
+        assert torch.equal(getattr(parameterization, name)[:20], getattr(other, name)[:20]), name
 
 
 def test_a_clip_that_stands_still_can_be_refined() -> None:
     made = {name: value[:1].repeat(6, *[1] * (value.ndim - 1)) for name, value in true_tracks(1).items()}
     made["shape"] = torch.zeros(2)
-    freedom = find_freedom(made, (0, 1, 2), CENTRE)
-    assert freedom.index.tolist() == list(range(9))
-    assert torch.isfinite(freedom.calm).all()
-    assert float(freedom.calm.max()) == pytest.approx(HEAD_CALM / LEAST_ACCELERATION**2)
-    assert find_freedom({n: v[:1] if n != "shape" else v for n, v in made.items()}, (0,), CENTRE).unit.all()
+    parameterization = find_parameterization(made, (0, 1, 2), CENTRE)
+    assert parameterization.index.tolist() == list(range(9))
+    assert torch.isfinite(parameterization.calm).all()
+    assert float(parameterization.calm.max()) == pytest.approx(HEAD_CALM / LEAST_ACCELERATION**2)
+    assert find_parameterization({n: v[:1] if n != "shape" else v for n, v in made.items()}, (0,), CENTRE).unit.all()
 
 
 def test_moves_are_centred_without_extremes_and_only_the_head_poses() -> None:
-    freedom = find_freedom(tracks(), TRAIN, CENTRE)
+    parameterization = find_parameterization(tracks(), TRAIN, CENTRE)
     frames = torch.arange(30) < 20
-    moves = torch.randn(30, len(freedom.index), generator=torch.Generator().manual_seed(0)) + 3.0
+    moves = torch.randn(30, len(parameterization.index), generator=torch.Generator().manual_seed(0)) + 3.0
     moves[:2] = 1000.0  # the tracker was lost
-    centred = freedom.centred(moves, frames)
-    pose = freedom.index < POSE.stop
+    centred = parameterization.centred(moves, frames)
+    pose = parameterization.index < POSE.stop
     assert pose.sum() == 6 and torch.equal(centred[:, ~pose], moves[:, ~pose])
     expected = moves[frames].sort(dim=0).values[2:18].mean(dim=0)
     torch.testing.assert_close(moves[:, pose] - centred[:, pose], expected[pose].expand(30, 6), rtol=0, atol=1e-4)
-    assert torch.equal(freedom.centred(moves, torch.zeros(30, dtype=torch.bool)), moves)
+    assert torch.equal(parameterization.centred(moves, torch.zeros(30, dtype=torch.bool)), moves)

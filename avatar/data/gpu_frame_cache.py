@@ -7,19 +7,19 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.data.subject import FramePixels, Subject
 from avatar.types import Frame, HeadParams
 
 SHARE = 0.5  # of the memory that is free on the GPU when a training begins
 
 
-def shelf_bytes(device: torch.device) -> int:
+def frame_cache_bytes(device: torch.device) -> int:
     """How much of a GPU's memory frames may take."""
     return int(SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else 0
 
 
-class Shelf:
+class GpuFrameCache:
     """The frames of a subject on one GPU, and how they become `Frame`s there, without a number that anybody waits for.
 
     The first frames that come stay: in every pass over a video all of them come, so which ones does not matter.
@@ -30,7 +30,7 @@ class Shelf:
         self._room = limit_bytes
         self._kept: dict[int, tuple[UInt8[Tensor, " bytes"], tuple[slice, slice]]] = {}
         tracks = subject.recording.tracks
-        self._tracks = {name: brought(tracks[name], device) for name in HeadParams.__dataclass_fields__}
+        self._tracks = {name: to_device(tracks[name], device) for name in HeadParams.__dataclass_fields__}
 
     def __contains__(self, index: int) -> bool:
         return index in self._kept
@@ -42,7 +42,7 @@ class Shelf:
             assert pixels is not None
             # One after the other in memory, so that one division makes floats of all.
             flat = torch.from_numpy(np.concatenate([part.reshape(-1) for part in pixels]))
-            kept = brought(flat, self._device), box_of(pixels.head_mask)
+            kept = to_device(flat, self._device), box_of(pixels.head_mask)
             if flat.nbytes <= self._room:
                 self._room -= flat.nbytes
                 self._kept[index] = kept

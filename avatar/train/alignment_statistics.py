@@ -10,31 +10,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import brought, on_gpu
+from avatar.compute.device import on_gpu, to_device
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.losses.photometric import MOUTH_WEIGHT
 from avatar.splat import CannotDraw
 from avatar.tracking.descent import Problem, curvature
-from avatar.tracking.freedom import Freedom
-from avatar.tracking.likeness import Likeness, coarse_levels, head_psnr, resized, targets
+from avatar.tracking.frame_fitter import FrameFitter, coarse_levels, head_psnr, resized, targets
 from avatar.tracking.motion import HeadPose
 from avatar.tracking.parallel import read_later
+from avatar.tracking.parameterization import PoseParameterization
 from avatar.train.order import evenly_spread
 from avatar.train.step import stopped
 from avatar.types import Frame
 
 
 @dataclass(frozen=True)
-class Inquiry:
+class AlignmentStatistics:
     """Asks evenly spread training frames that show a head; answers are on the CPU."""
 
     subject: Subject
     size: int | None
     background: Float[Tensor, 3]
-    likeness: Likeness
-    given: HeadPose  # of every frame; where the avatar is, as `freedom` is
-    freedom: Freedom
+    fitter: FrameFitter
+    given: HeadPose  # of every frame; where the avatar is, as `parameterization` is
+    parameterization: PoseParameterization
 
     def curvature(
         self, step: int, loader: FrameLoader, moves: Float[Tensor, "T F"], frames: int
@@ -45,8 +45,8 @@ class Inquiry:
         def measured(frame: Frame, problem: Problem) -> Tensor:
             coarsest = problem.targets[-1]
             mouth = resized(frame.mouth_mask, coarsest.camera.width, coarsest.camera.height)[coarsest.box]
-            weight = brought(1.0 + MOUTH_WEIGHT * mouth, moves.device)
-            return curvature(self.likeness, problem, len(problem.targets) - 1, moves[frame.index], weight)
+            weight = to_device(1.0 + MOUTH_WEIGHT * mouth, moves.device)
+            return curvature(self.fitter, problem, len(problem.targets) - 1, moves[frame.index], weight)
 
         found = self._of_frames(step, loader, frames, moves, measured)
         return torch.stack(found).mean(dim=0) if found else None
@@ -57,7 +57,9 @@ class Inquiry:
         def measured(frame: Frame, problem: Problem) -> Tensor:
             target, own = problem.targets[0], moves[frame.index]
             moved, still = (
-                head_psnr(self.likeness.picture(problem.freedom.values(frame.index, at), problem.given, target), target)
+                head_psnr(
+                    self.fitter.picture(problem.parameterization.values(frame.index, at), problem.given, target), target
+                )
                 for at in (own, torch.zeros_like(own))
             )
             return moved - still
@@ -87,7 +89,7 @@ class Inquiry:
             given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world)
             there = [target.on(moves.device, given) for target in made] if is_there else made
             own = HeadPose(*(part[frame.index] for part in self.given))
-            problem = Problem(own, there, frame.index, self.freedom)
+            problem = Problem(own, there, frame.index, self.parameterization)
             try:
                 return measured(frame, problem)
             except CannotDraw as error:

@@ -33,7 +33,7 @@ LEAST_ACCELERATION = 0.02  # units; a clip in which something stands still does 
 
 
 @dataclass(frozen=True)
-class Freedom:
+class PoseParameterization:
     """F of the P values of a frame may move; moves are measured in `unit`, from where the tracking is."""
 
     given: Float[Tensor, "T P"]
@@ -44,8 +44,8 @@ class Freedom:
     acceleration: Float[Tensor, "T F"]  # second differences of the given motion, float64, units
     calm: Float[Tensor, " F"]  # weight of a squared acceleration of one unit
 
-    def on(self, device: torch.device) -> Freedom:
-        return Freedom(*(getattr(self, field.name).to(device) for field in fields(self)))
+    def on(self, device: torch.device) -> PoseParameterization:
+        return PoseParameterization(*(getattr(self, field.name).to(device) for field in fields(self)))
 
     def values(self, frame: int, moves: Float[Tensor, " F"]) -> Float[Tensor, " P"]:
         """Differentiable in `moves`."""
@@ -78,7 +78,7 @@ class Freedom:
         return torch.zeros(self.given.shape[1], dtype=torch.bool).index_fill(0, self.index, True)
 
 
-def find_freedom(tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3]) -> Freedom:
+def find_parameterization(tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3]) -> PoseParameterization:
     """What may move in a tracking whose frames `train` the avatar was trained on; `centre` of the head, metres."""
     given = values_of(tracks)
     training = given[list(train)]
@@ -108,7 +108,7 @@ def find_freedom(tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3])
     weight[head] = HEAD_CALM
     scale = (typical[index] / unit).clamp(min=LEAST_ACCELERATION)
     calm = weight[index] / scale.square()
-    return Freedom(given, lowest, highest, index, unit, motion[:, index] / unit, calm)
+    return PoseParameterization(given, lowest, highest, index, unit, motion[:, index] / unit, calm)
 
 
 def _white_noise(accelerations: Float[Tensor, "T P"]) -> Float[Tensor, " P"]:

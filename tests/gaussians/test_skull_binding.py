@@ -10,12 +10,12 @@ from torch import Tensor
 
 from avatar.config import load_config
 from avatar.gaussians.embedding import Embedding
-from avatar.gaussians.rigidity import INITIAL_LOGIT, Hold, Skull, held
+from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.model import Avatar
 
-SMALL = ["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2", "model.rigidity=true"]
+SMALL = ["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2", "model.skull_binding=true"]
 
 
 def parts() -> tuple[HeadModel, Embedding, Skull]:
@@ -28,9 +28,9 @@ def parts() -> tuple[HeadModel, Embedding, Skull]:
 def small_avatar() -> Avatar:
     """Shares from nearly none to nearly all; offsets that the expression moves."""
     avatar = Avatar(grid_head(), torch.zeros(3), load_config(SMALL).model)
-    assert avatar.rigidity_logits is not None and avatar.hyper is not None
+    assert avatar.skull_logits is not None and avatar.hyper is not None
     with torch.no_grad():
-        avatar.rigidity_logits += 3.0 * torch.randn_like(avatar.rigidity_logits)
+        avatar.skull_logits += 3.0 * torch.randn_like(avatar.skull_logits)
     return avatar
 
 
@@ -53,14 +53,14 @@ def test_the_skull_is_the_head_that_only_the_neck_turns() -> None:
 
 def test_the_skull_knows_nothing_of_the_face() -> None:
     avatar = small_avatar()
-    assert avatar.skull is not None and avatar.rigidity_logits is not None
+    assert avatar.skull is not None and avatar.skull_logits is not None
     with torch.no_grad():
-        avatar.rigidity_logits.fill_(30.0)
+        avatar.skull_logits.fill_(30.0)
     rest, face = rest_params(), replace(random_params(), neck=rest_params().neck)
     points = avatar.points(avatar.vertices(face), face)
     torch.testing.assert_close(points, avatar.skull.at_rest, rtol=0, atol=1e-7)
     with torch.no_grad():
-        avatar.rigidity_logits.fill_(-30.0)
+        avatar.skull_logits.fill_(-30.0)
     points = avatar.points(avatar.vertices(face), face)
     torch.testing.assert_close(points, avatar.embedding.points(avatar.vertices(face)), rtol=0, atol=1e-7)
     assert (points - avatar.points(avatar.vertices(rest), rest)).abs().max() > 1e-3
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_the_definition() -> None:
         w = 1 / (1 + torch.exp(-logits))[:, None]
         return (1 - w) * points + w * embedding.points((1 - carried) * at_rest + carried * turned)
 
-    found = gradients(lambda neck, points, logits: held(points, Hold(skull, neck, logits)))
+    found = gradients(lambda neck, points, logits: bind_to_skull(points, SkullBinding(skull, neck, logits)))
     for own, expected in zip(found, gradients(definition), strict=True):
         assert expected.abs().max() > 1e-3
         torch.testing.assert_close(own, expected, rtol=1e-4, atol=1e-5)
@@ -92,18 +92,18 @@ def test_gradients_are_those_of_the_definition() -> None:
 
 def test_an_avatar_begins_near_the_skin_and_learns_its_shares() -> None:
     avatar = Avatar(grid_head(), torch.zeros(3), load_config(SMALL).model)
-    assert avatar.rigidity is not None and avatar.rigidity_logits is not None
-    assert torch.equal(avatar.rigidity, torch.sigmoid(torch.full((len(avatar),), INITIAL_LOGIT)))
+    assert avatar.skull_shares is not None and avatar.skull_logits is not None
+    assert torch.equal(avatar.skull_shares, torch.sigmoid(torch.full((len(avatar),), INITIAL_LOGIT)))
     gaussians = avatar(random_params())
     gaussians.means.square().sum().backward()
-    assert avatar.rigidity_logits.grad is not None and (avatar.rigidity_logits.grad != 0).all()
+    assert avatar.skull_logits.grad is not None and (avatar.skull_logits.grad != 0).all()
 
 
 def test_where_it_is_not_asked_for_nothing_is_learned() -> None:
-    for overrides in (["model.rigidity=false"], ["model=splattingavatar"], ["model=monogaussianavatar"]):
+    for overrides in (["model.skull_binding=false"], ["model=splattingavatar"], ["model=monogaussianavatar"]):
         avatar = Avatar(grid_head(), torch.zeros(3), load_config([*SMALL, *overrides]).model)
-        assert avatar.skull is None and avatar.rigidity is None
-        assert not any("rigidity" in name for name in avatar.state_dict())
+        assert avatar.skull is None and avatar.skull_shares is None
+        assert not any("skull_logits" in name for name in avatar.state_dict())
         assert avatar.points(avatar.vertices(rest_params()), rest_params()).shape[1] == 3
 
 

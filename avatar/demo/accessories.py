@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.demo.fields import smooth_step
+from avatar.demo.blendshape_fields import smooth_step
 from avatar.demo.identity import Identity
 
 

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import brought
+from avatar.compute.device import to_device
 from avatar.gaussians.embedding import Embedding
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.types import IDENTITY_6D
@@ -44,7 +44,7 @@ class Skull:
         device = self.at_rest.device
         if neck.is_cpu and not neck.requires_grad and tuple(neck.tolist()) == IDENTITY_6D:
             return self.at_rest
-        turn = matrix_from_6d(brought(neck, device).to(self.at_rest.dtype)) - torch.eye(3, device=device)
+        turn = matrix_from_6d(to_device(neck, device).to(self.at_rest.dtype)) - torch.eye(3, device=device)
         return torch.addmm(self.at_rest, self.arms, turn.T)
 
     def move(self, device: torch.device) -> None:
@@ -52,7 +52,7 @@ class Skull:
             self.at_rest, self.arms = self.at_rest.to(device), self.arms.to(device)
 
 
-class Hold(NamedTuple):
+class SkullBinding(NamedTuple):
     """What holds points in a frame."""
 
     skull: Skull
@@ -60,7 +60,7 @@ class Hold(NamedTuple):
     logits: Float[Tensor, " N"]  # of the shares that keep with the skull
 
 
-def held(points: Float[Tensor, "N 3"], by: Hold | None) -> Float[Tensor, "N 3"]:
+def bind_to_skull(points: Float[Tensor, "N 3"], by: SkullBinding | None) -> Float[Tensor, "N 3"]:
     """`points` of the posed mesh, each brought to the skull by its share. Differentiable."""
     if by is None:
         return points

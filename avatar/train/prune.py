@@ -20,31 +20,33 @@ from avatar.types import Frame
 
 WHEN = 0.8  # share of the steps: in those after it others take over what strays covered with reason
 FRAMES = 24
-LEAST_COVER = 0.01  # pixels, mean over the frames: what covers less is not seen over any background
+LEAST_COVERAGE = 0.01  # pixels, mean over the frames: what covers less is not seen over any background
 HIDDEN = -10.0  # logit of an opacity below which no splat is drawn
 
 
-def strays_step(config: TrainerConfig) -> int | None:
+def prune_step(config: TrainerConfig) -> int | None:
     """After how many steps strays are removed; None: never."""
-    return round(WHEN * config.iterations) if config.stray_share > 0 else None
+    return round(WHEN * config.iterations) if config.prune_share > 0 else None
 
 
-def remove_strays(avatar: Avatar, loader: FrameLoader, train: Sequence[int], share: float, step: int) -> int:
+def prune_background_gaussians(
+    avatar: Avatar, loader: FrameLoader, train: Sequence[int], share: float, step: int
+) -> int:
     """Hide each Gaussian of whose cover in some of the frames `train` less than `share` lies on the head; returns how many.
 
     They keep their place in every tensor, with an opacity that is never drawn. A function of the parameters and the
     frames. Raises UserError, naming `step` and the frame, when the Gaussians cannot be drawn.
     """
     chosen = evenly_spread(train, FRAMES)
-    total = sum((cover(avatar, frame, step) for frame in loader.frames(chosen)), start=torch.zeros(()))
+    total = sum((coverage(avatar, frame, step) for frame in loader.frames(chosen)), start=torch.zeros(()))
     both = total.sum(dim=1)
-    strays = (both > LEAST_COVER * len(chosen)) & (total[:, 0] < share * both)
+    pruned = (both > LEAST_COVERAGE * len(chosen)) & (total[:, 0] < share * both)
     with torch.no_grad():
-        avatar.opacity_logits[: len(strays)][strays] = HIDDEN
-    return int(strays.sum())
+        avatar.opacity_logits[: len(pruned)][pruned] = HIDDEN
+    return int(pruned.sum())
 
 
-def cover(avatar: Avatar, frame: Frame, step: int) -> Float[Tensor, "N 2"]:
+def coverage(avatar: Avatar, frame: Frame, step: int) -> Float[Tensor, "N 2"]:
     """Pixels of the frame that each Gaussian covers, by its weight in their colour: of the head and of what is around it.
 
     A pixel's colour is a sum of the Gaussians' colours by their weights, so that the gradient in the colours is the cover.

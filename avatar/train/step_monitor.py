@@ -24,7 +24,7 @@ from avatar.train.step import Judge, Outcome
 MOST_AHEAD = 64  # steps
 
 
-class Spoilt(Exception):
+class NonFiniteStep(Exception):
     """Step `step` (from 0) was not finite; nothing has moved since."""
 
     def __init__(self, step: int) -> None:
@@ -37,24 +37,24 @@ class Guard:
 
     def __init__(self, optimizer: torch.optim.Adam, device: torch.device) -> None:
         self._sum = torch.zeros((), device=device)  # of 0 for each step, NaN from the first that is not finite on
-        self.is_spoilt: Float[Tensor, ""] = torch.zeros((), device=device)
-        optimizer.found_inf = self.is_spoilt  # type: ignore[attr-defined]  # of Adam's fused kernel: 1 is to do nothing
+        self.is_nonfinite: Float[Tensor, ""] = torch.zeros((), device=device)
+        optimizer.found_inf = self.is_nonfinite  # type: ignore[attr-defined]  # of Adam's fused kernel: 1 is to do nothing
 
     def judge(self, loss: PhotometricLoss, gradients: list[Tensor]) -> None:
         """Before the optimizer's step."""
         norms = torch._foreach_norm(gradients)  # pyright: ignore
         self._sum.add_(torch.stack((*norms, loss.total.detach())).sum(), alpha=0.0)
-        torch.ne(self._sum, self._sum, out=self.is_spoilt)
+        torch.ne(self._sum, self._sum, out=self.is_nonfinite)
 
-    def forgive(self) -> None:
+    def reset(self) -> None:
         self._sum.zero_()
-        self.is_spoilt.zero_()
+        self.is_nonfinite.zero_()
 
 
 class Numbers(NamedTuple):
     """What is told of a step; float32."""
 
-    is_spoilt: float
+    is_nonfinite: float
     total: float
     frame: float
     mouth: float
@@ -76,13 +76,13 @@ class _Note:
         return self.arrived is None or self.arrived.query()
 
 
-class Prompt:
+class SyncStepMonitor:
     """Steps on a CPU: each is checked before it moves anything, and logged when it is made."""
 
     def __init__(self, log: TrainingLog) -> None:
         self._log = log
 
-    is_spoilt = None  # no step is made after one that was not finite
+    is_nonfinite = None  # no step is made after one that was not finite
 
     def judge(self, step: int) -> None:
         """`training_step` is to check step `step` itself."""
@@ -93,11 +93,11 @@ class Prompt:
     def settle(self) -> None:
         """Everything is known."""
 
-    def go_back(self, spoilt: Spoilt) -> int:
-        raise spoilt
+    def go_back(self, nonfinite: NonFiniteStep) -> int:
+        raise nonfinite
 
 
-class Ahead:
+class AsyncStepMonitor:
     """Steps on a GPU, which run ahead of what the log shows of them."""
 
     def __init__(self, log: TrainingLog, optimizer: torch.optim.Adam, device: torch.device) -> None:
@@ -106,9 +106,9 @@ class Ahead:
         self._suspect = -1
 
     @property
-    def is_spoilt(self) -> Float[Tensor, ""]:
+    def is_nonfinite(self) -> Float[Tensor, ""]:
         """1 from the first step on that was not finite, where the GPU is; nothing may move then."""
-        return self._guard.is_spoilt
+        return self._guard.is_nonfinite
 
     def judge(self, step: int) -> Judge | None:
         """Who looks at step `step` (from 0) before it moves anything; None: `training_step`, which waits and says why."""
@@ -120,7 +120,7 @@ class Ahead:
         total = outcome.loss.total.detach()
         quality = psnr(outcome.render, outcome.target).float() if self._log.shows(step) else total
         terms = [term.detach() for term in outcome.loss]
-        numbers = torch.stack((self._guard.is_spoilt, *terms, quality))
+        numbers = torch.stack((self._guard.is_nonfinite, *terms, quality))
         copy, arrived = numbers.to("cpu", non_blocking=True), None
         if numbers.is_cuda:
             arrived = torch.cuda.Event()
@@ -132,19 +132,19 @@ class Ahead:
         """Wait for all that is known of the steps so far. Raises Spoilt."""
         self._read(most_left=0)
 
-    def go_back(self, spoilt: Spoilt) -> int:
+    def go_back(self, nonfinite: NonFiniteStep) -> int:
         """Give the step to repeat, with care: the GPU's buffers were too small for it, or it has an error to show."""
         self._notes.clear()
-        self._guard.forgive()
-        self._suspect = spoilt.step
+        self._guard.reset()
+        self._suspect = nonfinite.step
         CAPACITIES.forget()
-        return spoilt.step
+        return nonfinite.step
 
     def _read(self, most_left: int) -> None:
         while self._notes and self._notes[0].has_arrived(wait=len(self._notes) > most_left):
             note = self._notes.popleft()
             numbers = Numbers(*note.numbers.tolist())
-            if numbers.is_spoilt:
-                raise Spoilt(note.step - 1)
+            if numbers.is_nonfinite:
+                raise NonFiniteStep(note.step - 1)
             terms = {name: getattr(numbers, name) for name in PhotometricLoss._fields}
             self._log.note(note.step, numbers.total, terms, numbers.psnr)
