@@ -15,6 +15,7 @@ from avatar.errors import UserError
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
 from avatar.model import SH_DEGREE
+from avatar.train import optimizer
 from avatar.train.step import perceptual_start
 
 
