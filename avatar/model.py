@@ -138,10 +138,10 @@ class Avatar(nn.Module):
             return compose_carried(self.mesh_points.points(vertices), self.mesh_points.turns(vertices), *base)
         values = self.deformation(self.active(self.code), self.condition(params, rotation, head_rotation))
         if on_gpu(values) and values.dtype == torch.float32 and self.is_fused:
-            from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
+            from avatar.gaussians.compose_gpu import compose_gpu  # imports Triton, which is not there on every machine
 
             grid = None if self.grid is None else self.grid.interpolate
-            return place_gpu(vertices, values, self.packed, *base, self.embedding, grid, self.skull_binding(params))
+            return compose_gpu(vertices, values, self.packed, *base, self.embedding, grid, self.skull_binding(params))
         if self.grid is not None:
             values = self.grid.interpolate(values)
         points = self.points(vertices, params)

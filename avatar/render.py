@@ -64,11 +64,11 @@ class Renderer:
             vertices = self.vertices(params)
             return compose_carried(self.points(vertices, params), self._mesh_points.turns(vertices), **self._base)
         if self._on_gpu:
-            from avatar.gaussians.place_gpu import place_gpu  # imports Triton, which is not there on every machine
+            from avatar.gaussians.compose_gpu import compose_gpu  # imports Triton, which is not there on every machine
 
             avatar, grid = self._avatar, self._avatar.grid
             values = self._network(avatar.condition(params, rotation_of(camera)))
-            return place_gpu(
+            return compose_gpu(
                 self.vertices(params),
                 values,
                 self._packed,

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from avatar.bench.clock import paired_medians
 from avatar.bench.splat_gpu import settle, splat_gsplat
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.runs.run import open_trained
 from avatar.splat import splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity

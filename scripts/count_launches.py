@@ -34,10 +34,10 @@ from avatar.kernels.start import watched
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
+from avatar.pose_refinement.parameterization import find_freedom
 from avatar.render import Renderer
 from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera
-from avatar.tracking.parameterization import find_freedom
 from avatar.train.align import Alignment
 from avatar.train.optimizer import make_optimizer
 from avatar.train.step import SPARSE_EVERY, Objective, PerceptualTerm, Weighted, training_step

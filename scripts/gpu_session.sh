@@ -34,7 +34,7 @@ case $part in
 checks)
   run device nvidia-smi
   run doctor avatar doctor
-  run self-test python3 -c 'from avatar.pipeline.device import choose_device; choose_device("cuda", print)'
+  run self-test python3 -c 'from avatar.pipeline.choose_device import choose_device; choose_device("cuda", print)'
   # Without torch's caching allocator, so that a write beside a buffer is not one into the next.
   for tool in memcheck racecheck initcheck; do
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 run "$tool" timeout 240 compute-sanitizer --tool "$tool" --error-exitcode 9 \

@@ -21,12 +21,12 @@ from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.splat_gpu import device_of, settle
+from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import interpreted
-from avatar.compute.replay import own_stream
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.losses.photometric import dssim
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity

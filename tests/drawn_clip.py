@@ -17,8 +17,8 @@ from tracked_folder import write_head_model
 from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.model import Avatar
+from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, EYES, JAW, POSE, SHIFT, TURN, moved_tracks, values_of
 from avatar.splat.sh import C0
-from avatar.tracking.motion import EXPRESSION, EYELIDS, EYES, JAW, POSE, SHIFT, TURN, moved_tracks, values_of
 from avatar.types import IDENTITY_6D, Frame
 
 EXPRESSIONS = 6

@@ -17,7 +17,7 @@ ORDER = [
     *("avatar.head", "avatar.data", "avatar.config_values", "avatar.config"),
     *("data_prep", "data_prep.formats", "data_prep.prepare", "data_prep.check", "data_prep.track", "data_prep.live"),
     *("avatar.losses", "avatar.splat", "avatar.gaussians", "avatar.model", "avatar.render"),
-    *("avatar.tracking", "avatar.motion", "avatar.runs", "avatar.train", "avatar.refine", "avatar.evaluation"),
+    *("avatar.pose_refinement", "avatar.motion", "avatar.runs", "avatar.train", "avatar.evaluation"),
     *("avatar.pipeline", "avatar.report", "avatar.view", "avatar.export", "avatar.sweep"),
     *("avatar.demo", "avatar.bench", "avatar.commands", "avatar.cli", "avatar"),
 ]

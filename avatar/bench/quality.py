@@ -16,8 +16,8 @@ from avatar.bench.clock import Time, paired_medians
 from avatar.bench.train import Trainee, per_step, run_steps, steps_at_once, trainee
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
+from avatar.evaluation.lpips_networks import find_lpips
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
-from avatar.evaluation.networks import find_lpips
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.pipeline.open import open_run

@@ -17,14 +17,14 @@ import numpy as np
 import torch
 
 from avatar.bench import Request
-from avatar.bench.disturb import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed
+from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
 from avatar.data.subject import Subject
+from avatar.evaluation.lpips_networks import find_lpips
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
-from avatar.evaluation.networks import find_lpips
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.lpips_network import Lpips
@@ -32,9 +32,9 @@ from avatar.losses.metrics import psnr, ssim
 from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
 from avatar.pipeline.plan import round_steps
-from avatar.refine.refine import refine_subject
+from avatar.pose_refinement.motion import EXPRESSION, values_of
+from avatar.pose_refinement.refine import refine_subject
 from avatar.render import Renderer
-from avatar.tracking.motion import EXPRESSION, values_of
 from avatar.train.align import WITH_REFINEMENT
 from avatar.train.order import planned_steps, within_passes
 from avatar.train.step import choose_perceptual

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import torch
 
 from avatar.compute.device import CPU, interpreted
-from avatar.pipeline.device import sees_gpu
+from avatar.pipeline.choose_device import sees_gpu
 from avatar.types import Camera, Gaussians, Rendering
 
 ON_GPU = ("gpu", "gsplat")

@@ -30,7 +30,7 @@ from avatar.data.subject import Subject
 from avatar.demo.raw_video import in_room
 from avatar.demo.subject import make_subject
 from avatar.errors import UserError
-from avatar.evaluation.networks import find_lpips
+from avatar.evaluation.lpips_networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.pipeline.open import split_sizes

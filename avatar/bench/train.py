@@ -14,8 +14,8 @@ from avatar.bench.clock import Time, paired_medians, time_of
 from avatar.bench.floor import floor_ms
 from avatar.bench.splat_gpu import settle
 from avatar.bench.stages import StagedStep, network_of
+from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import on_gpu
-from avatar.compute.replay import own_stream
 from avatar.config import Config, load_config
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
@@ -23,9 +23,9 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
-from avatar.tracking.frame_fitter import FrameFitter
+from avatar.pose_refinement.frame_fitter import FrameFitter
+from avatar.train.aligned_frame import moving_step
 from avatar.train.optimizer import make_optimizer
-from avatar.train.placed import moving_step
 from avatar.train.step import Judge, Objective, choose_perceptual, perceptual_start
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import WARM, StepRunner

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from avatar.bench import Request
-from avatar.bench.disturb import disturbed
+from avatar.bench.perturb_tracking import disturbed
 from avatar.bench.refine import Trial
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config

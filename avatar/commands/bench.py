@@ -14,7 +14,7 @@ from avatar.compute.device import CPU
 from avatar.config_values import check_device
 from avatar.errors import UserError, check_installed
 from avatar.pipeline import OK
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 
 
 def run_bench(arguments: Namespace) -> int:

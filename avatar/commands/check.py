@@ -13,7 +13,7 @@ from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
-from avatar.train.cost import measure_cost
+from avatar.train.cost_estimate import measure_cost
 from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
 from data_prep.prepare.open import find_head

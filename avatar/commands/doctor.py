@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
-from avatar.compute.present import has_gpu_driver
+from avatar.compute.availability import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError
 from avatar.files.opening import check_file, is_there
@@ -113,7 +113,7 @@ def gpu() -> Finding:
 def find_gpu() -> str:
     import torch
 
-    from avatar.pipeline.device import check_gpu, describe_gpu
+    from avatar.pipeline.choose_device import check_gpu, describe_gpu
 
     device = torch.device("cuda", 0)
     check_gpu(device)

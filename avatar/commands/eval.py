@@ -12,7 +12,7 @@ from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import choose_protocols
 from avatar.files.lock import locked
 from avatar.pipeline import OK
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import open_run
 
 

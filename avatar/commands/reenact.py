@@ -9,7 +9,7 @@ from avatar.commands.outputs import check_file, check_outputs
 from avatar.files.names import safe_name
 from avatar.files.video import VIDEO_SUFFIXES
 from avatar.pipeline import OK
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_driver
 from avatar.pipeline.reenact import Choices, reenact, sidecars
 from avatar.pipeline.track import is_video, tracked_once

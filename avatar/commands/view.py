@@ -22,12 +22,12 @@ from torch import Tensor
 from avatar.commands.reenact import head_of
 from avatar.errors import UserError
 from avatar.pipeline import INTERRUPTED, OK
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_run
 from avatar.runs.clips import Clip, driven_clip, own_clip
 from avatar.runs.run import RUN_FILE, Run, open_trained
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.gate import LOCAL
+from avatar.view.auth import LOCAL
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.stage import Stage

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from avatar.errors import UserError
 
@@ -57,3 +60,8 @@ def split_frames(count: int, sizes: SplitSizes = DEFAULT_SIZES) -> Split:
             f"{train} training frames cannot be taken from {count} with {test} held out: choose from 1 to {available}"
         )
     return Split(tuple(range(available - train, available)), tuple(range(available, count)))
+
+
+def evenly_spread(frames: Sequence[int], count: int) -> list[int]:
+    """`count` of the frames, from the first to the last; all where there are fewer."""
+    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]

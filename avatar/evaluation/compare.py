@@ -19,10 +19,10 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.evaluation.bootstrap import BlockBootstrap, Interval
-from avatar.evaluation.earlier import MAX_TABLE_BYTES
 from avatar.evaluation.evaluate import RESULTS_FORMAT
+from avatar.evaluation.previous_results import MAX_TABLE_BYTES
 from avatar.evaluation.protocol import NAME
-from avatar.evaluation.tracked import Drive, Part, is_marked, legend, parts
+from avatar.evaluation.tracking_source import Drive, Part, is_marked, legend, parts
 from avatar.files.opening import MissingFile, read_bytes, read_json
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "perceptual", "protocols", "tracking"}  # of results.json

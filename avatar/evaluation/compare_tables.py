@@ -9,7 +9,7 @@ from pathlib import Path
 
 from avatar.evaluation.bootstrap import LEVEL
 from avatar.evaluation.compare import Cell, Comparison, ProtocolComparison
-from avatar.evaluation.tracked import LABELS, MARK
+from avatar.evaluation.tracking_source import LABELS, MARK
 from avatar.files.atomic import write_atomically
 
 UNITS = {"psnr": "dB", "jitter": "levels"}

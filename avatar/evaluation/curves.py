@@ -10,7 +10,7 @@ import numpy as np
 from avatar.errors import check_installed
 from avatar.evaluation.protocol import REGIONS, Protocol, column
 from avatar.evaluation.results import FrameResult
-from avatar.evaluation.tracked import Drive
+from avatar.evaluation.tracking_source import Drive
 
 
 def curves(

@@ -34,16 +34,16 @@ from avatar.errors import MissingPackage, UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
-from avatar.evaluation.earlier import in_order, protocol_of, read_earlier, read_frames, remove_others
 from avatar.evaluation.jitter import JitterMeter
+from avatar.evaluation.lpips_networks import find_networks
 from avatar.evaluation.measure import FrameMeasurer
-from avatar.evaluation.networks import find_networks
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
+from avatar.evaluation.previous_results import in_order, protocol_of, read_earlier, read_frames, remove_others
 from avatar.evaluation.protocol import HELD_OUT, SHARED_CHOICES, Protocol, choose_protocols
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
-from avatar.evaluation.tracked import Drive, describe_tracking, drives, parts, renders_of, tracking_notes
+from avatar.evaluation.tracking_source import Drive, describe_tracking, drives, parts, renders_of, tracking_notes
 from avatar.files.atomic import write_atomically
 from avatar.files.video import video_writer
 from avatar.losses.lpips_network import Lpips, Net

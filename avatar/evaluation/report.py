@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.protocol import MEASURES, REGIONS, column
 from avatar.evaluation.results import FrameResult
-from avatar.evaluation.tracked import LABELS, MARK, is_marked, parts, tracking_lines
+from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
 
 MAIN_TITLE = "by the protocol"
 FORMATS = {"psnr": "7.2f", "ssim": "8.4f", "lpips": "8.4f"}

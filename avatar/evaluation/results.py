@@ -10,10 +10,10 @@ import numpy as np
 
 from avatar.evaluation.bootstrap import BlockBootstrap, block_length, describe
 from avatar.evaluation.conditions import Conditions
+from avatar.evaluation.lpips_networks import ChosenLpips
 from avatar.evaluation.measure import Figures
-from avatar.evaluation.networks import ChosenLpips
 from avatar.evaluation.protocol import Protocol
-from avatar.evaluation.tracked import Drive
+from avatar.evaluation.tracking_source import Drive
 
 YAW_EDGES = (-30.0, -10.0, 10.0, 30.0)  # degrees
 DISTANCE_QUANTILES = (0.25, 0.5, 0.75)  # edges of the bins of expression distance: four bins with as many frames each

@@ -24,10 +24,10 @@ from tqdm import tqdm
 
 from avatar.data.images import MAX_BYTES
 from avatar.errors import UserError
-from avatar.evaluation.earlier import MAX_TABLE_BYTES
 from avatar.evaluation.pictures import MASK_FOLDERS, RENDERS
+from avatar.evaluation.previous_results import MAX_TABLE_BYTES
 from avatar.evaluation.protocol import column
-from avatar.evaluation.tracked import Drive, Part, parts
+from avatar.evaluation.tracking_source import Drive, Part, parts
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import read_bytes, read_json
 

@@ -19,9 +19,9 @@ from avatar.files.atomic import write_atomically
 from avatar.files.opening import read_json
 from avatar.pipeline.open import split_sizes
 from avatar.pipeline.train import new_avatar
-from avatar.refine.refine import estimated_seconds
+from avatar.pose_refinement.refine import estimated_seconds
 from avatar.train.align import WITH_REFINEMENT
-from avatar.train.cost import measure_cost
+from avatar.train.cost_estimate import measure_cost
 from avatar.train.order import within_passes
 from avatar.train.step import choose_perceptual
 from data_prep.prepare.open import open_subject

@@ -11,10 +11,10 @@ import torch
 from avatar.data.refinement import Refinement, Round
 from avatar.files.names import shortened
 from avatar.pipeline import INTERRUPTED, OK
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.plan import FIRST_PASSES
-from avatar.refine.record import frames_csv, sheet, summary
-from avatar.refine.refine import fingerprint, refine_subject
+from avatar.pose_refinement.record import frames_csv, sheet, summary
+from avatar.pose_refinement.refine import fingerprint, refine_subject
 from avatar.runs.run import Run
 from data_prep.formats.refined import check_target, frame_numbers, write_folder
 

@@ -87,10 +87,10 @@ def placed(device: torch.device) -> Fields:
     skull_binding = SkullBinding(skull, neck, skull_logits)
     sh = torch.zeros(COUNT, 1, 3, device=device)
     if on_gpu(sh):
-        from avatar.gaussians.place_gpu import place_gpu
+        from avatar.gaussians.compose_gpu import compose_gpu
 
         base = (quats, log_scales, logits, sh)
-        found = place_gpu(vertices, values, packed, *base, sheet, sheet.grid, skull_binding)
+        found = compose_gpu(vertices, values, packed, *base, sheet, sheet.grid, skull_binding)
     else:
         points = bind_to_skull((vertices[sheet.corners] * sheet.barycentric[..., None]).sum(dim=1), skull_binding)
         found = compose_raw(points, quats, log_scales, logits, sh, condition(sheet.grid(values), packed))

@@ -18,11 +18,11 @@ from avatar.files.lock import locked
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
 from avatar.pipeline import INTERRUPTED, OK
-from avatar.pipeline.device import choose_device
+from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import check_data, moved_source, split_sizes
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
-from avatar.runs.footprint import training_needs
+from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.order import within_passes
 from avatar.train.step import PerceptualTerm, choose_perceptual

@@ -11,7 +11,7 @@ from avatar.config import flatten
 from avatar.data.images import MAX_BYTES
 from avatar.errors import UserError, check_installed
 from avatar.evaluation.evaluate import RESULTS_FORMAT
-from avatar.evaluation.tracked import LABELS, MARK, is_marked, parts, tracking_lines
+from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there, read_bytes, read_json
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles

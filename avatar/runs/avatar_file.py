@@ -34,7 +34,7 @@ from avatar.head.packed import head_from_tensors, head_tensors
 from avatar.model import Avatar
 from avatar.motion.rest import RestPose
 from avatar.runs.checkpoint import check_fit, load_module, module_tensors
-from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shapes
+from avatar.runs.memory_estimate import count_gaussians, drawing_needs, parameter_shapes
 from avatar.version import __version__
 
 AVATAR_FILE = "avatar.safetensors"

@@ -12,7 +12,7 @@ from scipy import stats
 from avatar.errors import UserError
 from avatar.evaluation.bootstrap import LEVEL, Interval
 from avatar.evaluation.compare import Cell, Comparison, Evaluation, ProtocolComparison, read_evaluation
-from avatar.evaluation.tracked import Drive, is_marked, legend
+from avatar.evaluation.tracking_source import Drive, is_marked, legend
 from avatar.sweep.spec import Job, Spec
 
 Figures = Mapping[tuple[str, int], float]  # (subject, seed) -> a figure

@@ -5,10 +5,10 @@ loss and m the frame's moves in units of a tracker's errors,
 
     m <- m - r A^-1 (s dL/dm + m)
 
-A is the curvature of refinement (`avatar.tracking`), shared by all frames, plus the prior's identity; s turns the loss into
-refinement's misfit; the rate r falls from `trainer.align_rate` to LAST_RATE of it. The mean move of the head poses is
-subtracted after every pass, because held-out frames and drivers keep their tracking. Where the gain is below LEAST_GAIN,
-the given tracking is used again.
+A is the curvature of refinement (`avatar.pose_refinement`), shared by all frames, plus the prior's identity; s turns the
+loss into refinement's misfit; the rate r falls from `trainer.align_rate` to LAST_RATE of it. The mean move of the head
+poses is subtracted after every pass, because held-out frames and drivers keep their tracking. Where the gain is below
+LEAST_GAIN, the given tracking is used again.
 
 Left out is how a rotation of the head changes the colours that depend on the view: at most 0.24 units in six frames, whose
 largest components are 3 to 16.
@@ -30,11 +30,11 @@ from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.tracking.frame_fitter import OBSERVATIONS, PIXEL_SIGMA, FrameFitter
-from avatar.tracking.motion import HeadPose, head_params, moved_pose
-from avatar.tracking.parameterization import PoseParameterization, find_parameterization
+from avatar.pose_refinement.frame_fitter import OBSERVATIONS, PIXEL_SIGMA, FrameFitter
+from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose
+from avatar.pose_refinement.parameterization import PoseParameterization, find_parameterization
+from avatar.train.aligned_frame import AlignedFrame, place
 from avatar.train.alignment_statistics import AlignmentStatistics
-from avatar.train.placed import AlignedFrame, place
 from avatar.train.posed_mesh_cache import PosedMeshes
 from avatar.train.step import sh_degree
 from avatar.types import Frame, Gaussians, HeadParams

@@ -12,15 +12,15 @@ from torch import Tensor
 
 from avatar.compute.device import on_gpu, to_device
 from avatar.data.loader import FrameLoader
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.losses.photometric import MOUTH_WEIGHT
+from avatar.pose_refinement.descent import Problem, curvature
+from avatar.pose_refinement.frame_fitter import FrameFitter, coarse_levels, head_psnr, resized, targets
+from avatar.pose_refinement.motion import HeadPose
+from avatar.pose_refinement.parallel import read_later
+from avatar.pose_refinement.parameterization import PoseParameterization
 from avatar.splat import CannotDraw
-from avatar.tracking.descent import Problem, curvature
-from avatar.tracking.frame_fitter import FrameFitter, coarse_levels, head_psnr, resized, targets
-from avatar.tracking.motion import HeadPose
-from avatar.tracking.parallel import read_later
-from avatar.tracking.parameterization import PoseParameterization
-from avatar.train.order import evenly_spread
 from avatar.train.step import stopped
 from avatar.types import Frame
 

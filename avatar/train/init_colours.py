@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.head.rasterize import rasterize_mesh
 from avatar.model import Avatar
 from avatar.splat.sh import C0
-from avatar.train.order import evenly_spread
 from avatar.types import Frame
 
 FRAMES = 16  # evenly spread over the training frames: enough for every head turn to take part

@@ -17,11 +17,6 @@ def within_passes(config: TrainerConfig, frames: int) -> TrainerConfig:
     return replace(config, iterations=min(config.iterations, config.passes * frames))
 
 
-def evenly_spread(frames: Sequence[int], count: int) -> list[int]:
-    """`count` of the frames, from the first to the last; all where there are fewer."""
-    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
-
-
 def planned_steps(config: TrainerConfig) -> str:
     """How many steps that is, for a heading, before the number of frames is known."""
     return f"{config.iterations} steps" + (f", at most {config.passes} passes" if config.passes is not None else "")

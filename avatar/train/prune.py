@@ -10,11 +10,11 @@ from torch import Tensor
 
 from avatar.config import TrainerConfig
 from avatar.data.loader import FrameLoader
+from avatar.data.split import evenly_spread
 from avatar.model import Avatar
 from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
 from avatar.splat.sh import C0
-from avatar.train.order import evenly_spread
 from avatar.train.step import stopped
 from avatar.types import Frame
 

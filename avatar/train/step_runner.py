@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avatar.compute.cuda_graph import Replay
 from avatar.compute.device import on_gpu, to_device
-from avatar.compute.replay import Replay
 from avatar.model import Avatar
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.capacity import Kind as DrawingKind

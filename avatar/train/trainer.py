@@ -7,8 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import CPU, on_gpu
-from avatar.compute.replay import own_stream
+from avatar.compute.interruption import interruption
 from avatar.config import Config
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
@@ -22,7 +23,6 @@ from avatar.splat.capacity import with_room
 from avatar.train.align import make_alignment
 from avatar.train.condition_noise import make_noise
 from avatar.train.init_colours import colour_from_frames
-from avatar.train.interruption import interruption
 from avatar.train.log import TrainingLog
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order

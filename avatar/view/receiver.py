@@ -21,7 +21,7 @@ from avatar.motion.rest import RestPose
 from avatar.motion.transfer import departed
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
-from avatar.view.gate import same
+from avatar.view.auth import same
 from avatar.view.live import Live
 from avatar.view.packets import MAX_LINE, FrameReader, PacketError
 from avatar.view.player import STREAM

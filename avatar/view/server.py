@@ -19,8 +19,8 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
+from avatar.view.auth import LOCAL, Gate
 from avatar.view.complaints import Complaints
-from avatar.view.gate import LOCAL, Gate
 from avatar.view.live import Pace
 from avatar.view.messages import Door
 from avatar.view.panel import Panel, notes

@@ -24,8 +24,8 @@ from websockets.http11 import Request, Response
 from websockets.protocol import State
 
 from avatar.errors import UserError
+from avatar.view.auth import Gate, Refusal
 from avatar.view.complaints import Complaints
-from avatar.view.gate import Gate, Refusal
 from avatar.view.messages import MAX_MESSAGE, Door, MessageError
 
 MAX_WAITING = 64  # connections that have not been let in yet

@@ -15,13 +15,13 @@ from drawn_clip import drawn_clip, patterned_avatar, true_tracks
 from tracked_folder import write_tracked_folder
 
 from avatar.bench import refine as bench
-from avatar.bench.disturb import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed, tracking_noise
+from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed, tracking_noise
 from avatar.bench.refine import Figures, Row, coefficients_outside, recovered, report, vertex_errors
 from avatar.cli import main
 from avatar.data.recording import Recording
 from avatar.model import Avatar
-from avatar.refine.record import movements
-from avatar.tracking.motion import EXPRESSION, EYELIDS, NECK, values_of
+from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, NECK, values_of
+from avatar.pose_refinement.record import movements
 
 
 @pytest.fixture(scope="module")

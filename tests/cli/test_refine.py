@@ -20,7 +20,7 @@ from avatar.commands import train
 from avatar.data.source import Source
 from avatar.pipeline import plan, train_refined
 from avatar.pipeline.open import source_of
-from avatar.refine import refine as refine_module
+from avatar.pose_refinement import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 
 QUICK = [*SMALL, "trainer.iterations=10"]

@@ -15,9 +15,9 @@ import torch
 
 from avatar.commands.doctor import find_gpu
 from avatar.errors import UserError
-from avatar.pipeline import device as choose
+from avatar.pipeline import choose_device as choose
 from avatar.pipeline import self_test
-from avatar.pipeline.device import NoGpu, check_gpu, choose_device, sees_gpu
+from avatar.pipeline.choose_device import NoGpu, check_gpu, choose_device, sees_gpu
 from avatar.pipeline.self_test import WrongGpu
 
 CUDA = torch.device("cuda", 0)

@@ -13,7 +13,7 @@ from disc import TEST, make_run
 from avatar.data.refinement import Refinement, Round
 from avatar.data.subject import Subject
 from avatar.evaluation.evaluate import evaluate
-from avatar.evaluation.tracked import OF_MARK, describe_tracking, tracking_notes
+from avatar.evaluation.tracking_source import OF_MARK, describe_tracking, tracking_notes
 
 
 def refined(subject: Subject, trained_on: tuple[int, ...], first: int = 0) -> Subject:

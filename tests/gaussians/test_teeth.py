@@ -12,10 +12,10 @@ from small_runs import new_avatar, open_small, small_config
 
 from avatar.head.model import HeadModel
 from avatar.head.teeth import GRID, ROWS
+from avatar.pose_refinement.frame_fitter import FrameFitter
 from avatar.runs.avatar_file import read_portrait, write_portrait
-from avatar.runs.footprint import count_gaussians, parameter_shapes
+from avatar.runs.memory_estimate import count_gaussians, parameter_shapes
 from avatar.runs.trained import TrainedAvatar, load_avatar
-from avatar.tracking.frame_fitter import FrameFitter
 
 TEETH = "model.teeth=true"
 PLAIN = "model.teeth=false"

@@ -16,13 +16,13 @@ pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.compute.device import CPU
 from avatar.model import Avatar
+from avatar.pose_refinement.frame_fitter import FrameFitter
+from avatar.pose_refinement.motion import HeadPose
+from avatar.pose_refinement.parameterization import find_parameterization
 from avatar.runs.checkpoint import Checkpoint, list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.splat import splat
-from avatar.tracking.frame_fitter import FrameFitter
-from avatar.tracking.motion import HeadPose
-from avatar.tracking.parameterization import find_parameterization
 from avatar.train import align as align_module
-from avatar.train.placed import place
+from avatar.train.aligned_frame import place
 from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
 

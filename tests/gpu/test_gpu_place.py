@@ -76,7 +76,7 @@ class Scene:
             return compose_raw(points, *base, self.sh, values)
 
     def found(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
-        from avatar.gaussians.place_gpu import place_gpu
+        from avatar.gaussians.compose_gpu import compose_gpu
 
         self.embedding.move(DEVICE)
         if self.grid is not None:
@@ -84,7 +84,9 @@ class Scene:
         *base, neck, logits = rest
         skull = Skull(self.skull.at_rest.to(DEVICE), self.skull.arms.to(DEVICE))
         skull_binding = None if logits is None else SkullBinding(skull, neck, logits)
-        return place_gpu(vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, skull_binding)
+        return compose_gpu(
+            vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, skull_binding
+        )
 
     def run(self, function: Callable[..., Gaussians], device: torch.device) -> tuple[Gaussians, dict[str, Tensor]]:
         leaves = {n: None if t is None else t.to(device).requires_grad_() for n, t in self.inputs.items()}

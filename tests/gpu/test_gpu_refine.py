@@ -16,11 +16,11 @@ pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.data.subject import Subject
 from avatar.model import Avatar
-from avatar.refine import refine as refine_module
-from avatar.refine.refine import _Work, frozen
+from avatar.pose_refinement import refine as refine_module
+from avatar.pose_refinement.motion import head_params, quaternion, rotation
+from avatar.pose_refinement.parallel import read_later
+from avatar.pose_refinement.refine import _Work, frozen
 from avatar.splat.capacity import fixed_capacity
-from avatar.tracking.motion import head_params, quaternion, rotation
-from avatar.tracking.parallel import read_later
 
 FRAME = 1
 

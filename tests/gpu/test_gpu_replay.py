@@ -15,7 +15,7 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from avatar.compute.replay import Replay, own_stream
+from avatar.compute.cuda_graph import Replay, own_stream
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
 from avatar.splat.capacity import CAPACITIES, Capacities, Kind, fixed_capacity

@@ -12,7 +12,7 @@ from avatar.motion.expression_space import fit_expressions
 from avatar.motion.rest import RestPose, find_mean, find_neutral
 from avatar.motion.statistics import MotionStatistics, learn_repertoire
 from avatar.motion.transfer import TRANSFERS, departed, transfer_motion
-from avatar.tracking.motion import rotation
+from avatar.pose_refinement.motion import rotation
 from avatar.types import HeadParams
 
 

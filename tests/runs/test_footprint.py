@@ -11,7 +11,7 @@ from small_runs import small_config
 
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.runs.footprint import count_gaussians, drawing_needs, parameter_shapes, places, training_needs
+from avatar.runs.memory_estimate import count_gaussians, drawing_needs, parameter_shapes, places, training_needs
 
 MIB = 2**20
 PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
@@ -59,7 +59,7 @@ import resource, sys
 sys.path[:0] = {path!r}
 from pathlib import Path
 from small_runs import *
-from avatar.runs.footprint import training_needs
+from avatar.runs.memory_estimate import training_needs
 
 def bytes_of(field):
     return 1024 * int(next(line for line in open("/proc/self/status") if line.startswith(field)).split()[1])

@@ -16,15 +16,15 @@ from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.errors import UserError
 from avatar.model import SH_DEGREE, Avatar
-from avatar.refine.refine import frozen
+from avatar.pose_refinement.frame_fitter import FrameFitter, misfit, targets
+from avatar.pose_refinement.motion import HeadPose, moved_tracks
+from avatar.pose_refinement.parameterization import find_parameterization
+from avatar.pose_refinement.refine import frozen
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
-from avatar.tracking.frame_fitter import FrameFitter, misfit, targets
-from avatar.tracking.motion import HeadPose, moved_tracks
-from avatar.tracking.parameterization import find_parameterization
 from avatar.train import align as align_module
 from avatar.train.align import Alignment, make_alignment
+from avatar.train.aligned_frame import place
 from avatar.train.optimizer import make_optimizer
-from avatar.train.placed import place
 from avatar.train.step import Objective, choose_perceptual, training_step
 from avatar.types import Frame
 

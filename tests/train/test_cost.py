@@ -8,7 +8,7 @@ import pytest
 from small_runs import small_config
 
 from avatar.losses.photometric import dssim
-from avatar.train.cost import kinds_of_steps
+from avatar.train.cost_estimate import kinds_of_steps
 from avatar.train.step import PerceptualTerm, Weighted
 
 

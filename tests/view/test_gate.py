@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("websockets")
 from websockets.datastructures import Headers
 
-from avatar.view.gate import Gate
+from avatar.view.auth import Gate
 
 TOKEN = "a-token-that-is-long"
 HERE = Gate(TOKEN, True)

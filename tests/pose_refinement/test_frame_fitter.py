@@ -14,12 +14,19 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from avatar.losses.metrics import psnr
 from avatar.model import Avatar
-from avatar.refine.refine import frozen
+from avatar.pose_refinement import frame_fitter as fitter_module
+from avatar.pose_refinement.frame_fitter import (
+    OBSERVATIONS,
+    PIXEL_SIGMA,
+    FrameFitter,
+    camera_gradient,
+    head_psnr,
+    targets,
+)
+from avatar.pose_refinement.frame_fitter import misfit as misfit_of
+from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose, rotation, values_of
+from avatar.pose_refinement.refine import frozen
 from avatar.splat import splat
-from avatar.tracking import frame_fitter as fitter_module
-from avatar.tracking.frame_fitter import OBSERVATIONS, PIXEL_SIGMA, FrameFitter, camera_gradient, head_psnr, targets
-from avatar.tracking.frame_fitter import misfit as misfit_of
-from avatar.tracking.motion import HeadPose, head_params, moved_pose, rotation, values_of
 from avatar.types import Camera, Gaussians
 
 VALUES = 20 + EXPRESSIONS

@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from avatar.compute.device import on_gpu
-from avatar.tracking.frame_fitter import FrameFitter, before_camera, camera_gradient
-from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, values_of
+from avatar.pose_refinement.frame_fitter import FrameFitter, before_camera, camera_gradient
+from avatar.pose_refinement.motion import TURN, HeadPose, head_params, moved_pose, values_of
 from avatar.train.step import Judge, Objective, sh_degree, training_step
 from avatar.types import Frame, Gaussians
 

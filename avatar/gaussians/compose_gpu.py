@@ -33,7 +33,7 @@ class Mesh(Protocol):
     def touching(self, num_vertices: int) -> Touching: ...
 
 
-def place_gpu(
+def compose_gpu(
     vertices: Float[Tensor, "V 3"],
     values: Float[Tensor, "M n"],
     packed: Float[Tensor, "blocks rows 16"] | None,

@@ -9,8 +9,8 @@ import torch
 from drawn_clip import EXPRESSIONS, true_tracks
 from poison import poisoned_tracks
 
-from avatar.tracking.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
-from avatar.tracking.parameterization import (
+from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
+from avatar.pose_refinement.parameterization import (
     DEPTH_UNIT,
     FACE_CALM,
     HEAD_CALM,

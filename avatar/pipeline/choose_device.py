@@ -11,8 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
+from avatar.compute.availability import has_gpu_driver
 from avatar.compute.device import CPU
-from avatar.compute.present import has_gpu_driver
 from avatar.config_values import check_device
 from avatar.errors import UserError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from avatar.refine.smoothing import second_differences, smoothed
+from avatar.pose_refinement.smoothing import second_differences, smoothed
 
 FRAMES, VALUES = 9, 4
 

@@ -22,19 +22,19 @@ from torch import Tensor
 from tqdm import tqdm
 
 from avatar.compute.device import on_gpu, to_device
+from avatar.compute.interruption import interruption
 from avatar.compute.native import thread_count
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.refine.progress import read_progress, write_progress
-from avatar.refine.smoothing import smoothed
-from avatar.tracking.descent import Descent, Problem, curvature, descend
-from avatar.tracking.frame_fitter import FrameFitter, Measure, Target, coarse_levels, head_psnr, targets
-from avatar.tracking.motion import HeadPose, moved_tracks
-from avatar.tracking.parallel import in_order, read_later
-from avatar.tracking.parameterization import PoseParameterization, find_parameterization
-from avatar.train.interruption import interruption
-from avatar.train.order import evenly_spread
+from avatar.pose_refinement.descent import Descent, Problem, curvature, descend
+from avatar.pose_refinement.frame_fitter import FrameFitter, Measure, Target, coarse_levels, head_psnr, targets
+from avatar.pose_refinement.motion import HeadPose, moved_tracks
+from avatar.pose_refinement.parallel import in_order, read_later
+from avatar.pose_refinement.parameterization import PoseParameterization, find_parameterization
+from avatar.pose_refinement.progress import read_progress, write_progress
+from avatar.pose_refinement.smoothing import smoothed
 
 COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all

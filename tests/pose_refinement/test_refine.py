@@ -16,10 +16,10 @@ from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, scr
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.refine import refine as refine_module
-from avatar.refine.record import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary
-from avatar.refine.refine import SAMPLES, Refined, estimated_seconds, fingerprint, frozen, refine_subject
-from avatar.tracking.motion import EXPRESSION, values_of
+from avatar.pose_refinement import refine as refine_module
+from avatar.pose_refinement.motion import EXPRESSION, values_of
+from avatar.pose_refinement.record import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary
+from avatar.pose_refinement.refine import SAMPLES, Refined, estimated_seconds, fingerprint, frozen, refine_subject
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def test_the_record_tells_what_happened(avatar: Avatar, wrong: Clip, result: Ref
 
 
 def test_movements_are_the_turn_and_the_way_of_the_centre(clip: Clip) -> None:
-    from avatar.tracking.motion import moved_tracks
+    from avatar.pose_refinement.motion import moved_tracks
 
     values = values_of(clip.recording.tracks)
     values[:, 1], values[:, 3] = 0.02, 0.003

@@ -15,10 +15,10 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.tracking.frame_fitter import FrameFitter
+from avatar.pose_refinement.frame_fitter import FrameFitter
 from avatar.train.align import MOVING_SHARE
+from avatar.train.aligned_frame import moving_step
 from avatar.train.optimizer import make_optimizer
-from avatar.train.placed import moving_step
 from avatar.train.step import Objective, choose_perceptual, perceptual_start, training_step
 from avatar.types import Frame
 

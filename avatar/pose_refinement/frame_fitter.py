@@ -22,8 +22,8 @@ from avatar.compute.device import on_gpu, to_device
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.model import SH_DEGREE, Avatar
+from avatar.pose_refinement.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.splat.sh import C0, sh_colours
-from avatar.tracking.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.types import Camera, Frame, Gaussians, HeadParams
 
 # The squared error of a frame counts as this many independent observations with this standard deviation. Errors of

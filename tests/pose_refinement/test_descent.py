@@ -11,11 +11,11 @@ from drawn_clip import BACKGROUND, Clip, drawn_clip, patterned_avatar, screen_er
 
 from avatar.data.recording import Recording
 from avatar.model import Avatar
-from avatar.refine.refine import frozen
-from avatar.tracking.descent import Problem, curvature, descend
-from avatar.tracking.frame_fitter import HUBER_DELTA, FrameFitter, targets
-from avatar.tracking.motion import HeadPose, moved_tracks
-from avatar.tracking.parameterization import find_parameterization
+from avatar.pose_refinement.descent import Problem, curvature, descend
+from avatar.pose_refinement.frame_fitter import HUBER_DELTA, FrameFitter, targets
+from avatar.pose_refinement.motion import HeadPose, moved_tracks
+from avatar.pose_refinement.parameterization import find_parameterization
+from avatar.pose_refinement.refine import frozen
 
 
 @pytest.fixture(scope="module")
