@@ -145,6 +145,7 @@ def test_maps_are_blended_as_colours_are_and_the_variance_is_arbitrary(folder: P
     assert torch.equal(uncertainty.variance_of(run), variances)  # the heads are as they were
 
 
+@pytest.mark.slow
 def test_uncertainty_and_cross_leave_what_they_say(folder: Path, tmp_path: Path) -> None:
     words = [*words_of(folder, tmp_path), "--side-by-side"]
     assert uncertainty.main([*words, "--frames", "2"]) == 0
