@@ -168,7 +168,7 @@ def test_evaluations(fault: int, tracked_folder: Path, tmp_path: Path) -> None:
 
 @FAULTS
 def test_prepared_subjects(fault: int | None, tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", 6, 24, mouth_masks=False)
+    folder = write_tracked_folder(tmp_path / "subject", 4, 24, mouth_masks=False)
     head = load_head_assets(folder / "head_model")
     torch.set_num_threads(1)
     (tmp_path / "out").mkdir()
