@@ -35,8 +35,8 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer_module.TrainingLog, "step", record)
-        _, done = train_small(tracked_folder, tmp_path / "run", ["trainer.iterations=240"])
-    assert done == 240
+        _, done = train_small(tracked_folder, tmp_path / "run", ["trainer.iterations=120"])
+    assert done == 120
     assert sum(scores[-20:]) / 20 > sum(scores[:20]) / 20 + 3.0
     assert [p.name for p in sorted((tmp_path / "run").iterdir())] == [
         "avatar.safetensors",
@@ -45,7 +45,7 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
         "run.json",
         "tensorboard",
     ]
-    assert (tmp_path / "run" / "previews" / "step_00000240.png").is_file()
+    assert (tmp_path / "run" / "previews" / "step_00000120.png").is_file()
     assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 3
 
 
@@ -80,10 +80,10 @@ def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(
 @pytest.mark.parametrize("model", ["covariance", "ndgs", "splattingavatar", "monogaussianavatar"])
 def test_the_papers_other_systems_learn(tracked_folder: Path, tmp_path: Path, model: str) -> None:
     """The pictures get nearer, and every parameter that the latent is weighed by leaves its start."""
-    config = small_config(*PAPER, f"model={model}", "model.mlp_width=24", "trainer.iterations=150")
+    config = small_config(*PAPER, f"model={model}", "model.mlp_width=24", "trainer.iterations=80")
     _, subject, assets = open_small(tracked_folder, config)
     untrained = new_avatar(assets, subject, config)
-    trained, _ = train_small(tracked_folder, tmp_path / "run", [*PAPER, f"model={model}", "trainer.iterations=150"])
+    trained, _ = train_small(tracked_folder, tmp_path / "run", [*PAPER, f"model={model}", "trainer.iterations=80"])
     frame = subject.frame(subject.split.train[0])
     background = torch.ones(3)
 
