@@ -212,7 +212,8 @@ def _turned(folder: Path) -> Path:
     return folder / "v.mp4"
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "8K" else n for n in TAKEN])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TAKEN)
 def test_taken_and_said(name: str, tmp_path: Path, tracking_models: None) -> None:
     case = TAKEN[name]
     footage = open_footage(case.make(tmp_path))
