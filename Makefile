@@ -13,7 +13,7 @@ STRESS_EXAMPLES ?= 100000
 STRESS_MINUTES ?= 60
 FUZZ_CASES ?= 20000
 
-.PHONY: help setup setup-dev demo test mutate stress stress-view fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
+.PHONY: help setup setup-dev demo test test-all mutate stress stress-view fuzz sanitize wasm arm64 gpu-check paper-smoke check format smoke wheel clean
 help: ## show this list
 	@sed -n 's/^\([a-z0-9-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-18s %s\n", $$1, $$2}'
 
@@ -24,9 +24,13 @@ setup-dev: $(VENV)/.installed-dev ## the same with what tests, checks and wheels
 demo: setup ## make two people, train an avatar of one, evaluate it and let the other drive it
 	$(BIN)/avatar demo $(DEMO)
 
-# A worker for each core, with one thread: most tests have work for one.
-test: setup-dev ## run all tests
-	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+# A worker for each core, with one thread, since most tests have work for one; a worker that is done takes tests of another.
+PYTEST := OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations=25
+test: setup-dev ## run the tests but the slow ones and those that need a browser (five minutes on two cores)
+	$(PYTEST) -m "not slow and not chromium"
+
+test-all: setup-dev ## run all tests
+	$(PYTEST)
 
 mutate: setup-dev ## plant mistakes in the program, one at a time, and see that tests catch each (ten minutes)
 	OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python scripts/mutate.py

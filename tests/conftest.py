@@ -34,6 +34,14 @@ def _short_training() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _coarse_textures() -> Iterator[None]:
+    """The demo's people are painted in half the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("avatar.demo.render.TEXTURE_SIZE", 384)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Prepared subjects and weights of the person who runs the tests stay out of them."""
     with pytest.MonkeyPatch.context() as patch:

@@ -24,10 +24,19 @@ def test_a_demo_installs_no_developers_tools(target: str, tmp_path: Path) -> Non
     assert "-e '.[track,view]'" in said and "dev]" not in said
 
 
-@pytest.mark.parametrize("target", ["test", "check", "stress", "fuzz", "smoke", "paper-smoke", "gpu-check", "wheel"])
+@pytest.mark.parametrize(
+    "target", ["test", "test-all", "check", "stress", "fuzz", "smoke", "paper-smoke", "gpu-check", "wheel"]
+)
 def test_developers_targets_install_their_tools_once(target: str, tmp_path: Path) -> None:
     assert commands(target, tmp_path / "new").count("-e '.[dev]'") == 1
     (tmp_path / "used").mkdir()
     for name in (".tools", ".installed", ".installed-dev"):
         (tmp_path / "used" / name).touch()
     assert "-e '.[" not in commands(target, tmp_path / "used") and "-e '.[" not in commands("demo", tmp_path / "used")
+
+
+def test_slow_tests_are_left_to_test_all(tmp_path: Path) -> None:
+    assert "not slow and not chromium" in commands("test", tmp_path) and "not slow" not in commands(
+        "test-all", tmp_path
+    )
+    assert "make test-all" in (ROOT / ".ci" / "run").read_text()

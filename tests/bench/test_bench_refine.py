@@ -112,6 +112,7 @@ def test_the_share_recovered_and_the_report() -> None:
     assert line.split()[-3:] == ["0.600", "0.300", "2"]
 
 
+@pytest.mark.slow
 def test_a_quick_run_leaves_its_figures_and_nothing_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

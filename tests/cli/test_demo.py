@@ -44,6 +44,7 @@ def test_an_interrupted_demo_goes_on(tmp_path: Path) -> None:
     assert f"PSNR {means['psnr']:.2f}" in output, "the whole avatar is measured"
 
 
+@pytest.mark.slow
 def test_people_are_filmed_and_tracked_where_that_is_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tracking is another test's: here it leaves a folder without a head model, as it does."""
     out, videos = tmp_path / "demo", []

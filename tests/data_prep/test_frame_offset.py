@@ -95,6 +95,7 @@ def test_too_few_frames_are_called_that(frames: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.shared
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [{"mouth": False}, {"mouth": False, "head": False}])
 def test_the_images_decide_where_masks_cannot(kinds: dict[str, bool], shared_dir: Path) -> None:
     """Head masks alone hardly move with speech; the lips in the images do."""

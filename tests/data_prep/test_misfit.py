@@ -250,6 +250,7 @@ def flame(shared: Path, like: HeadAssets) -> HeadAssets:
 
 
 @pytest.mark.shared
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anna", "carla"])
 def test_flame_is_not_the_head_of_the_development_subjects(name: str, shared_dir: Path, tmp_path: Path) -> None:
     folder, head = shared_dir / "subjects" / name, shared_dir / "subjects" / "head_model"

@@ -163,6 +163,7 @@ def test_tracking_in_another_folder(tmp_path: Path) -> None:
         assert len(subject) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(("name", "count"), [("anna", 1000), ("carla", 400)])
 def test_development_subjects(name: str, count: int, shared_dir: Path, tmp_path: Path) -> None:

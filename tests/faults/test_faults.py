@@ -152,6 +152,7 @@ def test_results(fault: int | None, tmp_path: Path) -> None:
     assert stop_at_every_step(work, fault, lambda: file.read_bytes() in (b"old" * 1000, b"new" * 1000) or 1 / 0) >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [FULL, READ_ONLY], ids=["disk full", "read-only"])
 def test_evaluations(fault: int, tracked_folder: Path, tmp_path: Path) -> None:
     """What an evaluation could not write, it says in one sentence; the figures before are there still."""
@@ -166,9 +167,10 @@ def test_evaluations(fault: int, tracked_folder: Path, tmp_path: Path) -> None:
         assert (run / "eval" / "results.json").read_bytes() == figures
 
 
+@pytest.mark.slow
 @FAULTS
 def test_prepared_subjects(fault: int | None, tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", 6, 24, mouth_masks=False)
+    folder = write_tracked_folder(tmp_path / "subject", 4, 24, mouth_masks=False)
     head = load_head_assets(folder / "head_model")
     torch.set_num_threads(1)
     (tmp_path / "out").mkdir()

@@ -68,6 +68,7 @@ def test_both_naive_ways_condition_the_same_distributions() -> None:
     torch.testing.assert_close(second, first, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_conditioning_is_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["--out", str(tmp_path), "--sizes", "2", "--gaussians", "64", "--repeats", "1"]
     assert conditioning.main(words) == 0
@@ -100,6 +101,7 @@ print(*(peak_bytes(holds(megabytes), leaves) for megabytes in (40, 80)))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not conditioning.RESET.exists(), reason="the high-water mark is Linux's")
 def test_memory_is_that_of_the_pass() -> None:
     """A way that holds forty more megabytes, for a moment, is seen, whatever was freed before."""
@@ -145,6 +147,7 @@ def test_maps_are_blended_as_colours_are_and_the_variance_is_arbitrary(folder: P
     assert torch.equal(uncertainty.variance_of(run), variances)  # the heads are as they were
 
 
+@pytest.mark.slow
 def test_uncertainty_and_cross_leave_what_they_say(folder: Path, tmp_path: Path) -> None:
     words = [*words_of(folder, tmp_path), "--side-by-side"]
     assert uncertainty.main([*words, "--frames", "2"]) == 0

@@ -53,6 +53,7 @@ def test_a_table_is_a_sweep_that_can_be_read(name: str, tmp_path: Path) -> None:
     assert {load_config(job.overrides).data.size for job in spec.jobs} == {64}
 
 
+@pytest.mark.slow
 def test_a_table_holds_what_was_measured_and_is_not_made_twice(tmp_path: Path) -> None:
     write_tracked_folder(tmp_path / "someone", frames=12, size=32)
     out = tmp_path / "out"

@@ -76,15 +76,16 @@ print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize(
     "overrides",
     [
         (*PAPER, "model.uv_size=256", "model.mlp_width=256", "model.mlp_layers=4"),  # activations
-        ("model.uv_size=256", "model.latent_dim=64"),  # HyperGaussians, which are largest while they are saved
-        ("model.mlp_width=2048", "model.mlp_layers=6"),  # the network, likewise
-        ("model=covariance", "model.uv_size=256", "model.latent_dim=12"),
-        ("model=ndgs", "model.uv_size=256", "model.latent_dim=40"),
+        ("model.uv_size=128", "model.latent_dim=50"),  # HyperGaussians, which are largest while they are saved
+        ("model.mlp_width=1800", "model.mlp_layers=5"),  # the network, likewise
+        ("model=covariance", "model.uv_size=200", "model.latent_dim=8"),
+        ("model=ndgs", "model.uv_size=160", "model.latent_dim=30"),
     ],
     ids=["activations", "heads", "network", "covariances", "n-dimensional"],
 )

@@ -212,6 +212,7 @@ def _turned(folder: Path) -> Path:
     return folder / "v.mp4"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TAKEN)
 def test_taken_and_said(name: str, tmp_path: Path, tracking_models: None) -> None:
     case = TAKEN[name]

@@ -120,6 +120,7 @@ def test_large_pictures_are_learned_at_the_size_at_which_they_are_matted(monkeyp
     assert made.shape == (SIZE, SIZE) and made.dtype == np.uint8
 
 
+@pytest.mark.slow
 def test_mattes_of_a_demo_person_come_nearer_to_the_truth() -> None:
     """By a network that knows the outline to a pixel of 96 and closes its gaps."""
     size, seed = 384, 1
