@@ -34,7 +34,7 @@ from avatar.kernels.start import watched
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
-from avatar.pose_refinement.parameterization import find_freedom
+from avatar.pose_refinement.parameterization import find_parameterization
 from avatar.render import Renderer
 from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera
@@ -147,8 +147,11 @@ class Rehearsal:
         alignment = Alignment(
             self.avatar, cast(Subject, SimpleNamespace(recording=recording, split=recording.split)), self.config
         )
-        freedom = find_freedom(recording.tracks, recording.split.train, torch.zeros(3))
-        moves = {"moves": torch.zeros(len(recording), len(freedom.index)), "factor": torch.eye(len(freedom.index))}
+        parameterization = find_parameterization(recording.tracks, recording.split.train, torch.zeros(3))
+        moves = {
+            "moves": torch.zeros(len(recording), len(parameterization.index)),
+            "factor": torch.eye(len(parameterization.index)),
+        }
         alignment.load({f"align.{name}": value for name, value in (moves | {"is_over": torch.zeros(())}).items()})
         with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
             for _ in range(2):

@@ -36,7 +36,7 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import psnr
 from avatar.model import Avatar
-from avatar.motion.statistics import learn_repertoire
+from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
@@ -122,7 +122,7 @@ def measure(
         own = tracking_bias(TARGET_SEED, NEUTRAL_BIAS).expression
         rows = []
         for tracking, avatar, recording in avatars(target, assets, config, Path(scratch), trackings):
-            statistics = learn_repertoire(recording.motion(target.split.train), avatar.head)
+            statistics = learn_statistics(recording.motion(target.split.train), avatar.head)
             motions = {mode: transfer_motion(tracked, statistics, mode, driver_head).motion for mode in TRANSFERS}
             motions[CEILING] = [replace(params, expression=params.expression + own) for params in true]
             renderer = Renderer(avatar, torch.tensor(config.data.background))

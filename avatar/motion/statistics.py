@@ -20,13 +20,13 @@ class MotionStatistics:
     expressions: ExpressionSpace
 
 
-def learn_repertoire(
+def learn_statistics(
     training: Sequence[HeadParams], head: HeadModel, neutral: RestPose | None = None
 ) -> MotionStatistics:
-    """The repertoire of the frames that an avatar is trained on; `head` has their person's identity.
+    """The statistics of the frames that an avatar is trained on; `head` has their person's identity.
 
     The neutral face is searched for among the frames where it is not given. Raises ValueError when there is no frame.
     """
     if not training:
-        raise ValueError("a repertoire needs training frames, got none")
+        raise ValueError("motion statistics need training frames, got none")
     return MotionStatistics(neutral or find_neutral(training, head), find_mean(training), fit_expressions(training))

@@ -35,7 +35,7 @@ class Problem:
 
     given: HeadPose
     targets: Sequence[Target]  # by level, full size first
-    frame: int  # of the freedom
+    frame: int  # of the parameterization
     parameterization: PoseParameterization
 
 

@@ -19,7 +19,7 @@ from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.model import Avatar
 from avatar.motion.rest import RestPose
-from avatar.motion.statistics import MotionStatistics, learn_repertoire
+from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_portrait
 from avatar.runs.inputs import checked_camera, checked_params
@@ -67,7 +67,7 @@ class TrainedAvatar:
     @cached_property
     def statistics(self) -> MotionStatistics:
         """Rests and expressions of the training frames."""
-        return learn_repertoire(self.recording.motion(self.recording.split.train), self.avatar.head, self.neutral)
+        return learn_statistics(self.recording.motion(self.recording.split.train), self.avatar.head, self.neutral)
 
     def rest_camera(self, size: int | None = None) -> Camera:
         """The camera of the neutral face, `size` pixels wide; by default as in training."""

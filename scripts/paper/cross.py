@@ -99,10 +99,10 @@ def farthest(expressions: Tensor, count: int) -> list[int]:
 def drive(trained: TrainedAvatar, name: str, driver: Subject, chosen: Sequence[int]) -> Driven:
     motion = subject_drive(driver, trained.config.data.size)
     head = HeadModel(trained.assets, motion.identity)
-    moved, _, _ = transfer_motion(motion.params, trained.repertoire, DEFAULT_CHOICES.transfer, head)
+    moved, _, _ = transfer_motion(motion.params, trained.statistics, DEFAULT_CHOICES.transfer, head)
     cameras = choose_cameras(motion, trained.rest_camera(), DEFAULT_CHOICES.camera, DEFAULT_CHOICES.intrinsics)
     renders = [as_bytes(trained.render(moved[i], cameras[i]).image) for i in chosen]
-    distances = trained.repertoire.expressions.distances(moved).numpy()
+    distances = trained.statistics.expressions.distances(moved).numpy()
     return Driven(driver.name, name, [motion.names[i] for i in chosen], distances, list(chosen), renders)
 
 

@@ -35,7 +35,7 @@ OPEN_BY_THEMSELVES = {
     "avatar/bench/splat_work.py",
     "avatar/compute/memory.py",
     "avatar/data/tensor_file.py",
-    "avatar/doctor.py",
+    "avatar/commands/doctor.py",
     "avatar/evaluation/verify.py",
     "avatar/export/landmarker_pack.py",
     "avatar/export/web_page.py",

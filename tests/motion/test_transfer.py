@@ -10,7 +10,7 @@ from heads import grid_head, rest_params
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.expression_space import fit_expressions
 from avatar.motion.rest import RestPose, find_mean, find_neutral
-from avatar.motion.statistics import MotionStatistics, learn_repertoire
+from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.motion.transfer import TRANSFERS, departed, transfer_motion
 from avatar.pose_refinement.motion import rotation
 from avatar.types import HeadParams
@@ -41,7 +41,7 @@ REST_A, REST_B = torch.tensor([0.4, 0, 0.2, 0, 0]), torch.tensor([0, -0.3, 0, 0.
 
 
 def learned(motion: list[HeadParams]) -> MotionStatistics:
-    return learn_repertoire(motion, HEAD)
+    return learn_statistics(motion, HEAD)
 
 
 def test_the_neutral_is_found_and_the_mean_is_not_it() -> None:

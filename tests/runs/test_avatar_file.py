@@ -89,7 +89,7 @@ def test_the_neutral_frame_is_counted_among_those_of_the_training(trained: Train
         assert torch.equal(getattr(one.rest_camera(), name), getattr(one.recording.camera(8), name))
 
 
-def test_a_repertoire_is_that_of_the_training_frames(trained: TrainedAvatar) -> None:
+def test_motion_statistics_are_of_the_training_frames(trained: TrainedAvatar) -> None:
     one = later(trained)
     training = one.recording.motion(one.recording.split.train)
     assert torch.equal(one.statistics.mean.expression, find_mean(training).expression)

@@ -78,7 +78,7 @@ def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, stage: St
     assert Stage(trained).overlays == ("none", "mesh")
 
 
-def test_the_distance_is_that_of_the_repertoire(stage: Stage, trained: TrainedAvatar) -> None:
+def test_the_distance_is_that_of_the_motion_statistics(stage: Stage, trained: TrainedAvatar) -> None:
     rest = trained.rest_params()
     far = replace(rest, expression=rest.expression + 20)
     own = trained.statistics.expressions.distances([trained.recording.params(3)])
