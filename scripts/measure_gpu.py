@@ -32,7 +32,7 @@ from avatar.splat import gpu_draw, splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.train.step import Objective, PerceptualTerm, Weighted
-from avatar.train.step_runner import WARM, Steps
+from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Gaussians
 
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # mean over the pixels, of a field's norm; cut-offs may decide a pixel
@@ -121,7 +121,7 @@ class Replays:
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.rehearsal = rehearsal
         objective = Objective(rehearsal.trainer, rehearsal.background, STAND_IN)
-        self.steps = Steps(rehearsal.avatar, rehearsal.optimizer, objective)
+        self.steps = StepRunner(rehearsal.avatar, rehearsal.optimizer, objective)
 
     def train(self, late: bool) -> None:
         r = self.rehearsal

@@ -18,14 +18,14 @@ from avatar.splat.sh import C0
 from avatar.train.step import stopped
 from avatar.types import Frame
 
-WHEN = 0.8  # share of the steps: in those after it others take over what strays covered with reason
+WHEN = 0.8  # share of the steps: in those after it other Gaussians take over what the hidden ones covered
 FRAMES = 24
 LEAST_COVERAGE = 0.01  # pixels, mean over the frames: what covers less is not seen over any background
 HIDDEN = -10.0  # logit of an opacity below which no splat is drawn
 
 
 def prune_step(config: TrainerConfig) -> int | None:
-    """After how many steps strays are removed; None: never."""
+    """After how many steps background Gaussians are pruned; None: never."""
     return round(WHEN * config.iterations) if config.prune_share > 0 else None
 
 
