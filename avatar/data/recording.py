@@ -54,8 +54,10 @@ class Recording:
         """(width, height) of the frames when the width is resized to `size` pixels; None keeps the video's size."""
         if size is None:
             return self.width, self.height
-        if size < 1 or size != int(size):
-            raise ValueError(f"size must be at least 1 pixel, and a whole number, got {size}")
+        if size < 1:
+            raise ValueError(f"size must be at least 1 pixel, got {size}")
+        if size != int(size):
+            raise ValueError(f"size must be a whole number of pixels, got {size}")
         return size, max(1, round(size * self.height / self.width))
 
     def camera(self, index: int, size: int | None = None) -> Camera:
