@@ -94,9 +94,9 @@ class TrainerConfig:
     prune_share: Annotated[
         float, SHARE, "Gaussians whose rendered coverage lies less than this share on the head are pruned; 0: none"
     ] = 0.05
-    align_rate: Annotated[
-        float, SHARE, "share of a Gauss-Newton step that moves a frame's tracking in its training step; 0: fixed"
-    ] = 0.25
+    pose_rate: Annotated[
+        float, SHARE, "learning rate of the training frames' pose corrections, in half degrees and millimetres; 0: none"
+    ] = 0.01
     condition_noise: Annotated[
         float, SHARE, "noise on the network's input, as a share of each coefficient's standard deviation"
     ] = 0.2

@@ -38,7 +38,7 @@ from avatar.losses.photometric import dssim
 from avatar.splat import splat
 from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera, head_shell
-from avatar.train.step import PerceptualTerm, Weighted
+from avatar.train.objective import PerceptualTerm, Weighted
 from avatar.types import Gaussians
 
 TARGETS = {

@@ -13,8 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 from unittest.mock import patch
 
 import torch
@@ -23,10 +22,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from avatar.config import load_config
-from avatar.data.loader import FrameLoader
-from avatar.data.recording import Recording
-from avatar.data.split import Split
-from avatar.data.subject import Subject
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
@@ -34,14 +29,15 @@ from avatar.kernels.start import watched
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
-from avatar.pose_refinement.parameterization import find_parameterization
 from avatar.render import Renderer
 from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera
-from avatar.train.align import Alignment
-from avatar.train.optimizer import make_optimizer
-from avatar.train.step import SPARSE_EVERY, Objective, PerceptualTerm, Weighted, training_step
+from avatar.train.objective import SPARSE_EVERY, Objective, PerceptualTerm, Weighted
+from avatar.train.optimizer import make_optimizer, schedule, set_rates
+from avatar.train.pose_corrections import make_pose_corrections
+from avatar.train.step import Trainee, train_step
 from avatar.train.step_monitor import Guard
+from avatar.train.step_runner import StepRunner
 from avatar.types import IDENTITY_6D, Frame, HeadParams
 
 META = torch.device("meta")
@@ -111,7 +107,8 @@ class Rehearsal:
         self.avatar = avatar.to(device)
         self.config, self.trainer = config, config.trainer
         with patch("torch.optim.adam._device_dtype_check_for_fused"):  # it knows no meta device
-            self.optimizer = make_optimizer(self.avatar, config.trainer)
+            self.corrections = make_pose_corrections(self.avatar, 2, config.trainer)
+            self.optimizer = make_optimizer(self.avatar, config.trainer, self.corrections)
         self.guard = Guard(self.optimizer, device)
         self.background = torch.ones(3, device=device)
         rest = torch.tensor(IDENTITY_6D)
@@ -120,7 +117,8 @@ class Rehearsal:
         planes = [torch.rand(size, size, *channels, device=device) for channels in ((3,), (), (), ())]
         box = slice(size // 8, size), slice(size // 4, 3 * size // 4)
         self.frame = Frame(0, "rehearsed", self.camera, self.params, *planes, head_box=box)
-        self.vertices = self.avatar.vertices(self.params)
+        self.steps = StepRunner(self.trainee(PerceptualTerm("none")))
+        self.steps.pose([self.frame])
         self.lpips = Lpips("squeeze").on(device)
 
     def step(self, perceptual: PerceptualTerm, late: bool) -> Counter[str]:
@@ -132,61 +130,17 @@ class Rehearsal:
         return launches
 
     def train(self, perceptual: PerceptualTerm, late: bool) -> None:
+        step = self.number(late)
+        set_rates(self.optimizer, schedule(step, self.trainer))
+        train_step(self.trainee(perceptual), step, self.steps.inputs(step, self.frame), self.guard.judge)
+
+    def trainee(self, perceptual: PerceptualTerm) -> Trainee:
         objective = Objective(self.trainer, self.background, perceptual)
-        step = objective, self.number(late), self.frame, self.vertices
-        training_step(self.avatar, self.optimizer, *step, self.guard.judge)
+        return Trainee(self.avatar, self.optimizer, objective, self.corrections)
 
     def number(self, late: bool) -> int:
         """Of a step in the second half, or in the first."""
         return self.trainer.iterations - SPARSE_EVERY if late else self.trainer.iterations // 4
-
-    def moving(self, perceptual: PerceptualTerm) -> Counter[str]:
-        """What a step launches that moves its frame's tracking."""
-        objective, number = Objective(self.trainer, self.background, perceptual), self.trainer.iterations // 4 + 1
-        recording = self.recording()
-        alignment = Alignment(
-            self.avatar, cast(Subject, SimpleNamespace(recording=recording, split=recording.split)), self.config
-        )
-        parameterization = find_parameterization(recording.tracks, recording.split.train, torch.zeros(3))
-        moves = {
-            "moves": torch.zeros(len(recording), len(parameterization.index)),
-            "factor": torch.eye(len(parameterization.index)),
-        }
-        alignment.load({f"align.{name}": value for name, value in (moves | {"is_over": torch.zeros(())}).items()})
-        with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
-            for _ in range(2):
-                with counting() as launches:
-                    seen = alignment.see(number, self.frame, cast(FrameLoader, None), print)
-                    step = objective, number, seen.frame, seen.vertices, self.guard.judge, seen.watched
-                    training_step(self.avatar, self.optimizer, *step)
-                    alignment.learn(seen, self.guard.is_nonfinite)
-        return launches
-
-    def recording(self) -> Recording:
-        """Of a few frames in which the whole face moves."""
-        frames, rest, camera = 4, torch.tensor(IDENTITY_6D), self.camera
-        tracks = {
-            "expression": torch.rand(frames, len(self.params.expression)),
-            "jaw": rest.repeat(frames, 1),
-            "eyes": rest.repeat(frames, 2),
-            "eyelids": torch.rand(frames, 2),
-            "neck": rest.repeat(frames, 1),
-            "R": camera.R_cam_world.repeat(frames, 1, 1),
-            "t": camera.t_cam_world.repeat(frames, 1),
-            "shape": torch.zeros(1),
-        }
-        return Recording(
-            name="rehearsed",
-            fps=25.0,
-            width=camera.width,
-            height=camera.height,
-            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-            names=tuple(map(str, range(frames))),
-            split=Split(tuple(range(frames)), ()),
-            tracks=tracks,
-            data_hash="",
-            head_fingerprint=self.avatar.head.assets.fingerprint,
-        )
 
     def rendered(self) -> Counter[str]:
         renderer = Renderer(self.avatar, self.background)
@@ -205,7 +159,6 @@ def count_all(assets: HeadAssets, uv_size: int, size: int) -> dict[str, Counter[
         "step with LPIPS (each tenth of the second half)": rehearsal.step(
             PerceptualTerm("lpips", lpips, SPARSE_EVERY, stand_in), late=True
         ),
-        "step that moves its frame": rehearsal.moving(PerceptualTerm("dssim", stand_in)),
         "rendered frame": rehearsal.rendered(),
     }
 

@@ -31,7 +31,7 @@ from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
-from avatar.train.step import Objective, PerceptualTerm, Weighted
+from avatar.train.objective import PerceptualTerm, Weighted
 from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Gaussians
 
@@ -120,12 +120,11 @@ class Replays:
 
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.rehearsal = rehearsal
-        objective = Objective(rehearsal.trainer, rehearsal.background, STAND_IN)
-        self.steps = StepRunner(rehearsal.avatar, rehearsal.optimizer, objective)
+        self.steps = StepRunner(rehearsal.trainee(STAND_IN))
 
     def train(self, late: bool) -> None:
         r = self.rehearsal
-        self.steps.make(r.number(late), r.frame, r.guard.judge, r.guard.is_nonfinite)
+        self.steps.make(r.number(late), r.frame, r.guard.judge)
 
 
 def check_replays(make: Callable[[], Rehearsal]) -> str:

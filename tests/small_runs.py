@@ -16,7 +16,7 @@ from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
 from avatar.runs.checkpoint import Checkpoint
 from avatar.runs.run import start_run
-from avatar.train.step import choose_perceptual
+from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
 from data_prep.prepare.open import open_subject
 

@@ -16,7 +16,7 @@ from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
 from avatar.model import SH_DEGREE
 from avatar.train import optimizer
-from avatar.train.step import perceptual_start
+from avatar.train.objective import perceptual_start
 
 
 def test_the_papers_recipe() -> None:
@@ -85,7 +85,7 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "trainer.dssim_weight": (0.2, 0.05),
         "trainer.dssim_early": (0.1, 0.0),
         "trainer.prune_share": (0.05, 0.0),
-        "trainer.align_rate": (0.25, 0.0),
+        "trainer.pose_rate": (0.01, 0.0),
         "trainer.condition_noise": (0.2, 0.0),
     }
 
@@ -207,7 +207,7 @@ def test_a_background_may_be_written_as_people_write_colours(written: str, colou
         ("trainer.iterations=1e3", "trainer.iterations", 1000),
         ("trainer.iterations='5'", "trainer.iterations", 5),
         ("trainer.seed=010", "trainer.seed", 10),
-        ("trainer.align_rate=1", "trainer.align_rate", 1.0),
+        ("trainer.pose_rate=1", "trainer.pose_rate", 1.0),
         ("data.size=null", "data.size", None),
         ("data.size=~", "data.size", None),
         ("trainer.perceptual=none", "trainer.perceptual", "none"),

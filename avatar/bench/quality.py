@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.train import Trainee, per_step, run_steps, steps_at_once, trainee
+from avatar.bench.train import Learner, make_learner, per_step, run_steps, steps_at_once
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.evaluation.lpips_networks import find_lpips
@@ -24,7 +24,7 @@ from avatar.pipeline.open import open_run
 from avatar.render import Renderer
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run
-from avatar.train.step import perceptual_start
+from avatar.train.objective import perceptual_start
 from avatar.types import Frame
 
 
@@ -72,7 +72,7 @@ def measure(
     for run in runs:
         if run.subject.data_hash != runs[0].subject.data_hash:
             raise UserError(f"{run.path} was trained on other data than {runs[0].path}; compare runs of one subject")
-    learners = [trainee(run.avatar, run.subject, run.config, say, run.trained.perceptual) for run in runs]
+    learners = [make_learner(run.avatar, run.subject, run.config, say, run.trained.perceptual) for run in runs]
     times = time_steps(learners, repeats)
     network, note = find_lpips("vgg")
     say(f"LPIPS: {note}")
@@ -92,7 +92,7 @@ def measure(
     return curves
 
 
-def time_steps(learners: Sequence[Trainee], repeats: int) -> list[tuple[Time, Time]]:
+def time_steps(learners: Sequence[Learner], repeats: int) -> list[tuple[Time, Time]]:
     """Milliseconds of an early and a late step of each, taken in turns."""
     steps: dict[tuple[int, bool], Callable[[], object]] = {}
     for index, learner in enumerate(learners):
@@ -105,7 +105,7 @@ def time_steps(learners: Sequence[Trainee], repeats: int) -> list[tuple[Time, Ti
     ]
 
 
-def minutes_of(learner: Trainee, step: int, early: Time, late: Time) -> float:
+def minutes_of(learner: Learner, step: int, early: Time, late: Time) -> float:
     trainer = learner.config.trainer
     before = min(step, perceptual_start(trainer))
     return (before * early.median + (step - before) * late.median) / 60_000

@@ -31,13 +31,12 @@ from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
-from avatar.pipeline.plan import round_steps
+from avatar.pipeline.plan import WITH_REFINEMENT, round_steps
 from avatar.pose_refinement.motion import EXPRESSION, values_of
 from avatar.pose_refinement.refine import refine_subject
 from avatar.render import Renderer
-from avatar.train.align import WITH_REFINEMENT
+from avatar.train.objective import choose_perceptual
 from avatar.train.order import planned_steps, within_passes
-from avatar.train.step import choose_perceptual
 from avatar.train.trainer import train
 from data_prep.prepare.open import find_head, open_subject
 

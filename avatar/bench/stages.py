@@ -17,7 +17,7 @@ from avatar.gaussians.skull_binding import bind_to_skull
 from avatar.losses.photometric import PhotometricLoss
 from avatar.model import Avatar
 from avatar.train.optimizer import schedule, set_rates
-from avatar.train.step import Objective, check_step
+from avatar.train.step import Trainee, check_step, gradients_of
 from avatar.types import Frame, Gaussians
 
 
@@ -44,10 +44,10 @@ class Link:
 
 
 class StagedStep:
-    """A training step of `avatar`, stage by stage; the same operations in the same order as `training_step`."""
+    """A training step of `avatar`, stage by stage: the operations of `train_step`, without pose corrections."""
 
-    def __init__(self, avatar: Avatar, optimizer: torch.optim.Adam, objective: Objective) -> None:
-        self.avatar, self.optimizer, self.objective = avatar, optimizer, objective
+    def __init__(self, trainee: Trainee) -> None:
+        self.avatar, self.optimizer, self.objective = trainee.avatar, trainee.optimizer, trainee.objective
         self.watch = Stopwatch()
         self._chain: list[Link] = []
 
@@ -80,7 +80,7 @@ class StagedStep:
             base if avatar.skull_logits is None else [*base, avatar.skull_logits],
         )
         (image,) = self._forward(
-            "splat", lambda *g: (objective.draw(step, frame, Gaussians(*g), avatar),), list(gaussians)
+            "splat", lambda *g: (objective.draw(step, Gaussians(*g), frame.camera, avatar),), list(gaussians)
         )
         loss: list[PhotometricLoss] = []
 
@@ -91,7 +91,7 @@ class StagedStep:
         self._forward("loss", compare, [image])
         watch.measure("backward: clearing", self.optimizer.zero_grad)
         self._backward()
-        watch.measure("check", lambda: check_step(step, frame, loss[0], avatar))
+        watch.measure("check", lambda: check_step(step, frame, loss[0], gradients_of(avatar)))
         set_rates(self.optimizer, schedule(step, objective.config))
         watch.measure("optimizer", self.optimizer.step)
         return loss[0]

@@ -23,10 +23,10 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
-from avatar.pose_refinement.frame_fitter import FrameFitter
-from avatar.train.aligned_frame import moving_step
+from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
-from avatar.train.step import Judge, Objective, choose_perceptual, perceptual_start
+from avatar.train.pose_corrections import make_pose_corrections
+from avatar.train.step import Judge, Trainee
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Frame
@@ -54,24 +54,21 @@ class Row:
 
 
 @dataclass
-class Trainee:
-    """An avatar in training, as far as a step needs it."""
+class Learner:
+    """An avatar in training and some frames."""
 
     config: Config
-    avatar: Avatar
-    optimizer: torch.optim.Adam
-    objective: Objective
+    trainee: Trainee
     frames: Iterator[Frame]
     steps: StepRunner
-    fitter: FrameFitter
     judge: Judge | None  # None: every step is checked at once
 
-    def step(self, number: int, moves: bool = False) -> None:
-        frame = next(self.frames)
-        if moves:
-            moving_step(self.fitter, self.optimizer, self.objective, number, frame, self.judge)
-        else:
-            self.steps.make(number, frame, self.judge)
+    @property
+    def avatar(self) -> Avatar:
+        return self.trainee.avatar
+
+    def step(self, number: int) -> None:
+        self.steps.make(number, next(self.frames), self.judge)
 
 
 def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:
@@ -79,7 +76,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     folder, overrides = request.inputs[0], [*(QUICK if request.quick else ()), *request.overrides]
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     subject, assets = open_subject(source, split_sizes(load_config(overrides)), say)
-    trainees = {}
+    learners = {}
     for recipe, own in RECIPES.items():
         config = load_config([*own, *overrides])
         torch.manual_seed(config.trainer.seed)
@@ -87,9 +84,9 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
         with torch.no_grad():  # opacities as after training: what is drawn decides what drawing costs
             avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
         avatar.to(torch.device(request.device))
-        trainees[recipe] = trainee(avatar, subject, config, say if recipe == "paper" else silent)
+        learners[recipe] = make_learner(avatar, subject, config, say if recipe == "paper" else silent)
     steps: dict[tuple[str, bool], Callable[[], object]] = {}
-    for recipe, learner in trainees.items():
+    for recipe, learner in learners.items():
         for late in (False, True):
             steps[recipe, late] = lambda learner=learner, late=late: run_steps(learner, late)
     with own_stream(torch.device(request.device)):
@@ -105,13 +102,13 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
             {} if on_gpu(learner.avatar.code) else stages(learner, subject, repeats),
             {} if on_gpu(learner.avatar.code) else floors(learner.avatar),
         )
-        for recipe, learner in trainees.items()
+        for recipe, learner in learners.items()
     ]
 
 
-def trainee(
+def make_learner(
     avatar: Avatar, subject: Subject, config: Config, say: Callable[[str], None], perceptual: str | None = None
-) -> Trainee:
+) -> Learner:
     """The avatar with a few decoded frames that are spread over the training split, all where the avatar is.
 
     `perceptual` is the recorded term of a run, which its steps are timed with; None chooses as a new run would.
@@ -124,34 +121,33 @@ def trainee(
         frames = list(loader.frames(chosen))
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
-    optimizer = make_optimizer(avatar, config.trainer)
-    fitter = FrameFitter(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0).to(device))
+    corrections = make_pose_corrections(avatar, len(train), config.trainer)
+    optimizer = make_optimizer(avatar, config.trainer, corrections)
+    trainee = Trainee(avatar, optimizer, objective, corrections)
     judge = Guard(optimizer, device).judge if is_gpu else None
-    steps = StepRunner(avatar, optimizer, objective, say=say)
+    steps = StepRunner(trainee, rows={index: row for row, index in enumerate(train)}, say=say)
     steps.pose(frames)
-    return Trainee(config, avatar, optimizer, objective, cycle(frames), steps, fitter, judge)
+    return Learner(config, trainee, cycle(frames), steps, judge)
 
 
 def silent(_: str) -> None:
     """What was said for one recipe holds for the other."""
 
 
-def steps_at_once(learner: Trainee) -> int:
+def steps_at_once(learner: Learner) -> int:
     """So many steps hold one with the perceptual term."""
-    return learner.objective.perceptual.every
+    return learner.trainee.objective.perceptual.every
 
 
-def run_steps(learner: Trainee, late: bool) -> None:
-    """One step with all degrees of colour but before the perceptual term, which moves its frame's tracking if any does; or
-    the last ones, as many as hold one with it."""
+def run_steps(learner: Learner, late: bool) -> None:
+    """One step with all degrees of colour but before the perceptual term; or the last ones, as many as hold one with it."""
     iterations = learner.config.trainer.iterations
     if late:
         first = iterations // steps_at_once(learner) * steps_at_once(learner)
         for number in range(first, first + steps_at_once(learner)):
             learner.step(number)
     else:
-        moves = learner.config.trainer.align_rate > 0
-        learner.step(perceptual_start(learner.config.trainer) - 1, moves)
+        learner.step(perceptual_start(learner.config.trainer) - 1)
     settle(learner.avatar.code.device)
 
 
@@ -159,8 +155,8 @@ def per_step(time: Time, steps: int) -> Time:
     return Time(time.median / steps, time.p95 / steps, time.repeats)
 
 
-def stages(learner: Trainee, subject: Subject, repeats: int) -> dict[str, Time]:
-    staged = StagedStep(learner.avatar, learner.optimizer, learner.objective)
+def stages(learner: Learner, subject: Subject, repeats: int) -> dict[str, Time]:
+    staged = StagedStep(learner.trainee)
     size = learner.config.data.size
     pixels = [
         (frame.index, subject.pixels(frame.index, size)) for frame in (next(learner.frames) for _ in range(FRAMES))

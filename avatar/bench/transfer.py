@@ -39,8 +39,8 @@ from avatar.model import Avatar
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.pipeline.open import split_sizes
+from avatar.pipeline.plan import WITH_REFINEMENT
 from avatar.render import Renderer
-from avatar.train.align import WITH_REFINEMENT
 from avatar.types import Camera, HeadParams
 from data_prep.prepare.open import open_subject
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Generic, TypeVar
 
@@ -20,24 +20,26 @@ class Replay(Generic[Made]):
     own (`own_stream`), on which it has run before. Where there is no GPU it is called at each start instead, for tests.
     """
 
-    def __init__(self, function: Callable[[Sequence[Tensor]], Made], inputs: Sequence[Tensor]) -> None:
-        self._buffers = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in inputs]
+    def __init__(self, function: Callable[[Mapping[str, Tensor]], Made], inputs: Mapping[str, Tensor]) -> None:
+        self._buffers = {
+            name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in inputs.items()
+        }
         self._function = function
         self._graph: torch.cuda.CUDAGraph | None = None
-        if self._buffers[0].is_cuda:
+        if next(iter(self._buffers.values())).is_cuda:
             graph = torch.cuda.CUDAGraph()
             # Other threads, which decode frames, may do what they like.
             with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
                 self._made = function(self._buffers)
             self._graph = graph
 
-    def __call__(self, inputs: Sequence[Tensor]) -> Made:
-        """With tensors of the shapes, types and device of the first ones."""
-        fast = [(ours, given) for ours, given in zip(self._buffers, inputs, strict=True) if ours.dtype == torch.float32]
-        torch._foreach_copy_([ours for ours, _ in fast], [given for _, given in fast])  # pyright: ignore
-        for ours, given in zip(self._buffers, inputs, strict=True):
-            if ours.dtype != torch.float32:
-                ours.copy_(given)
+    def __call__(self, inputs: Mapping[str, Tensor]) -> Made:
+        """With tensors of the names, shapes, types and device of the first ones."""
+        by_type: dict[torch.dtype, list[tuple[Tensor, Tensor]]] = {}
+        for name, buffer in self._buffers.items():
+            by_type.setdefault(buffer.dtype, []).append((buffer, inputs[name]))
+        for copies in by_type.values():
+            torch._foreach_copy_(*map(list, zip(*copies, strict=True)))  # pyright: ignore
         if self._graph is None:
             return self._function(self._buffers)
         self._graph.replay()

@@ -20,13 +20,14 @@ from avatar.files.opening import read_json
 from avatar.pipeline.open import split_sizes
 from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
-from avatar.train.align import WITH_REFINEMENT
 from avatar.train.cost_estimate import measure_cost
+from avatar.train.objective import choose_perceptual
 from avatar.train.order import within_passes
-from avatar.train.step import choose_perceptual
 from data_prep.prepare.open import open_subject
 
 ROUNDS_FOLDER = "rounds"
+# Training between rounds of refinement, which moves every frame and farther; before the user's own overrides.
+WITH_REFINEMENT = ("trainer.pose_rate=0", "trainer.condition_noise=0")
 PLAN_FORMAT = 1
 LEAST_STEPS = 500  # fewer make no avatar
 # An avatar that tells where a head is has seen each training frame some times; later it learns the errors of each frame's

@@ -24,8 +24,8 @@ from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
+from avatar.train.objective import PerceptualTerm, choose_perceptual
 from avatar.train.order import within_passes
-from avatar.train.step import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import save_avatar, train
 from data_prep.prepare.open import open_subject
 

@@ -40,20 +40,10 @@ class Problem:
 
 
 @torch.no_grad()
-def curvature(
-    fitter: FrameFitter,
-    problem: Problem,
-    level: int,
-    moves: Float[Tensor, " F"] | None = None,
-    weight: Float[Tensor, "h w"] | None = None,
-) -> Float[Tensor, "F F"]:
-    """J^T J of the misfit in the frame's moves, each pixel weighted as the Huber loss weights it.
-
-    moves    where; None: at the given tracking
-    weight   of the pixels besides; None: all are one
-    """
+def curvature(fitter: FrameFitter, problem: Problem, level: int) -> Float[Tensor, "F F"]:
+    """J^T J of the misfit in the frame's moves at the given tracking, pixels weighted as the Huber loss weights them."""
     target, parameterization = problem.targets[level], problem.parameterization
-    moves = torch.zeros(len(parameterization.index), device=parameterization.unit.device) if moves is None else moves
+    moves = torch.zeros(len(parameterization.index), device=parameterization.unit.device)
 
     def picture(moves: Tensor) -> Tensor:
         return fitter.picture(parameterization.values(problem.frame, moves), problem.given, target)
@@ -61,8 +51,6 @@ def curvature(
     before = picture(moves)
     error = (before - target.picture).abs()
     root = torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt()
-    if weight is not None:
-        root = root * weight.sqrt()[..., None]
     probes = PROBE * torch.eye(len(moves), dtype=torch.float64, device=moves.device)
     columns = [
         ((picture((moves.double() + probe).to(moves.dtype)) - before) * root).flatten() / PROBE for probe in probes

@@ -164,15 +164,11 @@ class _Work:
         return hashlib.sha256(repr(choices).encode()).hexdigest()
 
     def pose(self, frame: int) -> HeadPose:
-        return self.given(frame).on(self.device)
-
-    def given(self, frame: int) -> HeadPose:
-        """On the CPU, where cameras are."""
-        return HeadPose(self.tracks["R"][frame], self.tracks["t"][frame])
+        return HeadPose(self.tracks["R"][frame], self.tracks["t"][frame]).on(self.device)
 
     def targets(self, frame: int, levels: int) -> list[Target] | None:
         made = targets(self.subject.frame(frame, self.size), self.background, levels)
-        return made if made is None else [target.on(self.device, self.given(frame)) for target in made]
+        return made if made is None else [target.on(self.device) for target in made]
 
     def factors(self, matrices: Sequence[Float[Tensor, "F F"]]) -> list[Float[Tensor, "F F"]]:
         """Lower Cholesky factors, where the avatar is."""

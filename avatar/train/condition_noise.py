@@ -1,22 +1,17 @@
-"""Noise on what the network is told of a training frame.
+"""Noise on the network's input in training.
 
-Expressions of a tracker err, and a network that takes them at their word learns the errors by heart: of expressions that it
-has not seen it then makes too much. The mesh, which is posed already, stays where it is.
+Tracked expressions err, and without noise the network overfits their errors. The posed mesh gets no noise.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import to_device
 from avatar.config import TrainerConfig
 from avatar.data.recording import Recording
-from avatar.types import Frame
 
 _STREAM = 1  # of random numbers, beside that of the frames' order
 
@@ -29,20 +24,12 @@ class ConditionNoise:
         self._deviations = share / len(conditions) ** 0.5 * centred
         self._seed = seed
 
-    def on(self, step: int, frame: Frame) -> Frame:
-        """The frame as step `step` (from 0) tells the network of it: a function of seed and step."""
-        return noisy(frame, to_device(self.of(step), frame.params.expression.device))
-
     def of(self, step: int) -> Float[Tensor, " C"]:
-        """What is added in step `step`; on the CPU."""
+        """What is added in step `step` (from 0): a function of seed and step; on the CPU."""
         generator = np.random.default_rng([self._seed, step, _STREAM])
         # A sum of deviations with weights that are independent and normal has their covariance.
         weights = generator.standard_normal(len(self._deviations), dtype=np.float32)
         return torch.from_numpy(weights) @ self._deviations
-
-
-def noisy(frame: Frame, noise: Float[Tensor, " C"]) -> Frame:
-    return replace(frame, params=frame.params.with_condition(frame.params.condition() + noise))
 
 
 def make_noise(recording: Recording, config: TrainerConfig) -> ConditionNoise | None:

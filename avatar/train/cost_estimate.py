@@ -15,11 +15,11 @@ from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.model import Avatar
-from avatar.pose_refinement.frame_fitter import FrameFitter
-from avatar.train.align import MOVING_SHARE
-from avatar.train.aligned_frame import moving_step
+from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
-from avatar.train.step import Objective, choose_perceptual, perceptual_start, training_step
+from avatar.train.pose_corrections import make_pose_corrections
+from avatar.train.step import Trainee
+from avatar.train.step_runner import StepRunner
 from avatar.types import Frame
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
@@ -53,29 +53,23 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     """
     torch.manual_seed(config.trainer.seed)
     avatar = Avatar(assets, identity, config.model)
-    optimizer = make_optimizer(avatar, config.trainer)
+    corrections = make_pose_corrections(avatar, frames, config.trainer)
+    optimizer = make_optimizer(avatar, config.trainer, corrections)
     size = frame.camera.width, frame.camera.height
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
-    fitter = FrameFitter(avatar, objective.background, avatar.head.neutral_vertices().mean(dim=0))
-    vertices = avatar.mesh.vertices(frame.params)
+    steps = StepRunner(Trainee(avatar, optimizer, objective, corrections))
 
-    def seconds(step: int, moves: bool = False) -> float:
+    def seconds(step: int) -> float:
         taken = []
         for _ in range(1 + MEASURED_STEPS):
             begin = time.perf_counter()
-            if moves:
-                moving_step(fitter, optimizer, objective, step, frame)
-            else:
-                training_step(avatar, optimizer, objective, step, frame, vertices)
+            steps.make(step, frame, None)
             taken.append(time.perf_counter() - begin)
         return float(np.median(taken[1:]))
 
     kinds = kinds_of_steps(config.trainer, term.every)
     total = sum(count * seconds(step) for count, step in kinds)
-    if config.trainer.align_rate > 0:
-        first = kinds[0][1]
-        total += MOVING_SHARE * config.trainer.iterations * max(seconds(first, moves=True) - seconds(first), 0.0)
     height, width = frame.image.shape[:2]
     parameters = sum(p.numel() for p in avatar.parameters())
     return Cost(

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu, to_device
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.model import Avatar
+from avatar.train.pose_corrections import PoseCorrections
 
 OPACITY_RATE = 0.05  # of the logits of opacity and of rigidity
 NETWORK_RATE = 1e-4  # of the deformation network
@@ -22,7 +23,9 @@ WARM_UP = 20  # steps
 FINAL_SHARE = 0.05  # of the learning rates, at the last step
 
 
-def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
+def make_optimizer(
+    avatar: Avatar, config: TrainerConfig, pose_corrections: PoseCorrections | None = None
+) -> torch.optim.Adam:
     """Adam with the paper's groups: colour, opacity, scale, rotation, deformation network, HyperGaussian heads."""
     rates = config.learning_rates
     logits = [avatar.opacity_logits] + ([] if avatar.skull_logits is None else [avatar.skull_logits])
@@ -40,6 +43,8 @@ def make_optimizer(avatar: Avatar, config: TrainerConfig) -> torch.optim.Adam:
     for distributions in (avatar.hyper, avatar.ndgs):
         if distributions is not None:
             groups.append({"params": list(distributions.parameters()), "lr": HYPER_RATE})
+    if pose_corrections is not None:
+        groups.append({"params": [pose_corrections.moves], "lr": config.pose_rate})
     for group in groups:
         group["full_lr"] = group["lr"]
     # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.
@@ -76,18 +81,20 @@ def set_rates(optimizer: torch.optim.Adam, share: float) -> None:
         group["lr"] = rate
 
 
-def optimizer_tensors(optimizer: torch.optim.Adam, avatar: Avatar) -> dict[str, Tensor]:
+def optimizer_tensors(optimizer: torch.optim.Adam, named: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
     """Adam's state under names made of the parameter's: optimizer.<parameter>.<exp_avg | exp_avg_sq | step>."""
     return {
         f"optimizer.{name}.{key}": value
-        for name, parameter in avatar.named_parameters()
+        for name, parameter in named.items()
         for key, value in optimizer.state[parameter].items()
     }
 
 
-def load_optimizer(optimizer: torch.optim.Adam, avatar: Avatar, tensors: Mapping[str, Tensor]) -> None:
+def load_optimizer(
+    optimizer: torch.optim.Adam, named: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor]
+) -> None:
     """Put back what `optimizer_tensors` gave, to the bit."""
-    for name, parameter in avatar.named_parameters():
+    for name, parameter in named.items():
         prefix = f"optimizer.{name}."
         own = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
         state = {key: value.to(parameter.device, copy=True) for key, value in own.items()}

@@ -1,74 +1,58 @@
-"""One step of the optimisation: draw a frame, compare, differentiate, check, move."""
+"""One step of the optimisation: draw a frame, compare, differentiate, check, update.
+
+`train_step` is one function of named tensors: a CPU calls it, a GPU captures it (`avatar.train.step_runner`).
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 
-from avatar.compute.device import CPU
-from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.losses.lpips import MissingWeights, load_lpips
-from avatar.losses.lpips_network import MIN_SIZE
-from avatar.losses.metrics import SSIM_WINDOW
-from avatar.losses.photometric import (
-    LPIPS_WEIGHT,
-    Perceptual,
-    PhotometricLoss,
-    dssim,
-    masked_lpips,
-    on_head,
-    photometric_loss,
-)
-from avatar.model import SH_DEGREE, Avatar
+from avatar.losses.photometric import PhotometricLoss
+from avatar.model import Avatar
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
-from avatar.train.optimizer import schedule, set_rates
-from avatar.train.points import move_points
-from avatar.types import Frame, Gaussians
-
-SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part
-PERCEPTUAL_START = 0.5  # share of the steps after which the perceptual term takes part (15,000 of 30,000)
-SPARSE_EVERY = 10  # LPIPS takes part in every so many-th step, with so many times the weight, where it is sparse
+from avatar.train.objective import Objective
+from avatar.train.pose_corrections import PoseCorrections
+from avatar.types import Frame, HeadParams
 
 Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
 
-
-class Weighted(NamedTuple):
-    function: Perceptual
-    weight: float
-    crops: bool = False  # to the head's box, which it takes as `box` where it is known
+_IMAGES = ("image", "alpha", "head_mask", "mouth_mask")
+_PARAMS = tuple(field.name for field in fields(HeadParams))
 
 
-@dataclass(frozen=True)
-class PerceptualTerm:
-    """What the third term of the loss is in this run."""
+class StepInputs(NamedTuple):
+    """One training frame as a step takes it; all tensors are where the avatar is."""
 
-    name: str
-    term: Weighted | None = None
-    every: int = 1  # takes part in every so many-th step, with so many times the weight
-    between: Weighted | None = None  # stands in for it in the other steps
-    before: Weighted | None = None  # stands in for it in steps before its first
+    frame: Frame
+    vertices: Float[Tensor, "V 3"]  # posed by the frame's parameters, metres
+    row: Int[Tensor, ""]  # of the frame among the pose corrections
+    noise: Float[Tensor, " C"] | None = None  # added to the network's input
 
-    def at(self, step: int, start: int) -> Weighted | None:
-        """The term of step `step` (from 0) when there is one from step `start` on."""
-        if self.term is None:
-            return None
-        if step < start:
-            return self.before
-        if (step - start) % self.every:
-            return self.between
-        return self.term._replace(weight=self.term.weight * self.every)
+    def tensors(self) -> dict[str, Tensor]:
+        """All that differs between two steps, by name."""
+        frame, camera = self.frame, self.frame.camera
+        named = {name: getattr(frame, name) for name in _IMAGES} | {"R": camera.R_cam_world, "t": camera.t_cam_world}
+        named |= {name: getattr(frame.params, name) for name in _PARAMS}
+        named |= {"vertices": self.vertices, "row": self.row}
+        return named if self.noise is None else named | {"noise": self.noise}
+
+    def with_tensors(self, named: Mapping[str, Tensor]) -> StepInputs:
+        """The same with other `tensors`."""
+        camera = replace(self.frame.camera, R_cam_world=named["R"], t_cam_world=named["t"])
+        params = HeadParams(**{name: named[name] for name in _PARAMS})
+        frame = replace(self.frame, camera=camera, params=params, **{name: named[name] for name in _IMAGES})
+        return StepInputs(frame, named["vertices"], named["row"], named.get("noise"))
 
 
-class Outcome(NamedTuple):
+class StepOutputs(NamedTuple):
     """What a step saw and what it cost, before its update; without a graph."""
 
     loss: PhotometricLoss
@@ -76,151 +60,60 @@ class Outcome(NamedTuple):
     target: Float[Tensor, "H W 3"]
 
 
-def sh_degree(step: int) -> int:
-    """The degree of the view-dependent colour that takes part in step `step` (from 0)."""
-    return min(step // SH_INTERVAL, SH_DEGREE)
-
-
-def perceptual_start(config: TrainerConfig) -> int:
-    """The first step (from 0) in which the perceptual term takes part."""
-    return round(PERCEPTUAL_START * config.iterations)
-
-
 @dataclass(frozen=True)
-class Objective:
-    """What a step minimises, for any frame."""
+class Trainee:
+    """What is trained, how, and on what loss."""
 
-    config: TrainerConfig
-    background: Float[Tensor, 3]
-    perceptual: PerceptualTerm
+    avatar: Avatar
+    optimizer: torch.optim.Adam
+    objective: Objective
+    pose_corrections: PoseCorrections | None = None
 
-    def term(self, step: int) -> Weighted | None:
-        """The third term of step `step`."""
-        return self.perceptual.at(step, perceptual_start(self.config))
-
-    def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
-        term = self.term(step)
-        function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
-        return photometric_loss(
-            image,
-            target,
-            frame.mouth_mask,
-            frame.head_mask,
-            perceptual=function,
-            perceptual_weight=term.weight if term else 0.0,
-        )
-
-    def draw(self, step: int, frame: Frame, gaussians: Gaussians, avatar: Avatar) -> Float[Tensor, "H W 3"]:
-        return avatar.draw(gaussians, frame.camera, self.background, sh_degree=sh_degree(step)).image
+    def named_parameters(self) -> dict[str, nn.Parameter]:
+        named = dict(self.avatar.named_parameters())
+        if self.pose_corrections is not None:
+            named |= {f"pose_corrections.{name}": p for name, p in self.pose_corrections.named_parameters()}
+        return named
 
 
-def training_step(
-    avatar: Avatar,
-    optimizer: torch.optim.Adam,
-    objective: Objective,
-    step: int,
-    frame: Frame,
-    vertices: Float[Tensor, "V 3"],
-    judge: Judge | None = None,
-    watched: Callable[[Gaussians], Gaussians] | None = None,
-) -> Outcome:
-    """Step number `step` (from 0) on one frame, whose posed mesh is `vertices`; drawn are `watched` of its Gaussians.
+def train_step(trainee: Trainee, step: int, inputs: StepInputs, judge: Judge | None = None) -> StepOutputs:
+    """Step number `step` (from 0) at the optimizer's rates.
 
     Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
     is not finite; with a `judge` the latter is for it to see to.
     """
-    set_rates(optimizer, schedule(step, objective.config))
-    outcome = descend(avatar, optimizer, objective, step, frame, vertices, judge, watched)
-    move_points(avatar, optimizer, step + 1, objective.config)
-    return outcome
-
-
-def descend(
-    avatar: Avatar,
-    optimizer: torch.optim.Adam,
-    objective: Objective,
-    step: int,
-    frame: Frame,
-    vertices: Float[Tensor, "V 3"],
-    judge: Judge | None = None,
-    watched: Callable[[Gaussians], Gaussians] | None = None,
-    head_rotation: Float[Tensor, " 3"] | None = None,
-) -> Outcome:
-    """What of `training_step` a GPU does by itself, at the optimizer's rates; `head_rotation` as in `Avatar.forward`."""
+    avatar, objective, frame = trainee.avatar, trainee.objective, inputs.frame
     target = frame.composite(objective.background)
+    params, camera = frame.params, frame.camera
+    if inputs.noise is not None:
+        params = params.with_condition(params.condition() + inputs.noise)
+    if trainee.pose_corrections is not None:
+        camera = trainee.pose_corrections(camera, inputs.row)
     try:
-        gaussians = avatar(frame.params, vertices, frame.camera.R_cam_world, head_rotation=head_rotation)
-        gaussians = gaussians if watched is None else watched(gaussians)
-        image = objective.draw(step, frame, gaussians, avatar)
+        gaussians = avatar(params, inputs.vertices, camera.R_cam_world.detach())
+        image = objective.draw(step, gaussians, camera, avatar)
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
     loss = objective.loss(step, frame, image, target)
-    optimizer.zero_grad()
+    trainee.optimizer.zero_grad()
     loss.total.backward()
+    gradients = gradients_of(trainee)
     if judge is None:
-        check_step(step, frame, loss, avatar)
+        check_step(step, frame, loss, gradients)
     else:
-        judge(loss, [parameter.grad for parameter in avatar.parameters() if parameter.grad is not None])
-    optimizer.step()
-    return Outcome(PhotometricLoss(*(term.detach() for term in loss)), image.detach(), target)
+        judge(loss, list(gradients.values()))
+    trainee.optimizer.step()
+    return StepOutputs(PhotometricLoss(*(term.detach() for term in loss)), image.detach(), target)
 
 
-def choose_perceptual(
-    config: TrainerConfig,
-    say: Callable[[str], None],
-    recorded: str | None = None,
-    *,
-    size: tuple[int, int] | None = None,
-    device: torch.device = CPU,
-) -> PerceptualTerm:
-    """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
-
-    `recorded` is the name of what a run began with, which it keeps whatever this machine has. `size` is that of the frames
-    (width, height), where it is known: LPIPS needs 32 pixels a side, SSIM 11. Raises UserError when LPIPS is asked for by
-    name, or recorded, and cannot be had, and for frames that are too small.
-    """
-    if size is not None and min(size) < SSIM_WINDOW:
-        raise UserError(too_small("SSIM, which training and evaluation compare by,", SSIM_WINDOW, size))
-    if config.perceptual == "none":
-        return PerceptualTerm("none")
-    in_its_place = Weighted(dssim, config.dssim_weight)
-    before = Weighted(dssim, config.dssim_early) if config.dssim_early else None
-    lpips_name = f"lpips-{config.lpips_net}"
-    if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
-        try:
-            if size is not None and min(size) < MIN_SIZE:
-                raise UserError(too_small("LPIPS", MIN_SIZE, size))
-            lpips = load_lpips(config.lpips_net, download=config.perceptual == "lpips").on(device)
-            crops = config.sparse_lpips
-            function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
-            every = SPARSE_EVERY if config.sparse_lpips else 1
-            return PerceptualTerm(lpips_name, Weighted(function, LPIPS_WEIGHT, crops), every, in_its_place, before)
-        except UserError as error:
-            if recorded is not None:
-                raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
-            if config.perceptual == "lpips":
-                raise UserError(
-                    f"{error}. This configuration trains with LPIPS (trainer.perceptual=lpips); trainer.perceptual=dssim "
-                    "trains without, and its figures do not compare"
-                ) from None
-            said = error.brief if isinstance(error, MissingWeights) else error
-            say(f"Training with D-SSIM in place of LPIPS: {said}")
-    return PerceptualTerm("dssim", in_its_place, before=before)
+def gradients_of(module: Trainee | nn.Module) -> dict[str, Tensor]:
+    """By the parameter's name, of those that have one."""
+    return {name: p.grad for name, p in dict(module.named_parameters()).items() if p.grad is not None}
 
 
-def too_small(term: str, side: int, size: tuple[int, int]) -> str:
-    width, height = size
-    enough = math.ceil(side * max(1.0, width / (height - 0.5)))  # the height is rounded
-    return (
-        f"{term} needs frames of at least {side}x{side} pixels, these have {width}x{height}; train with --size {enough} or "
-        "more"
-    )
-
-
-def check_step(step: int, frame: Frame, loss: PhotometricLoss, avatar: Avatar) -> None:
+def check_step(step: int, frame: Frame, loss: PhotometricLoss, gradients: Mapping[str, Tensor]) -> None:
     """Stop before the optimizer when the loss or a gradient is not finite, naming the step, the frame and the tensor."""
-    gradients: dict[str, Tensor] = {n: p.grad for n, p in avatar.named_parameters() if p.grad is not None}
-    norm = torch.nn.utils.get_total_norm(gradients.values())
+    norm = nn.utils.get_total_norm(gradients.values())
     if bool(torch.isfinite(norm + loss.total.detach())):
         return
     suspects = {f"the loss term {n}": v for n, v in loss._asdict().items()}

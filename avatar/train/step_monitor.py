@@ -19,7 +19,7 @@ from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
 from avatar.splat.capacity import CAPACITIES
 from avatar.train.log import TrainingLog
-from avatar.train.step import Judge, Outcome
+from avatar.train.step import Judge, StepOutputs
 
 MOST_AHEAD = 64  # steps
 
@@ -82,12 +82,10 @@ class SyncStepMonitor:
     def __init__(self, log: TrainingLog) -> None:
         self._log = log
 
-    is_nonfinite = None  # no step is made after one that was not finite
-
     def judge(self, step: int) -> None:
         """`training_step` is to check step `step` itself."""
 
-    def note(self, step: int, outcome: Outcome) -> None:
+    def note(self, step: int, outcome: StepOutputs) -> None:
         self._log.step(step, outcome.loss, outcome.render, outcome.target)
 
     def settle(self) -> None:
@@ -105,17 +103,12 @@ class AsyncStepMonitor:
         self._notes: deque[_Note] = deque()
         self._suspect = -1
 
-    @property
-    def is_nonfinite(self) -> Float[Tensor, ""]:
-        """1 from the first step on that was not finite, where the GPU is; nothing may move then."""
-        return self._guard.is_nonfinite
-
     def judge(self, step: int) -> Judge | None:
         """Who looks at step `step` (from 0) before it moves anything; None: `training_step`, which waits and says why."""
         return None if step == self._suspect else self._guard.judge
 
     @torch.no_grad()
-    def note(self, step: int, outcome: Outcome) -> None:
+    def note(self, step: int, outcome: StepOutputs) -> None:
         """Send the numbers of a step (from 1) on their way, and log those that have arrived. Raises Spoilt."""
         total = outcome.loss.total.detach()
         quality = psnr(outcome.render, outcome.target).float() if self._log.shows(step) else total

@@ -20,14 +20,15 @@ from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw
 from avatar.splat.capacity import with_room
-from avatar.train.align import make_alignment
 from avatar.train.condition_noise import make_noise
 from avatar.train.init_colours import colour_from_frames
 from avatar.train.log import TrainingLog
+from avatar.train.objective import Objective, PerceptualTerm
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
+from avatar.train.pose_corrections import PREFIX, make_pose_corrections
 from avatar.train.prune import prune_background_gaussians, prune_step
-from avatar.train.step import Objective, PerceptualTerm, stopped
+from avatar.train.step import Trainee, stopped
 from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor
 from avatar.train.step_runner import StepRunner
 
@@ -62,13 +63,15 @@ def train(
         avatar.learn_head_rotation(recording.tracks["R"][list(recording.split.train)])
     neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
     avatar.to(device)
-    optimizer = make_optimizer(avatar, trainer)
-    if resume is not None:
-        load_optimizer(optimizer, avatar, resume.tensors)
-    is_gpu = on_gpu(avatar.code)
-    alignment = make_alignment(avatar, subject, config, None if resume is None else resume.tensors)
+    corrections = make_pose_corrections(avatar, len(recording.split.train), trainer)
+    optimizer = make_optimizer(avatar, trainer, corrections)
     background = torch.tensor(config.data.background).to(device)
-    objective = Objective(trainer, background, perceptual)
+    trainee = Trainee(avatar, optimizer, Objective(trainer, background, perceptual), corrections)
+    if resume is not None:
+        if corrections is not None:
+            corrections.load(resume.tensors)
+        load_optimizer(optimizer, trainee.named_parameters(), resume.tensors)
+    is_gpu = on_gpu(avatar.code)
     meta = {
         "head_fingerprint": avatar.head.assets.fingerprint,
         "data_hash": subject.data_hash,
@@ -79,8 +82,9 @@ def train(
     }
 
     def save(step: int) -> None:
-        aligned = {} if alignment is None else alignment.tensors()
-        tensors = {**module_tensors(avatar), **optimizer_tensors(optimizer, avatar), **aligned}
+        tensors = module_tensors(avatar) | optimizer_tensors(optimizer, trainee.named_parameters())
+        if corrections is not None:
+            tensors[f"{PREFIX}moves"] = corrections.moves.detach()
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
@@ -93,14 +97,13 @@ def train(
         interruption() as interrupted,
     ):
         progress = AsyncStepMonitor(log, optimizer, device) if is_gpu else SyncStepMonitor(log)
-        steps = StepRunner(avatar, optimizer, objective, make_noise(recording, trainer), alignment, log.say)
+        rows = {index: row for row, index in enumerate(recording.split.train)}
+        steps = StepRunner(trainee, make_noise(recording, trainer), rows, log.say)
         while step < trainer.iterations and not interrupted():
             order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
             try:
                 for frame in loader.frames(order):
-                    if alignment is not None:
-                        alignment.prepare(step, loader, log.say, progress.settle)
-                    outcome = steps.make(step, frame, progress.judge(step), progress.is_nonfinite)
+                    outcome = steps.make(step, frame, progress.judge(step))
                     step += 1
                     progress.note(step, outcome)
                     if step == prune_step(trainer):

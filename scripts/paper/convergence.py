@@ -47,10 +47,11 @@ from avatar.runs.checkpoint import (
     module_tensors,
     save_checkpoint,
 )
+from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
-from avatar.train.posed_mesh_cache import PosedMeshes
-from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.train.step import Trainee
+from avatar.train.step_runner import StepRunner
 from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
 
@@ -73,7 +74,7 @@ class Learner:
         self.background = torch.tensor(config.data.background)
         term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
         self.objective = Objective(config.trainer, self.background, term)
-        self.meshes = PosedMeshes(self.avatar)
+        self.steps = StepRunner(Trainee(self.avatar, self.optimizer, self.objective))
         self.step, self.points = 0, [{"mark": 0.0, "seconds": 0.0, "step": 0}]
         recorded = {"data_hash": subject.data_hash, "config": config.to_dict(), "perceptual": term.name}
         self.recorded = json.loads(json.dumps(recorded))  # as a checkpoint gives it back
@@ -86,7 +87,7 @@ class Learner:
                 f"{self.folder} holds a training of other data or another configuration; give another --out"
             )
         load_module(self.avatar, checkpoint.tensors, self.folder)
-        load_optimizer(self.optimizer, self.avatar, checkpoint.tensors)
+        load_optimizer(self.optimizer, dict(self.avatar.named_parameters()), checkpoint.tensors)
         self.step, self.points = checkpoint.step, list(checkpoint.meta["points"])
 
     def train_until(self, mark: float, loader: FrameLoader) -> None:
@@ -94,8 +95,7 @@ class Learner:
         trainer, before = self.config.trainer, self.points[-1]["seconds"]
         begin = time.perf_counter()
         for frame in loader.frames(frame_order(self.subject.split.train, trainer.seed, self.step, trainer.iterations)):
-            vertices = self.meshes.vertices(frame)
-            training_step(self.avatar, self.optimizer, self.objective, self.step, frame, vertices)
+            self.steps.make(self.step, frame, None)
             self.step += 1
             if before + time.perf_counter() - begin >= mark:
                 break
@@ -110,7 +110,10 @@ class Learner:
             values.append((float(psnr(*pair, frame.head_mask)), float(ssim(*pair, frame.head_mask))))
         self.points[-1] |= dict(zip(("psnr", "ssim"), np.mean(values, axis=0).tolist(), strict=True))
         write_atomically(self.picture(self.points[-1]["mark"]), as_png(self.draw(frames[len(frames) // 2])))
-        tensors = {**module_tensors(self.avatar), **optimizer_tensors(self.optimizer, self.avatar)}
+        tensors = {
+            **module_tensors(self.avatar),
+            **optimizer_tensors(self.optimizer, dict(self.avatar.named_parameters())),
+        }
         save_checkpoint(self.folder, Checkpoint(self.step, tensors, {**self.recorded, "points": self.points}), keep=1)
 
     @torch.no_grad()

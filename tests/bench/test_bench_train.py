@@ -12,8 +12,10 @@ from avatar.bench import Request
 from avatar.bench.stages import StagedStep
 from avatar.bench.train_report import run
 from avatar.errors import UserError
+from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import make_optimizer
-from avatar.train.step import Objective, choose_perceptual, training_step
+from avatar.train.step import Trainee
+from avatar.train.step_runner import StepRunner
 
 
 @pytest.mark.parametrize("overrides", [["experiment=paper", "trainer.perceptual=dssim"], [], ["model=flashavatar"]])
@@ -29,9 +31,9 @@ def test_a_step_in_stages_is_the_trainings_step(tracked_folder: Path, overrides:
         objective = Objective(config.trainer, torch.ones(3), choose_perceptual(config.trainer, lambda _: None))
         for _ in range(2):
             if staged:
-                StagedStep(avatar, optimizer, objective)(number, lambda: frame)
+                StagedStep(Trainee(avatar, optimizer, objective))(number, lambda: frame)
             else:
-                training_step(avatar, optimizer, objective, number, frame, avatar.head.vertices(frame.params))
+                StepRunner(Trainee(avatar, optimizer, objective)).make(number, frame, None)
         avatars.append(dict(avatar.named_parameters()))
     whole, staged = avatars
     assert not [name for name in whole if not torch.equal(whole[name], staged[name])]

@@ -24,7 +24,7 @@ TINY = ("model.uv_size=10", "data.size=24", "trainer.perceptual=dssim", "model.l
 def test_a_timed_step_is_the_gpus_and_is_not_cut(tracked_folder: Path, tmp_path: Path) -> None:
     config = small_config(*TINY)
     _, subject, assets = open_small(tracked_folder, config)
-    learner = train.trainee(new_avatar(assets, subject, config).to(DEVICE), subject, config, lambda _: None)
+    learner = train.make_learner(new_avatar(assets, subject, config).to(DEVICE), subject, config, lambda _: None)
     before = learner.avatar.sh_dc.detach().clone()
     train.run_steps(learner, late=True)
     assert learner.judge is not None, "nothing is read back in a step"

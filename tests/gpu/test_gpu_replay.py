@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +19,10 @@ from avatar.compute.cuda_graph import Replay, own_stream
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
 from avatar.splat.capacity import CAPACITIES, Capacities, Kind, fixed_capacity
-from avatar.train import align as align_module
-from avatar.train import step as step_module
+from avatar.train import objective as objective_module
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
-from avatar.train.step import choose_perceptual
+from avatar.train.objective import choose_perceptual
 from avatar.train.step_runner import StepRunner
 from avatar.train.trainer import train
 from avatar.types import Gaussians
@@ -38,7 +37,6 @@ TINY = (
     "trainer.checkpoint_every=8",
     "trainer.prune_share=0",
 )
-STILL = (*TINY, "trainer.align_rate=0")
 
 
 def trained(
@@ -61,7 +59,7 @@ def trained(
             return outcome
 
     with monkeypatch.context() as patch:
-        patch.setattr(step_module, "SH_INTERVAL", degree_every)
+        patch.setattr(objective_module, "SH_INTERVAL", degree_every)
         patch.setattr(trainer_module, "StepRunner", Noting)
         patch.setattr(step_runner_module, "WARM", warm)
         term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
@@ -84,38 +82,26 @@ def test_replayed_steps_have_the_bits_of_launched_ones(
     overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected, launching, losses = trained(
-        tracked_folder, tmp_path / "launched", monkeypatch, *STILL, *overrides, warm=99
+        tracked_folder, tmp_path / "launched", monkeypatch, *TINY, *overrides, warm=99
     )
-    found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *STILL, *overrides, warm=1)
+    found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, *overrides, warm=1)
     assert launching.replayed == 0
     assert replaying.replayed == 20 - 4  # the first of each kind: degrees 0, 1, 1 with a third term, 2
     assert same == losses and len(set(losses)) == 20
-    assert_same(found, expected)
-
-
-def test_so_have_those_that_move_their_frame(
-    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in (("LEAST_GAIN", -100.0), ("SAMPLES", 1), ("JUDGED", 2), ("BEGIN", 0.2), ("END", 0.8)):
-        monkeypatch.setattr(align_module, name, value)
-    expected, _, losses = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, warm=99)
-    found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, warm=1)
-    assert replaying.replayed >= 12
-    assert expected.tensors["align.moves"].any()
-    assert same == losses
+    assert expected.tensors["pose_corrections.moves"].any()
     assert_same(found, expected)
 
 
 def test_what_cannot_be_captured_is_launched_and_said(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)
+    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, warm=99)
 
     def refuse(*_: object) -> None:
         raise RuntimeError("operation not permitted when stream is capturing")
 
     monkeypatch.setattr(step_runner_module, "Replay", refuse)
-    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *STILL, warm=1)
+    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *TINY, warm=1)
     said = capsys.readouterr().err
     assert said.count("because they cannot be replayed: operation not permitted") == 1
     assert steps.replayed == 0
@@ -142,12 +128,12 @@ def test_a_script_without_todays_room_is_written_anew(
         written.append(CAPACITIES.known(CAPACITIES.last_kind))
         return replay(*arguments)  # type: ignore[arg-type]
 
-    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *STILL, warm=99)
+    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, warm=99)
     monkeypatch.setattr(Capacities, "known", growing)
     monkeypatch.setattr(step_runner_module, "Replay", counting)
-    monkeypatch.setattr(step_module, "PERCEPTUAL_START", 1.0)
+    monkeypatch.setattr(objective_module, "PERCEPTUAL_START", 1.0)
     found, steps, _ = trained(
-        tracked_folder, tmp_path / "run", monkeypatch, *STILL, "trainer.iterations=12", warm=1, degree_every=99
+        tracked_folder, tmp_path / "run", monkeypatch, *TINY, "trainer.iterations=12", warm=1, degree_every=99
     )
     assert found.step == 12 and steps.replayed == 11
     assert written == [4096, 8192]
@@ -157,16 +143,16 @@ def test_a_script_without_todays_room_is_written_anew(
 def test_a_replay_reads_what_it_is_given_each_time() -> None:
     weight = torch.full((3,), 2.0, device=DEVICE)
 
-    def function(inputs: Sequence[Tensor]) -> Tensor:
-        values, index = inputs
-        return (weight * values)[index]
+    def function(inputs: Mapping[str, Tensor]) -> Tensor:
+        return (weight * inputs["values"])[inputs["index"]]
 
-    inputs = torch.arange(3.0, device=DEVICE), torch.tensor([2, 0], device=DEVICE)
+    values, index = torch.arange(3.0, device=DEVICE), torch.tensor([2, 0], device=DEVICE)
+    inputs = {"values": values, "index": index}
     with own_stream(DEVICE):
         function(inputs)
         replay = Replay(function, inputs)
         assert replay(inputs).tolist() == [4.0, 0.0]
-        assert replay((inputs[0] + 1.0, inputs[1].flip(0))).tolist() == [2.0, 6.0]
+        assert replay({"values": values + 1.0, "index": index.flip(0)}).tolist() == [2.0, 6.0]
         weight.fill_(3.0)
         assert replay(inputs).tolist() == [6.0, 0.0]
 
@@ -175,14 +161,14 @@ def test_a_replayed_drawing_follows_its_camera() -> None:
     scene = SCENES["17x33"]
     gaussians, background = Gaussians(*(t.to(DEVICE) for t in scene.gaussians)), scene.background.to(DEVICE)
 
-    def function(pose: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        R, t = (part.detach().requires_grad_() for part in pose)
+    def function(pose: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        R, t = (pose[name].detach().requires_grad_() for name in ("R", "t"))
         camera = replace(scene.camera, R_cam_world=R, t_cam_world=t)
         image = splat(gaussians, camera, background, backend="gpu").image
         return image.detach(), *torch.autograd.grad(image.square().sum(), (R, t))
 
     R, t = scene.camera.R_cam_world.to(DEVICE), scene.camera.t_cam_world.to(DEVICE)
-    poses = [(R, t), (R.roll(1, 0).contiguous(), t + 0.1), (R, t + 0.02)]
+    poses = [{"R": R, "t": t}, {"R": R.roll(1, 0).contiguous(), "t": t + 0.1}, {"R": R, "t": t + 0.02}]
     with fixed_capacity(4096), own_stream(DEVICE):
         expected = [function(pose) for pose in poses]
         replay = Replay(function, poses[0])

@@ -20,7 +20,7 @@ from avatar.splat import capacity as capacity_module
 from avatar.splat import gpu_draw
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
-from avatar.train.step import choose_perceptual
+from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
 
 TINY = (
@@ -29,7 +29,6 @@ TINY = (
     "trainer.perceptual=dssim",
     "trainer.checkpoint_every=100",
     "model.latent_grid=4",
-    "trainer.align_rate=0",  # a GPU does not
 )
 
 

@@ -19,15 +19,13 @@ from avatar.pose_refinement.frame_fitter import (
     OBSERVATIONS,
     PIXEL_SIGMA,
     FrameFitter,
-    camera_gradient,
     head_psnr,
     targets,
 )
 from avatar.pose_refinement.frame_fitter import misfit as misfit_of
-from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose, rotation, values_of
+from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose, values_of
 from avatar.pose_refinement.refine import frozen
 from avatar.splat import splat
-from avatar.types import Camera, Gaussians
 
 VALUES = 20 + EXPRESSIONS
 
@@ -51,32 +49,6 @@ def fitter(avatar: Avatar) -> FrameFitter:
 
 def given(clip: Clip, index: int) -> HeadPose:
     return HeadPose(clip.recording.tracks["R"][index], clip.recording.tracks["t"][index])
-
-
-def test_the_cameras_gradient_is_that_of_the_reference() -> None:
-    generator = torch.Generator().manual_seed(3)
-    count = 40
-    quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
-    gaussians = Gaussians(
-        means=0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),
-        quats=torch.nn.functional.normalize(quats, dim=1),
-        scales=0.004 + 0.03 * torch.rand(count, 3, generator=generator, dtype=torch.float64),
-        opacities=0.2 + 0.5 * torch.rand(count, generator=generator, dtype=torch.float64),
-        sh=torch.randn(count, 1, 3, generator=generator, dtype=torch.float64),
-    )
-    R = rotation(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)).requires_grad_()
-    t = torch.tensor([0.02, -0.01, 0.7], dtype=torch.float64, requires_grad=True)
-    camera = Camera(R, t, 60.0, 64.0, 16.0, 15.0, 32, 30)
-    means, quats = gaussians.means.requires_grad_(), gaussians.quats.requires_grad_()
-    image = splat(gaussians, camera, BACKGROUND.double(), backend="reference", alpha_min=0.0).image
-    weights = torch.randn(image.shape, generator=generator, dtype=torch.float64)
-    by_R, by_t, by_means, by_quats = torch.autograd.grad((image * weights).sum(), (R, t, means, quats))
-    found = camera_gradient(gaussians, HeadPose(R.detach(), t.detach()), by_means, by_quats)
-    assert torch.allclose(found.t, by_t, rtol=1e-6, atol=1e-9)
-    # Only what a turn of the camera changes is defined: the part of the gradient along the rotations.
-    for axis in torch.eye(3, dtype=torch.float64):
-        turn = torch.linalg.cross(axis.expand(3, 3), R.detach().T).T
-        assert float((found.R * turn).sum()) == pytest.approx(float((by_R * turn).sum()), rel=1e-6, abs=1e-9)
 
 
 def mistracked(clip: Clip) -> tuple[torch.Tensor, HeadPose]:

@@ -18,8 +18,7 @@ from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import newest_checkpoint
 from avatar.runs.trained import TrainedAvatar, load_avatar
-from avatar.train import align as align_module
-from avatar.train.step import choose_perceptual
+from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
 from avatar.types import IDENTITY_6D
 
@@ -33,12 +32,11 @@ def trained(assets: HeadAssets, subject: Subject, run: Path, *overrides: str) ->
     return load_avatar(run / AVATAR_FILE, Path(subject.manifest.head_path))
 
 
-# The default recipe moves tracking and removes strays; it starts from the frames' colours, adds noise and knows the facing.
+# The default recipe corrects poses and prunes Gaussians; it starts from the frames' colours and adds noise.
 @pytest.mark.parametrize("recipe", [(), PAPER], ids=["default", "paper"])
 def test_noise_in_held_out_frames_changes_no_bit_of_a_trained_avatar(
-    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: tuple[str, ...]
+    tracked_folder: Path, tmp_path: Path, recipe: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr(align_module, "LEAST_GAIN", -100.0)  # tracking moves to the end
     _, subject, assets = open_small(tracked_folder, small_config())
     noisy = poisoned(subject)
     train_frames, test_frames = list(subject.split.train), list(subject.split.test)
@@ -49,7 +47,7 @@ def test_noise_in_held_out_frames_changes_no_bit_of_a_trained_avatar(
     checkpoints = [newest_checkpoint(tmp_path / run).tensors for run in ("clean", "noise")]
     assert checkpoints[0].keys() == checkpoints[1].keys()
     if not recipe:
-        assert checkpoints[0]["align.moves"].any() and checkpoints[0]["model.turning"].any()
+        assert checkpoints[0]["pose_corrections.moves"].any() and checkpoints[0]["model.turning"].any()
     assert not [name for name in checkpoints[0] if not torch.equal(checkpoints[0][name], checkpoints[1][name])]
 
     for name, values in clean.avatar.state_dict().items():
@@ -65,7 +63,7 @@ def test_noise_in_held_out_frames_changes_no_bit_of_a_trained_avatar(
 
 
 def test_training_opens_training_frames_and_one_preview(tracked_folder: Path, tmp_path: Path) -> None:
-    """For first colours, moved tracking, strays and steps, which pass over all frames."""
+    """For first colours, pruning and steps, which pass over all frames."""
     _, subject, assets = open_small(tracked_folder, small_config())
     opened: list[int] = []
 

@@ -9,7 +9,7 @@ from avatar.errors import UserError
 from avatar.losses.lpips import MissingWeights
 from avatar.losses.lpips_network import Net
 from avatar.train import step
-from avatar.train.step import choose_perceptual
+from avatar.train.objective import choose_perceptual
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from avatar.losses.photometric import PhotometricLoss
 from avatar.train import step_monitor as step_monitor_module
-from avatar.train.step import Outcome
+from avatar.train.step import StepOutputs
 from avatar.train.step_monitor import AsyncStepMonitor, Guard, NonFiniteStep
 
 
@@ -30,8 +30,8 @@ def loss_of(value: float) -> PhotometricLoss:
     return PhotometricLoss(total, 0.5 * total, 0.25 * total, 0.25 * total)
 
 
-def outcome_of(value: float) -> Outcome:
-    return Outcome(loss_of(value), torch.zeros(4, 4, 3), torch.full((4, 4, 3), 0.1))
+def outcome_of(value: float) -> StepOutputs:
+    return StepOutputs(loss_of(value), torch.zeros(4, 4, 3), torch.full((4, 4, 3), 0.1))
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
 from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
-from avatar.train import step as step_module
+from avatar.train import objective as objective_module
 from avatar.train import trainer as trainer_module
-from avatar.train.step import Objective, PerceptualTerm, Weighted, choose_perceptual
+from avatar.train.objective import Objective, PerceptualTerm, Weighted, choose_perceptual
 from avatar.train.trainer import interruption, train
 from avatar.types import Camera, Frame, HeadParams
 
@@ -129,7 +129,7 @@ def test_dssim_weighs_in_each_half_what_the_configuration_says(early: float, sha
 
 
 def test_lpips_lets_dssim_begin_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(step_module, "load_lpips", lambda *_, **__: Lpips("squeeze"))
+    monkeypatch.setattr(objective_module, "load_lpips", lambda *_, **__: Lpips("squeeze"))
     term = choose_perceptual(small_config("trainer.dssim_early=0.3").trainer, print)
     assert term.name == "lpips-squeeze" and term.before == Weighted(dssim, 0.3)
 
@@ -263,7 +263,7 @@ def test_a_learning_rate_that_is_far_too_high_ends_in_a_sentence(tracked_folder:
 
 def test_lpips_by_name_without_weights_fails_before_training(tracked_folder: Path, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(step_module, "load_lpips", _no_weights)
+        patch.setattr(objective_module, "load_lpips", _no_weights)
         with pytest.raises(UserError, match="no weights"):
             train_small(tracked_folder, tmp_path / "run", ["trainer.perceptual=lpips"])
     assert not (tmp_path / "run" / "checkpoints").exists()

@@ -1,0 +1,152 @@
+"""What a training step minimises: the photometric terms, and LPIPS or D-SSIM from a step on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.compute.device import CPU
+from avatar.config import TrainerConfig
+from avatar.errors import UserError
+from avatar.losses.lpips import MissingWeights, load_lpips
+from avatar.losses.lpips_network import MIN_SIZE
+from avatar.losses.metrics import SSIM_WINDOW
+from avatar.losses.photometric import (
+    LPIPS_WEIGHT,
+    Perceptual,
+    PhotometricLoss,
+    dssim,
+    masked_lpips,
+    on_head,
+    photometric_loss,
+)
+from avatar.model import SH_DEGREE, Avatar
+from avatar.types import Camera, Frame, Gaussians
+
+SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part
+PERCEPTUAL_START = 0.5  # share of the steps after which the perceptual term takes part (15,000 of 30,000)
+SPARSE_EVERY = 10  # LPIPS takes part in every so many-th step, with so many times the weight, where it is sparse
+
+
+class Weighted(NamedTuple):
+    function: Perceptual
+    weight: float
+    crops: bool = False  # to the head's box, which it takes as `box` where it is known
+
+
+@dataclass(frozen=True)
+class PerceptualTerm:
+    """What the third term of the loss is in this run."""
+
+    name: str
+    term: Weighted | None = None
+    every: int = 1  # takes part in every so many-th step, with so many times the weight
+    between: Weighted | None = None  # stands in for it in the other steps
+    before: Weighted | None = None  # stands in for it in steps before its first
+
+    def at(self, step: int, start: int) -> Weighted | None:
+        """The term of step `step` (from 0) when there is one from step `start` on."""
+        if self.term is None:
+            return None
+        if step < start:
+            return self.before
+        if (step - start) % self.every:
+            return self.between
+        return self.term._replace(weight=self.term.weight * self.every)
+
+
+def sh_degree(step: int) -> int:
+    """The degree of the view-dependent colour that takes part in step `step` (from 0)."""
+    return min(step // SH_INTERVAL, SH_DEGREE)
+
+
+def perceptual_start(config: TrainerConfig) -> int:
+    """The first step (from 0) in which the perceptual term takes part."""
+    return round(PERCEPTUAL_START * config.iterations)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a step minimises, for any frame."""
+
+    config: TrainerConfig
+    background: Float[Tensor, 3]
+    perceptual: PerceptualTerm
+
+    def term(self, step: int) -> Weighted | None:
+        """The third term of step `step`."""
+        return self.perceptual.at(step, perceptual_start(self.config))
+
+    def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
+        term = self.term(step)
+        function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
+        return photometric_loss(
+            image,
+            target,
+            frame.mouth_mask,
+            frame.head_mask,
+            perceptual=function,
+            perceptual_weight=term.weight if term else 0.0,
+        )
+
+    def draw(self, step: int, gaussians: Gaussians, camera: Camera, avatar: Avatar) -> Float[Tensor, "H W 3"]:
+        return avatar.draw(gaussians, camera, self.background, sh_degree=sh_degree(step)).image
+
+
+def choose_perceptual(
+    config: TrainerConfig,
+    say: Callable[[str], None],
+    recorded: str | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+    device: torch.device = CPU,
+) -> PerceptualTerm:
+    """LPIPS, D-SSIM or nothing. `auto` takes LPIPS when its weights are on this machine, else D-SSIM, and says so.
+
+    `recorded` is the name of what a run began with, which it keeps whatever this machine has. `size` is that of the frames
+    (width, height), where it is known: LPIPS needs 32 pixels a side, SSIM 11. Raises UserError when LPIPS is asked for by
+    name, or recorded, and cannot be had, and for frames that are too small.
+    """
+    if size is not None and min(size) < SSIM_WINDOW:
+        raise UserError(too_small("SSIM, which training and evaluation compare by,", SSIM_WINDOW, size))
+    if config.perceptual == "none":
+        return PerceptualTerm("none")
+    in_its_place = Weighted(dssim, config.dssim_weight)
+    before = Weighted(dssim, config.dssim_early) if config.dssim_early else None
+    lpips_name = f"lpips-{config.lpips_net}"
+    if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
+        try:
+            if size is not None and min(size) < MIN_SIZE:
+                raise UserError(too_small("LPIPS", MIN_SIZE, size))
+            lpips = load_lpips(config.lpips_net, download=config.perceptual == "lpips").on(device)
+            crops = config.sparse_lpips
+            function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
+            every = SPARSE_EVERY if config.sparse_lpips else 1
+            return PerceptualTerm(lpips_name, Weighted(function, LPIPS_WEIGHT, crops), every, in_its_place, before)
+        except UserError as error:
+            if recorded is not None:
+                raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
+            if config.perceptual == "lpips":
+                raise UserError(
+                    f"{error}. This configuration trains with LPIPS (trainer.perceptual=lpips); trainer.perceptual=dssim "
+                    "trains without, and its figures do not compare"
+                ) from None
+            said = error.brief if isinstance(error, MissingWeights) else error
+            say(f"Training with D-SSIM in place of LPIPS: {said}")
+    return PerceptualTerm("dssim", in_its_place, before=before)
+
+
+def too_small(term: str, side: int, size: tuple[int, int]) -> str:
+    width, height = size
+    enough = math.ceil(side * max(1.0, width / (height - 0.5)))  # the height is rounded
+    return (
+        f"{term} needs frames of at least {side}x{side} pixels, these have {width}x{height}; train with --size {enough} or "
+        "more"
+    )

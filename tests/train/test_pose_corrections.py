@@ -1,0 +1,106 @@
+"""Corrections of the training frames' head poses, trained with the avatar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
+from small_runs import small_config, train_small
+
+from avatar.errors import UserError
+from avatar.model import Avatar
+from avatar.pose_refinement.motion import HeadPose, moved_pose
+from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
+from avatar.train.objective import Objective, choose_perceptual
+from avatar.train.optimizer import make_optimizer
+from avatar.train.pose_corrections import PREFIX, PoseCorrections, make_pose_corrections
+from avatar.train.step import Trainee
+from avatar.train.step_runner import StepRunner
+from avatar.types import Camera
+
+STEPS = 280
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Avatar:
+    return patterned_avatar(tmp_path_factory.mktemp("head"))
+
+
+def corrected(avatar: Avatar, clip: Clip) -> tuple[PoseCorrections, Clip]:
+    """Corrections after so many steps of an avatar that stands still, and the clip with these poses."""
+    config = small_config(f"data.size={SIZE}", f"trainer.iterations={STEPS}", "trainer.pose_rate=0.02")
+    train = clip.split.train
+    corrections = make_pose_corrections(avatar, len(train), config.trainer)
+    assert corrections is not None
+    objective = Objective(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
+    optimizer = make_optimizer(avatar, config.trainer, corrections)
+    for group in optimizer.param_groups[:-1]:
+        group["full_lr"] = 0.0
+    rows = {index: row for row, index in enumerate(train)}
+    steps = StepRunner(Trainee(avatar, optimizer, objective, corrections), rows=rows)
+    for step in range(STEPS):
+        index = train[step % len(train)]
+        steps.make(step, replace(clip.pictures[index], camera=clip.recording.camera(index)), None)
+    tracks = {name: value.clone() for name, value in clip.recording.tracks.items()}
+    for index, row in rows.items():
+        camera = corrections(clip.recording.camera(index), torch.tensor(row))
+        tracks["R"][index], tracks["t"][index] = camera.R_cam_world.detach(), camera.t_cam_world.detach()
+    return corrections, replace(clip, recording=replace(clip.recording, tracks=tracks))
+
+
+def test_disturbed_poses_of_training_frames_come_back(avatar: Avatar) -> None:
+    true = drawn_clip(avatar)
+    wrong = wrongly_tracked(true, share=0.0, common=False)
+    _, found = corrected(avatar, wrong)
+    train = list(wrong.split.train)
+    before = screen_errors(avatar, wrong.recording, true.recording, train)
+    assert screen_errors(avatar, found.recording, true.recording, train) < 0.5 * before
+
+
+def test_a_correction_turns_the_head_about_its_centre_and_has_no_common_part() -> None:
+    centre = torch.tensor([0.01, -0.02, 0.03])
+    corrections = PoseCorrections(3, centre)
+    R, t = torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.01, 0.0, 0.8])
+    camera = Camera(R, t, 90.0, 90.0, 16.0, 16.0, 32, 32)
+    assert torch.equal(corrections(camera, torch.tensor(1)).R_cam_world, camera.R_cam_world)
+    with torch.no_grad():
+        corrections.moves.copy_(torch.arange(18.0).reshape(3, 6))
+    own = (corrections.moves[2] - corrections.moves.mean(dim=0)) * corrections.unit
+    expected = moved_pose(own, HeadPose(camera.R_cam_world, camera.t_cam_world), centre)
+    found = corrections(camera, torch.tensor(2))
+    torch.testing.assert_close(found.R_cam_world, expected.R)
+    torch.testing.assert_close(found.t_cam_world, expected.t)
+    with torch.no_grad():
+        corrections.moves += 5.0
+    torch.testing.assert_close(corrections(camera, torch.tensor(2)).t_cam_world, expected.t)
+
+
+def test_a_resumed_run_has_the_same_bits(tracked_folder: Path, tmp_path: Path) -> None:
+    train_small(tracked_folder, tmp_path / "whole")
+    whole = newest_checkpoint(tmp_path / "whole")
+    assert whole.tensors[f"{PREFIX}moves"].any()
+    run = tmp_path / "broken"
+    train_small(tracked_folder, run)
+    for file in list_checkpoints(run / "checkpoints")[1:]:
+        file.unlink()
+    halfway = newest_checkpoint(run)
+    assert halfway.step < whole.step
+    train_small(tracked_folder, run, resume=halfway)
+    broken = newest_checkpoint(run)
+    assert broken.step == whole.step and broken.tensors.keys() == whole.tensors.keys()
+    assert all(torch.equal(value, broken.tensors[name]) for name, value in whole.tensors.items())
+
+
+def test_a_checkpoint_without_them_or_of_other_frames_is_refused(tracked_folder: Path, tmp_path: Path) -> None:
+    train_small(tracked_folder, tmp_path / "run", ["trainer.pose_rate=0"])
+    tensors = newest_checkpoint(tmp_path / "run").tensors
+    assert not [name for name in tensors if "pose_corrections" in name]
+    corrections = PoseCorrections(4, torch.zeros(3))
+    for damaged in (tensors, {f"{PREFIX}moves": torch.zeros(5, 6)}):
+        with pytest.raises(UserError, match="pose corrections of 4 training frames"):
+            corrections.load(damaged)
+    corrections.load({f"{PREFIX}moves": torch.ones(4, 6)})
+    assert bool((corrections.moves == 1.0).all())
