@@ -36,7 +36,6 @@ from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
 from avatar.pose_refinement.parameterization import find_parameterization
 from avatar.render import Renderer
-from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera
 from avatar.train.align import Alignment
 from avatar.train.optimizer import make_optimizer
@@ -45,7 +44,6 @@ from avatar.train.step_monitor import Guard
 from avatar.types import IDENTITY_6D, Frame, HeadParams
 
 META = torch.device("meta")
-PAIRS = 300_000  # of a tile and a splat, as many as a head of 512 x 512 pixels takes
 
 # Operators that give a tensor without touching its memory.
 NOTHING = {
@@ -125,7 +123,7 @@ class Rehearsal:
 
     def step(self, perceptual: PerceptualTerm, late: bool) -> Counter[str]:
         """What one training step launches; `late`: in the second half of the training."""
-        with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
+        with patch("torch.optim.adam._device_dtype_check_for_fused"):
             for _ in range(2):  # the first makes the optimizer's state
                 with counting() as launches:
                     self.train(perceptual, late)
@@ -153,7 +151,7 @@ class Rehearsal:
             "factor": torch.eye(len(parameterization.index)),
         }
         alignment.load({f"align.{name}": value for name, value in (moves | {"is_over": torch.zeros(())}).items()})
-        with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
+        with patch("torch.optim.adam._device_dtype_check_for_fused"):
             for _ in range(2):
                 with counting() as launches:
                     seen = alignment.see(number, self.frame, cast(FrameLoader, None), print)
@@ -190,7 +188,7 @@ class Rehearsal:
 
     def rendered(self) -> Counter[str]:
         renderer = Renderer(self.avatar, self.background)
-        with fixed_capacity(PAIRS), counting() as launches:
+        with counting() as launches:
             renderer.render(self.params, self.camera)
         return launches
 

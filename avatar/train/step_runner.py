@@ -9,19 +9,16 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import fields, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.cuda_graph import Replay
 from avatar.compute.device import on_gpu, to_device
 from avatar.model import Avatar
-from avatar.splat.capacity import CAPACITIES, fixed_capacity
-from avatar.splat.capacity import Kind as DrawingKind
 from avatar.train.align import Alignment, FrameCorrection, StepInput
 from avatar.train.condition_noise import ConditionNoise, noisy
 from avatar.train.optimizer import schedule, set_rates
@@ -45,13 +42,7 @@ class Kind(NamedTuple):
     curvature: int | None  # by which of them the frame moves; None: it does not
 
 
-class CapturedStep(NamedTuple):
-    """What replays the steps of a kind: what they saw and, of a frame that moves, its moves."""
-
-    replay: Replay[tuple[Outcome, Tensor | None]]
-    capacity: int | None  # pairs that it draws with; None: as many as it takes, which a GPU would have to wait for
-    drawing: DrawingKind
-    ends: Int[Tensor, " N"]  # of its drawing, see `Capacities.watch`
+CapturedStep = Replay[tuple[Outcome, Tensor | None]]  # what a step saw and, of a frame that moves, its moves
 
 
 class StepRunner:
@@ -71,7 +62,6 @@ class StepRunner:
         self._meshes = PosedMeshes(avatar)
         self._replays = on_gpu(avatar.code) and not avatar.code.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
-        self._drawings: dict[Kind, DrawingKind] = {}  # of those that were launched
         self._captured: OrderedDict[Kind, CapturedStep] = OrderedDict()
         self.replayed = 0  # steps so far
 
@@ -89,18 +79,15 @@ class StepRunner:
         kind = self._kind(step, frame, row)
         if kind is None or judge is None:
             return self._launch(step, frame, row, judge, is_nonfinite)
-        captured = self._ready(kind)
+        captured = self._captured.get(kind)
         if captured is None and self._launched[kind] >= WARM:
             captured = self._capture(kind, step, frame, row, judge, is_nonfinite)
         if captured is None:
             self._launched[kind] += 1
-            outcome = self._launch(step, frame, row, judge, is_nonfinite)
-            self._drawings[kind] = CAPACITIES.last_kind
-            return outcome
+            return self._launch(step, frame, row, judge, is_nonfinite)
         set_rates(self._optimizer, schedule(step, self._objective.config))
         seen = self._still(step, frame) if row is None else None
-        outcome, moves = captured.replay(self._inputs(step, frame, seen, row))
-        CAPACITIES.watch(captured.drawing, captured.ends)
+        outcome, moves = captured(self._inputs(step, frame, seen, row))
         if moves is not None and self._alignment is not None:
             self._alignment.keep(frame.index, moves)
         self.replayed += 1
@@ -134,14 +121,6 @@ class StepRunner:
         degree = sh_degree(step)
         return Kind((frame.camera.width, frame.camera.height), degree, term, curvature)
 
-    def _ready(self, kind: Kind) -> CapturedStep | None:
-        """A script that has the room that drawings of today need."""
-        captured = self._captured.get(kind)
-        if captured is None or captured.capacity == CAPACITIES.known(captured.drawing):
-            return captured
-        del self._captured[kind]
-        return None
-
     def _capture(
         self,
         kind: Kind,
@@ -152,27 +131,22 @@ class StepRunner:
         is_nonfinite: Tensor | None,
     ) -> CapturedStep | None:
         """A script of steps like this one, which it does not make; None: it has to be launched."""
-        drawing = self._drawings[kind]
-        capacity = CAPACITIES.known(drawing)
-        if capacity is None and drawing.device.type == "cuda":
-            return None
         seen = self._still(step, frame) if row is None else None
         shown = frame if seen is None else seen.frame
 
         def play(inputs: Sequence[Tensor]) -> tuple[Outcome, Tensor | None]:
-            with nullcontext() if capacity is None else fixed_capacity(capacity):
-                return self._play(step, shown, row, judge, is_nonfinite, inputs)
+            return self._play(step, shown, row, judge, is_nonfinite, inputs)
 
         try:
-            replay = Replay(play, self._inputs(step, frame, seen, row))
+            captured = Replay(play, self._inputs(step, frame, seen, row))
         except RuntimeError as error:
             self._replays = False
             self._say(f"Steps are launched one operation at a time, because they cannot be replayed: {error}")
             return None
         while len(self._captured) >= KEPT:
             self._captured.popitem(last=False)
-        self._captured[kind] = CapturedStep(replay, capacity, drawing, CAPACITIES.last_ends)
-        return self._captured[kind]
+        self._captured[kind] = captured
+        return captured
 
     def _inputs(self, step: int, frame: Frame, seen: StepInput | None, row: FrameCorrection | None) -> list[Tensor]:
         """What differs between steps of a kind, where the avatar is; in the order in which `_play` takes it."""
