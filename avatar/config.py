@@ -96,7 +96,7 @@ class TrainerConfig:
     ] = 0.05
     pose_rate: Annotated[
         float, SHARE, "learning rate of the training frames' pose corrections, in half degrees and millimetres; 0: none"
-    ] = 0.01
+    ] = 0.005
     condition_noise: Annotated[
         float, SHARE, "noise on the network's input, as a share of each coefficient's standard deviation"
     ] = 0.2

@@ -29,8 +29,8 @@ from avatar.gaussians.ndgs import Slice
 from avatar.gaussians.skull_binding import SkullBinding, bind_to_skull
 from avatar.model import Avatar
 from avatar.splat import CannotDraw
-from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 AHEAD_PER_WORKER = 2  # frames begun before the first of them is asked for
@@ -135,8 +135,9 @@ class Renderer:
 
     def _arrived(self, frame: tuple[HeadParams, Camera], copies: Rendering, arrived: torch.cuda.Event) -> Rendering:
         arrived.synchronize()
-        if bool(copies.alpha.isnan().any()):  # the buffers were too small
-            copies = Rendering(*(t.cpu() for t in with_room(lambda: self.render(*frame))))
+        if bool(copies.alpha.isnan().any()):
+            with checked_drawings():
+                self.render(*frame)  # raises what is wrong
         return copies
 
     # The steps of `gaussians`, apart so that they can be timed; without autograd where their caller is.

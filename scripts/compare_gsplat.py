@@ -25,7 +25,6 @@ from avatar.bench.splat_gpu import settle, splat_gsplat
 from avatar.pipeline.choose_device import choose_device
 from avatar.runs.run import open_trained
 from avatar.splat import splat
-from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.types import Camera, Gaussians, Rendering
 
@@ -90,14 +89,12 @@ def captured(scene: Scene) -> Callable[[], None]:
         torch.autograd.grad(image, scene.gaussians, cotangent)
 
     both()
-    pairs = max(CAPACITIES._pairs.values())
     stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
-    with fixed_capacity(pairs):
-        with torch.cuda.stream(stream):
-            both()
-        torch.cuda.synchronize()
-        with torch.cuda.graph(graph, stream=stream):
-            both()
+    with torch.cuda.stream(stream):
+        both()
+    torch.cuda.synchronize()
+    with torch.cuda.graph(graph, stream=stream):
+        both()
 
     def replay() -> None:
         graph.replay()
@@ -107,7 +104,6 @@ def captured(scene: Scene) -> Callable[[], None]:
 
 
 def compare(scene: Scene, repeats: int) -> str:
-    CAPACITIES.forget()
     own, theirs = Splatter(scene, ours), Splatter(scene, splat_gsplat)
     with torch.no_grad():
         difference = float((own.forward() - theirs.forward()).abs().mean())

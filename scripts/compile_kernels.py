@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import torch
 import triton
-from count_launches import META, PAIRS, Rehearsal
+from count_launches import META, Rehearsal
 from torch import Tensor
 from triton.backends import nvidia
 from triton.backends.compiler import GPUTarget
@@ -36,7 +36,6 @@ from avatar.head.assets import HeadAssets
 from avatar.kernels.start import watched
 from avatar.losses.photometric import dssim
 from avatar.splat import splat
-from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera, head_shell
 from avatar.train.objective import PerceptualTerm, Weighted
 from avatar.types import Gaussians
@@ -117,7 +116,7 @@ def rehearse(assets: HeadAssets) -> list[Variant]:
         found[variant_of(kernel, arguments, dict(constants))] = None
 
     term = PerceptualTerm("dssim", Weighted(dssim, 0.05))
-    with watched(note), fixed_capacity(PAIRS):
+    with watched(note):
         for overrides in ((), ("experiment=paper",), ("model=flashavatar",)):
             rehearsal = Rehearsal(assets, 128, 512, overrides)
             rehearsal.step(term, late=True)

@@ -30,7 +30,6 @@ from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.model import Avatar
 from avatar.render import Renderer
-from avatar.splat.capacity import fixed_capacity
 from avatar.splat.scenes import head_camera
 from avatar.train.objective import SPARSE_EVERY, Objective, PerceptualTerm, Weighted
 from avatar.train.optimizer import make_optimizer, schedule, set_rates
@@ -41,7 +40,6 @@ from avatar.train.step_runner import StepRunner
 from avatar.types import IDENTITY_6D, Frame, HeadParams
 
 META = torch.device("meta")
-PAIRS = 300_000  # of a tile and a splat, as many as a head of 512 x 512 pixels takes
 
 # Operators that give a tensor without touching its memory.
 NOTHING = {
@@ -123,7 +121,7 @@ class Rehearsal:
 
     def step(self, perceptual: PerceptualTerm, late: bool) -> Counter[str]:
         """What one training step launches; `late`: in the second half of the training."""
-        with fixed_capacity(PAIRS), patch("torch.optim.adam._device_dtype_check_for_fused"):
+        with patch("torch.optim.adam._device_dtype_check_for_fused"):
             for _ in range(2):  # the first makes the optimizer's state
                 with counting() as launches:
                     self.train(perceptual, late)
@@ -144,7 +142,7 @@ class Rehearsal:
 
     def rendered(self) -> Counter[str]:
         renderer = Renderer(self.avatar, self.background)
-        with fixed_capacity(PAIRS), counting() as launches:
+        with counting() as launches:
             renderer.render(self.params, self.camera)
         return launches
 

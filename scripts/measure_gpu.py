@@ -29,14 +29,12 @@ from avatar.losses.photometric import dssim
 from avatar.pipeline.choose_device import choose_device
 from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
-from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
 from avatar.train.objective import PerceptualTerm, Weighted
 from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Gaussians
 
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # mean over the pixels, of a field's norm; cut-offs may decide a pixel
-ROOM = 4_000_000  # pairs; more than any of these scenes needs
 STAND_IN = PerceptualTerm("dssim", Weighted(dssim, 0.05))
 
 
@@ -99,16 +97,15 @@ def check_capture(scene: Scene) -> str:
     """A drawing and its gradients as a CUDA graph, replayed."""
     if not torch.cuda.is_available() or interpreted():
         return "not tried: no GPU"
-    with fixed_capacity(ROOM):
-        expected = scene.both()
-        stream = torch.cuda.Stream()
-        with torch.cuda.stream(stream):
-            scene.both()
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream):
-            image = splat(scene.leaves, scene.camera, scene.background).image
-            found = [image.detach(), *torch.autograd.grad(image, scene.leaves, scene.cotangent)]
+    expected = scene.both()
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        scene.both()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        image = splat(scene.leaves, scene.camera, scene.background).image
+        found = [image.detach(), *torch.autograd.grad(image, scene.leaves, scene.cotangent)]
     graph.replay()
     torch.cuda.synchronize()
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True)), "a replayed graph gives other bits"
@@ -153,14 +150,12 @@ def tune(scene: Scene, repeats: int, quick: bool) -> list[tuple[gpu_draw.Tuning,
     try:
         for tuning in [usual, *tunings][: 2 if quick else None]:
             gpu_draw.TUNING = tuning
-            CAPACITIES.forget()  # other tiles, other numbers of pairs
             times = paired_medians(
                 {"forward": scene.forward, "backward": scene.backward}, repeats, warm_up=min(3, repeats - 1)
             )
             rows.append((tuning, times["forward"], times["backward"]))
     finally:
         gpu_draw.TUNING = usual
-        CAPACITIES.forget()
     return sorted(rows, key=lambda row: row[1].median + row[2].median)
 
 

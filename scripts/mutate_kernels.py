@@ -15,9 +15,9 @@ import kernel_mutations
 from kernel_mutations_avatar import AVATAR_MUTATIONS
 from mutation_runner import Mutation, Task, options, run
 
-BACKENDS, CAPACITY, HOSTILE, PLACE = (
+BACKENDS, BUFFERS, HOSTILE, PLACE = (
     f"tests/{name}.py::"
-    for name in ("splat/test_splat_backends", "gpu/test_gpu_capacity", "gpu/test_gpu_hostile", "gpu/test_gpu_place")
+    for name in ("splat/test_splat_backends", "gpu/test_gpu_buffers", "gpu/test_gpu_hostile", "gpu/test_gpu_place")
 )
 LOOPS = BACKENDS + "test_image_and_alpha_are_those_of_the_definition_written_as_loops"
 REFERENCE = BACKENDS + "test_gpu_kernels_agree_with_the_reference"
@@ -29,9 +29,9 @@ SPLATTER = [
     *(f"{REFERENCE}[{scene}-gpu]" for scene in ("17x33", "wide field of view", "degree 3 of 3", "other cut-offs")),
     "tests/splat/test_splat_public_bugs.py::test_alpha_just_under_the_cut_off_is_skipped_and_at_it_drawn[gpu]",
     "tests/splat/test_splat_public_bugs.py::test_gradient_is_zero_where_alpha_is_clamped[gpu]",
-    CAPACITY + "test_room_for_exactly_the_pairs_is_enough_and_one_less_makes_the_image_nan",
-    CAPACITY + "test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits",
-    CAPACITY + "test_so_does_one_of_a_pose_that_is_on_the_gpu",
+    BUFFERS + "test_room_for_exactly_the_pairs_is_enough_and_one_less_makes_the_image_nan",
+    BUFFERS + "test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits",
+    BUFFERS + "test_so_does_one_of_a_pose_that_is_on_the_gpu",
     "tests/gpu/test_gpu_production.py::test_a_scene_agrees_with_the_reference[small]",
     HOSTILE + "test_the_same_bits_and_whole_bands[17x33]",
     HOSTILE + "test_the_same_bits_and_whole_bands[walls]",

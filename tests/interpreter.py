@@ -59,6 +59,27 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @contextmanager
+def as_on_a_gpu(capacity: int | None = None) -> Iterator[dict[Any, int]]:
+    """Drawings wait as on a GPU, the first of a kind and checked ones; gives what those fix, nothing at first, or
+    `capacity` of every kind."""
+    from avatar.splat import gpu_buffers
+
+    fixed: dict[Any, int] = {} if capacity is None else _Always(capacity)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gpu_buffers, "_fixed", fixed)
+        patch.setattr(gpu_buffers, "is_checked", lambda _: gpu_buffers._checked.get())
+        yield fixed
+
+
+class _Always(dict[Any, int]):
+    def __init__(self, value: int) -> None:
+        self._value = value
+
+    def get(self, *_: Any) -> int:
+        return self._value
+
+
+@contextmanager
 def the_cpus_way() -> Iterator[None]:
     """Tensors on the CPU take the compiled kernels in here, whether Triton interprets or not."""
     with pytest.MonkeyPatch.context() as patch:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from functools import partial
 from typing import Any
 
 import cv2
@@ -19,8 +18,8 @@ from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
-from avatar.splat.capacity import with_room
 from avatar.splat.cpu import thread_count
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import Frame
 
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
@@ -38,7 +37,8 @@ def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, 
     for look in looks:
         if look.background not in images:
             colour = torch.tensor(look.background)
-            picture = with_room(partial(renderer.draw, gaussians, frame.camera, to_device(colour, device)))
+            with checked_drawings():
+                picture = renderer.draw(gaussians, frame.camera, to_device(colour, device))
             images[look.background] = Pair(picture.image, to_device(frame.composite(colour), device))
         pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
     return pairs

@@ -36,4 +36,4 @@ def learned_turning(rotations: Float[Tensor, "T 3 3"]) -> Float[Tensor, "3 9"]:
 
 def head_rotation_input(turning: Float[Tensor, "3 9"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, 3]:
     """How the head is turned where R_cam_world is `rotation`; differentiable."""
-    return (turning @ rotation.reshape(9)).clamp(-LIMIT, LIMIT)
+    return (turning @ rotation.reshape(9).to(turning.dtype)).clamp(-LIMIT, LIMIT)

@@ -45,7 +45,8 @@ def expand(
     total = tl.load(ends + count - 1)
     live = (slot < total) & (total <= capacity)
 
-    # The first splat whose last slot is behind this one.
+    # The first splat whose last slot is behind this one. Programs behind the last pair search for nothing.
+    steps = tl.where(tl.program_id(0) * BLOCK < total, steps, 0)
     low = tl.zeros([BLOCK], tl.int32)
     high = low + count - 1
     for _ in range(steps):

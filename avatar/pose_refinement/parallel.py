@@ -12,7 +12,7 @@ from torch import Tensor
 from avatar.compute.native import thread_count
 from avatar.compute.workers import single_threaded_workers
 from avatar.render import AHEAD_ON_GPU, AHEAD_PER_WORKER
-from avatar.splat.capacity import CAPACITIES
+from avatar.splat.gpu_buffers import checked_drawings
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -42,7 +42,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Itera
 def read_later(begin: Callable[[Item], Tensor | None], items: Iterable[Item]) -> Iterator[Tensor | None]:
     """begin(item) for every item, brought to the CPU a few items later: a GPU has work while somebody waits for it.
 
-    What comes back with a NaN was drawn into buffers that were too small; it is begun again with room.
+    Where a NaN comes back, the item is begun again with checked drawings: raises CannotDraw if one of them is to blame.
     """
     pending: deque[tuple[Item, Tensor | None]] = deque()
 
@@ -50,9 +50,8 @@ def read_later(begin: Callable[[Item], Tensor | None], items: Iterable[Item]) ->
         item, begun = pending.popleft()
         found = None if begun is None else begun.cpu()
         if found is not None and bool(found.isnan().any()):
-            CAPACITIES.forget()
-            again = begin(item)
-            found = None if again is None else again.cpu()
+            with checked_drawings():
+                begin(item)
         return found
 
     for item in items:

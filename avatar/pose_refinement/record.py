@@ -6,7 +6,6 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from avatar.files.video import error_map, side_by_side
 from avatar.model import Avatar
 from avatar.pose_refinement.refine import Refined
 from avatar.render import Renderer
-from avatar.splat.capacity import with_room
+from avatar.splat.gpu_buffers import checked_drawings
 
 COLUMNS = ("frame", "name", "part", "psnr_before", "psnr_after", "turn_degrees", "shift_mm")
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
@@ -80,10 +79,11 @@ def sheet(
         frame = subject.frame(index, size)
         truth = frame.composite(background)
         weight = frame.head_mask[..., None]
-        renders = [
-            with_room(partial(renderer.render, recording.params(index), recording.camera(index, size))).image.cpu()
-            for recording in (subject.recording, after)
-        ]
+        with checked_drawings():
+            renders = [
+                renderer.render(recording.params(index), recording.camera(index, size)).image.cpu()
+                for recording in (subject.recording, after)
+            ]
         errors = [error_map(render * weight, truth * weight, ERROR_SCALE) for render in renders]
         captions = (
             f"truth of {frame.name}",

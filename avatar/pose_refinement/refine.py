@@ -9,11 +9,11 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from avatar.pose_refinement.parallel import in_order, read_later
 from avatar.pose_refinement.parameterization import PoseParameterization, find_parameterization
 from avatar.pose_refinement.progress import read_progress, write_progress
 from avatar.pose_refinement.smoothing import smoothed
+from avatar.splat import CannotDraw
 
 COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all
@@ -181,8 +182,7 @@ class _Work:
     def curvatures(self, count: int = SAMPLES) -> list[Float[Tensor, "F F"]]:
         """By level: the mean over a few training frames, with the prior's, which is one."""
         frames = self.samples(count)
-        made = in_order(self._curvatures, frames) if self.waits else read_later(self._stacked_curvatures, frames)
-        sampled = [found for found in made if found is not None]
+        sampled = [found for found in self._of_each(frames, self._curvatures) if found is not None]
         if not sampled:
             raise UserError(
                 f"no head is to be seen in the training frames of {self.subject.recording.name}: look at its masks"
@@ -190,24 +190,33 @@ class _Work:
         prior = torch.eye(len(self.parameterization.index))
         return [torch.stack(level).mean(dim=0) + prior for level in zip(*sampled, strict=True)]
 
-    def _curvatures(self, frame: int) -> list[Float[Tensor, "F F"]] | None:
+    def _curvatures(self, frame: int) -> Float[Tensor, "levels F F"] | None:
         made = self.targets(frame, self.levels)
         if made is None:
             return None
         problem = Problem(self.pose(frame), made, frame, self.there)
-        return [curvature(self.fitter, problem, level) for level in range(self.levels)]
+        return torch.stack([curvature(self.fitter, problem, level) for level in range(self.levels)])
 
-    def _stacked_curvatures(self, frame: int) -> Float[Tensor, "levels F F"] | None:
-        made = self._curvatures(frame)
-        return made if made is None else torch.stack(made)
+    def _of_each(self, frames: Iterable[int], function: Callable[[int], Any]) -> Iterator[Any]:
+        """function(frame) in order, on the CPU. Raises UserError for a frame that cannot be drawn."""
+
+        def named(frame: int) -> Any:
+            try:
+                return function(frame)
+            except CannotDraw as error:
+                raise UserError(
+                    f"frame {frame} cannot be drawn: {error}; or the avatar's training has gone wrong, train it again"
+                ) from error
+
+        return in_order(named, frames) if self.waits else read_later(named, frames)
 
     def refined(self, frames: Sequence[int], factors: Sequence[Float[Tensor, "F F"]]) -> Iterator[_Found]:
         """In order. Raises UserError for a frame that cannot be read, or drawn."""
         if self.waits:
-            yield from in_order(lambda frame: self.refine(frame, factors), frames)
+            yield from self._of_each(frames, lambda frame: self.refine(frame, factors))
             return
         unseen = _Found(torch.zeros(len(self.parameterization.index)), UNSEEN, UNSEEN.psnr)
-        for frame, found in zip(frames, read_later(lambda frame: self.begin(frame, factors), frames), strict=True):
+        for frame, found in zip(frames, self._of_each(frames, lambda frame: self.begin(frame, factors)), strict=True):
             if found is None:
                 yield unseen
                 continue
@@ -264,7 +273,7 @@ class _Work:
     def measured(self, frames: Sequence[int], values: Float[Tensor, "T P"]) -> Iterator[Measure]:
         """In order, each frame with its row of `values`."""
         if self.waits:
-            yield from in_order(lambda frame: self.measure(frame, values[frame]), frames)
+            yield from self._of_each(frames, lambda frame: self.measure(frame, values[frame]))
             return
         there = to_device(values, self.device)
 
@@ -272,7 +281,7 @@ class _Work:
             made = self.targets(frame, 1)
             return None if made is None else self.fitter.figures(there[frame], self.pose(frame), made[0])
 
-        for found in read_later(begin, frames):
+        for found in self._of_each(frames, begin):
             yield UNSEEN if found is None else Measure(*found.tolist())
 
     def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:

@@ -11,6 +11,7 @@ from avatar.evaluation.draw import panel
 from avatar.evaluation.measure import Pair
 from avatar.render import Renderer
 from avatar.runs.run import Run
+from avatar.splat.gpu_buffers import checked_drawings
 
 MAX_FRAMES = 40
 MAX_PANEL_WIDTH = 1080  # pixels of truth, render and error side by side; 40 of them stay under 5 MB
@@ -29,7 +30,8 @@ def frame_panels(run: Run) -> list[tuple[str, np.ndarray]]:
     panels = []
     with FrameLoader(subject, run.config.data.size) as loader:
         for frame in loader.frames(chosen):
-            render = renderer.render(frame.params, frame.camera).image.clamp(0, 1).cpu()
+            with checked_drawings():
+                render = renderer.render(frame.params, frame.camera).image.clamp(0, 1).cpu()
             image = panel(Pair(render, frame.composite(background)))
             if image.shape[1] > MAX_PANEL_WIDTH:
                 height = round(image.shape[0] * MAX_PANEL_WIDTH / image.shape[1])

@@ -23,6 +23,7 @@ from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_portrait
 from avatar.runs.inputs import checked_camera, checked_params
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
 
 
@@ -88,11 +89,13 @@ class TrainedAvatar:
     def render(self, params: HeadParams, camera: Camera | None = None) -> Rendering:
         """One picture, by default from the camera of the neutral face; [H, W, 3] and alpha [H, W], not clamped.
 
-        Raises UserError, naming the tensor, for parameters or a camera of another type, shape or dtype, or not finite.
+        Raises UserError, naming the tensor, for parameters or a camera of another type, shape or dtype, or not finite; and
+        where nothing can be drawn, for which a GPU is waited for.
         """
-        return self.renderer.render(
-            self._params(params), self.rest_camera() if camera is None else checked_camera(camera)
-        )
+        with checked_drawings():
+            return self.renderer.render(
+                self._params(params), self.rest_camera() if camera is None else checked_camera(camera)
+            )
 
     def stream(self, motion: Iterable[HeadParams | tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         """Pictures in order, several drawn at a time; `motion` may be endless.

@@ -72,8 +72,9 @@ def splat(
 
     Image, alpha and gradients of the "cpu" backend are the same to the last bit for any number of threads.
     Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
-    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. The
-    "gpu" backend learns of those when nobody waits for it any more: image and alpha are then NaN wherever it draws.
+    for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. On
+    the "gpu" backend image and alpha are NaN instead wherever it draws, also where the scene needs more memory than the
+    first of its kind fixed; within `avatar.splat.gpu_buffers.checked_drawings()` it waits for the GPU, and raises.
     """
     chosen = backend or _backend_for(gaussians.means)
     options = _checked_options(

@@ -1,7 +1,8 @@
 """Splatting on a GPU by the kernels of `avatar.kernels`, as an autograd function.
 
-A drawing reads nothing back, apart from the first of its kind (see `capacity`). So a value that is not finite, a colour
-that overflows or more pairs of tile and splat than there is room for cannot raise: image and alpha are NaN where it draws.
+A drawing reads nothing back, apart from the first of its kind and checked ones (see `gpu_buffers`). So a value that is not
+finite, a colour that overflows or more pairs of tile and splat than the buffers hold cannot raise: image and alpha are NaN
+where it draws.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from avatar.kernels.bin import FIELDS, expand, gather
 from avatar.kernels.composite import composite
 from avatar.kernels.project import POISON, project
 from avatar.kernels.start import start
-from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Kind
 from avatar.splat.cpu import CannotDraw
+from avatar.splat.gpu_buffers import MAX_PAIRS, Kind, capacity_of
 from avatar.splat.region import Region
 from avatar.tensors import check_finite
 from avatar.types import Gaussians, Rendering
@@ -124,12 +124,8 @@ def draw(
     )
     order = torch.sort(depths, stable=True).indices
     ends = boxes[3].index_select(0, order).cumsum(0)
-    kind = Kind(device, N, grid.tiles)
-    capacity = CAPACITIES.known(kind)
-    if capacity is None:
-        capacity = CAPACITIES.learn(kind, needed_pairs(gaussians, pose, background, boxes, ends))
-    if not 1 <= capacity <= MAX_PAIRS:
-        raise ValueError(f"the capacity must be 1 to {MAX_PAIRS} pairs of a tile and a splat, got {capacity}")
+    kind = Kind(device, N, grid.tiles, s.alpha_min)
+    capacity = capacity_of(kind, lambda: needed_pairs(gaussians, pose, background, boxes, ends))
 
     stride = programs(programs(capacity, tuning.chunk) * tuning.chunk + grid.tiles * tuning.chunk, ALIGNED) * ALIGNED
     key_type = torch.int16 if grid.tiles < 2**15 - 1 else torch.int32
@@ -173,7 +169,6 @@ def draw(
         CHUNK=tuning.chunk,
         STEP=tuning.step,
     )
-    CAPACITIES.watch(kind, ends)
     lists = (order, ends, boxes, begins, records, places)
     drawing = Drawing(tuning, grid, capacity, *lists, transmittances, stops, chunks)
     return Rendering(image, alphas), drawing

@@ -13,7 +13,7 @@ from avatar.data.loader import FrameLoader
 from avatar.data.split import evenly_spread
 from avatar.model import Avatar
 from avatar.splat import CannotDraw
-from avatar.splat.capacity import with_room
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.splat.sh import C0
 from avatar.train.step import stopped
 from avatar.types import Frame
@@ -56,7 +56,8 @@ def coverage(avatar: Avatar, frame: Frame, step: int) -> Float[Tensor, "N 2"]:
     flat = gaussians.means.new_zeros(len(gaussians.means), 1, 3).requires_grad_()
     black = flat.new_zeros(3)
     try:
-        drawn = with_room(lambda: avatar.draw(gaussians._replace(sh=flat), frame.camera, black))
+        with checked_drawings():
+            drawn = avatar.draw(gaussians._replace(sh=flat), frame.camera, black)
     except CannotDraw as error:
         raise stopped(step, frame, str(error)) from error
     head = frame.alpha * frame.head_mask

@@ -1,8 +1,8 @@
 """Training on a GPU, which is told of many steps before anything is known about the first.
 
 To ask after each step whether it was finite would make the GPU wait for the question. So it answers itself: a step whose
-loss or gradient is not finite moves nothing, and neither does any after it, until somebody has read of it and goes back.
-The parameters are then still those before that step.
+loss or gradient is not finite moves nothing, and neither does any after it. When the host reads of it the parameters are
+still those before that step, which can be repeated to find what was wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
-from avatar.splat.capacity import CAPACITIES
 from avatar.train.log import TrainingLog
 from avatar.train.step import Judge, StepOutputs
 
@@ -45,10 +44,6 @@ class Guard:
         norms = torch._foreach_norm(gradients)  # pyright: ignore
         self._sum.add_(torch.stack((*norms, loss.total.detach())).sum(), alpha=0.0)
         torch.ne(self._sum, self._sum, out=self.is_nonfinite)
-
-    def reset(self) -> None:
-        self._sum.zero_()
-        self.is_nonfinite.zero_()
 
 
 class Numbers(NamedTuple):
@@ -82,17 +77,13 @@ class SyncStepMonitor:
     def __init__(self, log: TrainingLog) -> None:
         self._log = log
 
-    def judge(self, step: int) -> None:
-        """`training_step` is to check step `step` itself."""
+    judge = None  # `train_step` checks each step itself
 
     def note(self, step: int, outcome: StepOutputs) -> None:
         self._log.step(step, outcome.loss, outcome.render, outcome.target)
 
     def settle(self) -> None:
         """Everything is known."""
-
-    def go_back(self, nonfinite: NonFiniteStep) -> int:
-        raise nonfinite
 
 
 class AsyncStepMonitor:
@@ -101,15 +92,11 @@ class AsyncStepMonitor:
     def __init__(self, log: TrainingLog, optimizer: torch.optim.Adam, device: torch.device) -> None:
         self._log, self._guard = log, Guard(optimizer, device)
         self._notes: deque[_Note] = deque()
-        self._suspect = -1
-
-    def judge(self, step: int) -> Judge | None:
-        """Who looks at step `step` (from 0) before it moves anything; None: `training_step`, which waits and says why."""
-        return None if step == self._suspect else self._guard.judge
+        self.judge: Judge = self._guard.judge
 
     @torch.no_grad()
     def note(self, step: int, outcome: StepOutputs) -> None:
-        """Send the numbers of a step (from 1) on their way, and log those that have arrived. Raises Spoilt."""
+        """Send the numbers of a step (from 1) on their way, and log those that have arrived. Raises NonFiniteStep."""
         total = outcome.loss.total.detach()
         quality = psnr(outcome.render, outcome.target).float() if self._log.shows(step) else total
         terms = [term.detach() for term in outcome.loss]
@@ -122,16 +109,8 @@ class AsyncStepMonitor:
         self._read(most_left=MOST_AHEAD)
 
     def settle(self) -> None:
-        """Wait for all that is known of the steps so far. Raises Spoilt."""
+        """Wait for all that is known of the steps so far. Raises NonFiniteStep."""
         self._read(most_left=0)
-
-    def go_back(self, nonfinite: NonFiniteStep) -> int:
-        """Give the step to repeat, with care: the GPU's buffers were too small for it, or it has an error to show."""
-        self._notes.clear()
-        self._guard.reset()
-        self._suspect = nonfinite.step
-        CAPACITIES.forget()
-        return nonfinite.step
 
     def _read(self, most_left: int) -> None:
         while self._notes and self._notes[0].has_arrived(wait=len(self._notes) > most_left):

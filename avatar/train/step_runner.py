@@ -9,18 +9,14 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from avatar.compute.cuda_graph import Replay
 from avatar.compute.device import on_gpu, to_device
-from avatar.splat.capacity import CAPACITIES, fixed_capacity
-from avatar.splat.capacity import Kind as DrawingKind
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
@@ -39,15 +35,6 @@ class Kind(NamedTuple):
     size: tuple[int, int]
     sh_degree: int
     term: Weighted | None
-
-
-class CapturedStep(NamedTuple):
-    """What replays the steps of a kind."""
-
-    replay: Replay[StepOutputs]
-    capacity: int | None  # pairs that it draws with; None: as many as it takes, which a GPU would have to wait for
-    drawing: DrawingKind
-    ends: Int[Tensor, " N"]  # of its drawing, see `Capacities.watch`
 
 
 class StepRunner:
@@ -69,8 +56,7 @@ class StepRunner:
         self._meshes = PosedMeshes(avatar)
         self._replays = on_gpu(avatar.code) and not avatar.code.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
-        self._drawings: dict[Kind, DrawingKind] = {}  # of those that were launched
-        self._captured: OrderedDict[Kind, CapturedStep] = OrderedDict()
+        self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
         self.replayed = 0  # steps so far
 
     def pose(self, frames: Iterable[Frame]) -> None:
@@ -84,17 +70,14 @@ class StepRunner:
         trainee, config = self._trainee, self._trainee.objective.config
         set_rates(trainee.optimizer, schedule(step, config))
         inputs, kind = self.inputs(step, frame), self._kind(step, frame)
-        captured = None if kind is None or judge is None else self._ready(kind, step, inputs, judge)
-        if captured is not None:
-            outputs = captured.replay(inputs.tensors())
-            CAPACITIES.watch(captured.drawing, captured.ends)
+        replay = None if kind is None or judge is None else self._ready(kind, step, inputs, judge)
+        if replay is not None:
             self.replayed += 1
-            return outputs
+            return replay(inputs.tensors())
         outputs = train_step(trainee, step, inputs, judge)
         move_points(trainee.avatar, trainee.optimizer, step + 1, config)
         if kind is not None and judge is not None:
             self._launched[kind] += 1
-            self._drawings[kind] = CAPACITIES.last_kind
         return outputs
 
     def inputs(self, step: int, frame: Frame) -> StepInputs:
@@ -116,24 +99,13 @@ class StepRunner:
             return None
         return Kind((frame.camera.width, frame.camera.height), sh_degree(step), term)
 
-    def _ready(self, kind: Kind, step: int, inputs: StepInputs, judge: Judge) -> CapturedStep | None:
-        """One that has the room that drawings of today need, captured if need be; None: the step has to be launched."""
-        captured = self._captured.get(kind)
-        if captured is not None and captured.capacity == CAPACITIES.known(captured.drawing):
-            return captured
-        self._captured.pop(kind, None)
-        return self._capture(kind, step, inputs, judge) if self._launched[kind] >= WARM else None
-
-    def _capture(self, kind: Kind, step: int, inputs: StepInputs, judge: Judge) -> CapturedStep | None:
-        """Steps like this one, which it does not make; None: it has to be launched."""
-        drawing = self._drawings[kind]
-        capacity = CAPACITIES.known(drawing)
-        if capacity is None and drawing.device.type == "cuda":
-            return None
+    def _ready(self, kind: Kind, step: int, inputs: StepInputs, judge: Judge) -> Replay[StepOutputs] | None:
+        """What replays steps like this one, captured if need be; None: the step has to be launched."""
+        if kind in self._captured or self._launched[kind] < WARM:
+            return self._captured.get(kind)
 
         def play(tensors: Mapping[str, Tensor]) -> StepOutputs:
-            with nullcontext() if capacity is None else fixed_capacity(capacity):
-                return train_step(self._trainee, step, inputs.with_tensors(tensors), judge)
+            return train_step(self._trainee, step, inputs.with_tensors(tensors), judge)
 
         try:
             replay = Replay(play, inputs.tensors())
@@ -143,5 +115,5 @@ class StepRunner:
             return None
         while len(self._captured) >= KEPT:
             self._captured.popitem(last=False)
-        self._captured[kind] = CapturedStep(replay, capacity, drawing, CAPACITIES.last_ends)
-        return self._captured[kind]
+        self._captured[kind] = replay
+        return replay

@@ -19,7 +19,7 @@ from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw
-from avatar.splat.capacity import with_room
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.train.condition_noise import make_noise
 from avatar.train.init_colours import colour_from_frames
 from avatar.train.log import TrainingLog
@@ -99,27 +99,30 @@ def train(
         progress = AsyncStepMonitor(log, optimizer, device) if is_gpu else SyncStepMonitor(log)
         rows = {index: row for row, index in enumerate(recording.split.train)}
         steps = StepRunner(trainee, make_noise(recording, trainer), rows, log.say)
-        while step < trainer.iterations and not interrupted():
-            order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
-            try:
-                for frame in loader.frames(order):
-                    outcome = steps.make(step, frame, progress.judge(step))
-                    step += 1
-                    progress.note(step, outcome)
-                    if step == prune_step(trainer):
-                        progress.settle()
-                        prune_background_gaussians(avatar, loader, subject.split.train, trainer.prune_share, step)
-                    saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
-                    if saves or interrupted():
-                        progress.settle()
-                    if saves:
-                        log.preview(step, *render_held_out(avatar, loader, subject, background, step))
-                        save(step)
-                        saved = step
-                    if interrupted():
-                        break
-            except NonFiniteStep as nonfinite:
-                step = progress.go_back(nonfinite)
+        order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
+        try:
+            for frame in loader.frames(order):
+                outcome = steps.make(step, frame, progress.judge)
+                step += 1
+                progress.note(step, outcome)
+                if step == prune_step(trainer):
+                    progress.settle()
+                    prune_background_gaussians(avatar, loader, subject.split.train, trainer.prune_share, step)
+                saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
+                if saves or interrupted():
+                    progress.settle()
+                if saves:
+                    log.preview(step, *render_held_out(avatar, loader, subject, background, step))
+                    save(step)
+                    saved = step
+                if interrupted():
+                    break
+        except NonFiniteStep as nonfinite:
+            index = next(frame_order(subject.split.train, trainer.seed, nonfinite.step, trainer.iterations))
+            frame = next(iter(loader.frames([index])))
+            with checked_drawings():
+                steps.make(nonfinite.step, frame, judge=None)  # raises what was wrong
+            raise stopped(nonfinite.step + 1, frame, "the loss or a gradient was not finite") from nonfinite
         if step > saved:
             save(step)
     return step
@@ -143,7 +146,8 @@ def render_held_out(
     frame = next(iter(loader.frames([subject.split.test[0]])))
     try:
         gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
-        drawn = with_room(lambda: avatar.draw(gaussians, frame.camera, background))
+        with checked_drawings():
+            drawn = avatar.draw(gaussians, frame.camera, background)
     except CannotDraw as error:
         raise stopped(step, frame, str(error)) from error
     return frame.composite(background), drawn.image

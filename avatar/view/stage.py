@@ -17,7 +17,7 @@ from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.controls import ExpressionControl, expression_controls, joint_ranges, posed
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat.capacity import with_room
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import Camera, HeadParams, Rendering
 
 Overlay = Literal["none", "mesh", "error"]
@@ -113,7 +113,8 @@ class Stage:
         own = frame[1].resized(width, max(1, round(width * frame[1].height / frame[1].width)))
         look, _ = self.within(setting.look)
         camera = orbited(own, look.yaw, look.pitch, look.zoom)
-        picture = to_bytes(with_room(lambda: self.rendered(params, camera)).image)
+        with checked_drawings():
+            picture = to_bytes(self.rendered(params, camera).image)
         if setting.overlay == "mesh":
             _draw_mesh(picture, self.trained.renderer.vertices(params).cpu(), self.trained.assets.faces, camera)
         beside = [picture]
@@ -122,7 +123,8 @@ class Stage:
             if setting.with_truth:
                 beside.append(to_bytes(truth))
             if setting.overlay == "error":  # of the recorded view, whatever the camera
-                drawn = with_room(lambda: self.rendered(frame[0], own)).image.cpu()
+                with checked_drawings():
+                    drawn = self.rendered(frame[0], own).image.cpu()
                 beside.append(to_bytes(error_map(drawn, truth, ERROR_SCALE)))
         return np.concatenate(beside, axis=1)
 

@@ -18,7 +18,6 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from avatar.compute.cuda_graph import Replay, own_stream
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
-from avatar.splat.capacity import CAPACITIES, Capacities, Kind, fixed_capacity
 from avatar.train import objective as objective_module
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
@@ -108,38 +107,6 @@ def test_what_cannot_be_captured_is_launched_and_said(
     assert_same(found, expected)
 
 
-def test_a_script_without_todays_room_is_written_anew(
-    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As if the drawings' numbers of pairs came back, and one of them was large."""
-    asked = {"times": 0}
-    known = Capacities.known
-
-    def growing(self: Capacities, kind: Kind) -> int | None:
-        if self.fixed is not None:
-            return known(self, kind)
-        asked["times"] += 1
-        return 4096 if asked["times"] < 12 else 8192
-
-    written: list[int | None] = []
-    replay = step_runner_module.Replay
-
-    def counting(*arguments: object) -> object:
-        written.append(CAPACITIES.known(CAPACITIES.last_kind))
-        return replay(*arguments)  # type: ignore[arg-type]
-
-    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, warm=99)
-    monkeypatch.setattr(Capacities, "known", growing)
-    monkeypatch.setattr(step_runner_module, "Replay", counting)
-    monkeypatch.setattr(objective_module, "PERCEPTUAL_START", 1.0)
-    found, steps, _ = trained(
-        tracked_folder, tmp_path / "run", monkeypatch, *TINY, "trainer.iterations=12", warm=1, degree_every=99
-    )
-    assert found.step == 12 and steps.replayed == 11
-    assert written == [4096, 8192]
-    assert expected.step == 20
-
-
 def test_a_replay_reads_what_it_is_given_each_time() -> None:
     weight = torch.full((3,), 2.0, device=DEVICE)
 
@@ -169,7 +136,7 @@ def test_a_replayed_drawing_follows_its_camera() -> None:
 
     R, t = scene.camera.R_cam_world.to(DEVICE), scene.camera.t_cam_world.to(DEVICE)
     poses = [{"R": R, "t": t}, {"R": R.roll(1, 0).contiguous(), "t": t + 0.1}, {"R": R, "t": t + 0.02}]
-    with fixed_capacity(4096), own_stream(DEVICE):
+    with own_stream(DEVICE):
         expected = [function(pose) for pose in poses]
         replay = Replay(function, poses[0])
         for pose, wanted in zip(poses, expected, strict=True):

@@ -16,8 +16,6 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
-from avatar.splat import capacity as capacity_module
-from avatar.splat import gpu_draw
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import choose_perceptual
@@ -101,36 +99,20 @@ def test_a_gradient_that_is_not_finite_is_named_and_has_moved_nothing(tracked_fo
 
 
 @pytest.mark.usefixtures("launched")
-def test_a_drawing_without_room_is_repeated_and_leaves_no_trace(
-    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Steps 3 and 4 find buffers that are too small, as if the splats had grown; the run is the same to the bit."""
-    steps = ("trainer.iterations=5",)
-    expected_avatar, expected = trained(tracked_folder, tmp_path / "whole", *steps)
-    drawn = {"count": 0, "without room": 0}
-    draw, forget = gpu_draw.draw, capacity_module.Capacities.forget
+def test_a_step_that_is_finite_when_it_is_repeated_stops_all_the_same(tracked_folder: Path, tmp_path: Path) -> None:
+    seen: list[int] = []
 
-    def sometimes_without_room(*arguments: object, **named: object) -> object:
-        drawn["count"] += 1
-        if drawn["count"] in (3, 4) and not drawn.get("forgotten"):
-            drawn["without room"] += 1
-            with capacity_module.fixed_capacity(2):
-                return draw(*arguments, **named)  # type: ignore[arg-type]
-        return draw(*arguments, **named)  # type: ignore[arg-type]
+    def poison_once(gradient: Tensor) -> Tensor:
+        seen.append(1)
+        return gradient * torch.nan if len(seen) == 2 else gradient
 
-    def forgotten(self: capacity_module.Capacities) -> None:
-        drawn["forgotten"] = 1
-        forget(self)
-
-    from avatar.splat import gpu
-
-    monkeypatch.setattr(gpu, "draw", sometimes_without_room)
-    monkeypatch.setattr(capacity_module.Capacities, "forget", forgotten)
-    avatar, found = trained(tracked_folder, tmp_path / "broken", *steps)
-    assert drawn["without room"] >= 1 and drawn["count"] > 5
-    assert found == expected
-    for (name, own), wanted in zip(avatar.state_dict().items(), expected_avatar.state_dict().values(), strict=True):
-        assert torch.equal(own, wanted), name
+    with pytest.raises(UserError, match="step 2, frame .*: the loss or a gradient was not finite"):
+        trained(
+            tracked_folder,
+            tmp_path / "run",
+            "trainer.iterations=4",
+            change=lambda avatar: avatar.sh_dc.register_hook(poison_once),
+        )
 
 
 def test_a_checkpoint_of_the_gpus_path_goes_on_there_to_the_same_bits_and_on_the_cpu_to_rounding(

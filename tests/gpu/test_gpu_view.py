@@ -14,7 +14,6 @@ from lively import lively_avatar
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat.capacity import fixed_capacity
 from avatar.view.stage import Setting, Stage
 
 
@@ -44,6 +43,5 @@ def test_a_picture_reads_nothing_back_before_it_is_there(
     trained: TrainedAvatar,
 ) -> None:
     stage = Stage(replace(trained, avatar=deepcopy(trained.avatar).to("meta")))
-    with fixed_capacity(10_000):
-        drawn = stage.rendered(trained.recording.params(5), trained.recording.camera(5, 48))
-        assert drawn.image.is_meta and drawn.image.shape == (48, 48, 3)
+    drawn = stage.rendered(trained.recording.params(5), trained.recording.camera(5, 48))
+    assert drawn.image.is_meta and drawn.image.shape == (48, 48, 3)

@@ -268,7 +268,7 @@ def test_the_estimate_is_the_time_of_a_frame_for_every_frame(
     monkeypatch.setenv("AVATAR_THREADS", "1")
     monkeypatch.setattr(refine_module.time, "perf_counter", lambda: now[0])
     values = len(refine_module.find_parameterization(wrong.recording.tracks, range(7), torch.zeros(3)).index)
-    monkeypatch.setattr(refine_module._Work, "_curvatures", taking(100.0, [torch.eye(values)]))
+    monkeypatch.setattr(refine_module._Work, "_curvatures", taking(100.0, torch.eye(values)[None]))
     monkeypatch.setattr(refine_module._Work, "refine", taking(10.0, None))
     monkeypatch.setattr(refine_module._Work, "measure", taking(1.0, None))
     assert estimated_seconds(avatar, cast(Subject, wrong), SIZE, BACKGROUND) == SAMPLES * 100.0 + 10 * 11.0

@@ -44,9 +44,7 @@ def adam(weights: list[Tensor]) -> torch.optim.Adam:
 
 
 @pytest.mark.parametrize("where", ["loss", "gradient", "norm"])
-def test_from_a_step_that_is_not_finite_on_nothing_moves_until_it_is_forgiven(
-    weights: list[Tensor], where: str
-) -> None:
+def test_from_a_step_that_is_not_finite_on_nothing_moves(weights: list[Tensor], where: str) -> None:
     optimizer = adam(weights)
     guard = Guard(optimizer, torch.device("cpu"))
     for step in range(5):
@@ -64,12 +62,6 @@ def test_from_a_step_that_is_not_finite_on_nothing_moves_until_it_is_forgiven(
         assert moved == [step < 2] * 2, step
         for weight in weights:
             assert float(optimizer.state[weight]["step"]) == float(counted[id(weight)]) + (step < 2)
-    guard.reset()
-    guard.judge(loss_of(1.0), [torch.ones(3)])
-    weights[0].grad = torch.ones(3)
-    before = weights[0].detach().clone()
-    optimizer.step()
-    assert not torch.equal(weights[0], before)
 
 
 def test_a_guard_changes_no_bit_of_a_step(weights: list[Tensor]) -> None:
@@ -99,22 +91,16 @@ def test_numbers_are_logged_in_order_with_all_terms(weights: list[Tensor]) -> No
     assert log.noted[1][3] == pytest.approx(20.0)  # of an error of 0.1, in dB
 
 
-def test_a_spoilt_step_is_named_and_repeated_with_care(weights: list[Tensor]) -> None:
+def test_a_step_that_is_not_finite_is_named_and_not_logged(weights: list[Tensor]) -> None:
     log = Log()
     ahead = AsyncStepMonitor(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
     for step, value in enumerate((1.0, float("nan"))):
-        judge = ahead.judge(step)
-        assert judge is not None
-        judge(loss_of(value), [torch.ones(3)])
+        ahead.judge(loss_of(value), [torch.ones(3)])
         if step == 0:
             ahead.note(step + 1, outcome_of(value))
     with pytest.raises(NonFiniteStep) as caught:
         ahead.note(2, outcome_of(float("nan")))
     assert caught.value.step == 1 and [step for step, *_ in log.noted] == [1]
-    assert ahead.go_back(caught.value) == 1
-    assert ahead.judge(1) is None and ahead.judge(2) is not None
-    ahead.note(2, outcome_of(5.0))
-    assert [step for step, *_ in log.noted] == [1, 2]
 
 
 def test_only_so_many_steps_are_ahead(weights: list[Tensor], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Room for pairs of tile and splat: what happens when it does not suffice, and values that nobody waits for."""
+"""Buffers for pairs of tile and splat: how large they are, drawings that exceed them, and values that nobody waits for."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from interpreter import DEVICE
+from interpreter import DEVICE, as_on_a_gpu
 from splat.scenes import (
     POSE,
     SCENES,
@@ -19,9 +19,10 @@ from splat.scenes import (
     render,
     with_inputs,
 )
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from avatar.splat import CannotDraw, _checked_options, splat
-from avatar.splat.capacity import CAPACITIES, MAX_PAIRS, Capacities, Kind, fixed_capacity, roomy
+from avatar.splat import CannotDraw, _checked_options, gpu_buffers, splat
+from avatar.splat.gpu_buffers import BYTES, HEADROOM, MAX_PAIRS, Kind, capacity_of, checked_drawings, most_pairs, roomy
 from avatar.types import Gaussians
 
 SCENE = SCENES["17x33"]
@@ -45,16 +46,21 @@ def pairs_of(scene: Scene) -> int:
 def test_room_for_exactly_the_pairs_is_enough_and_one_less_makes_the_image_nan() -> None:
     expected, needed = render(SCENE, "gpu"), pairs_of(SCENE)
     for capacity in (needed, needed + 1, 10 * needed):
-        with fixed_capacity(capacity):
+        with as_on_a_gpu(capacity):
             found = render(SCENE, "gpu")
         assert torch.equal(found.image, expected.image) and torch.equal(found.alpha, expected.alpha)
-    with fixed_capacity(needed - 1):
+    with as_on_a_gpu(needed - 1):
         spoilt = render(SCENE, "gpu")
+        with (
+            checked_drawings(),
+            pytest.raises(CannotDraw, match=f"needs {needed} pairs .* hold {needed - 1}; .*--size"),
+        ):
+            render(SCENE, "gpu")
     assert spoilt.image.isnan().all() and spoilt.alpha.isnan().all()
 
 
 def test_gradients_of_a_drawing_without_room_are_zero_and_no_garbage() -> None:
-    with fixed_capacity(3):
+    with as_on_a_gpu(3):
         found = gradients(SCENE, "gpu", torch.ones(33, 17, 3), None)
     background = found.pop("background")
     assert background.shape == (3,)
@@ -69,7 +75,7 @@ def test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits(field: s
     scene = replace(SCENE, background=tensor) if field == "background" else SCENE
     if field != "background":
         scene = replace(SCENE, gaussians=SCENE.gaussians._replace(**{field: tensor}))
-    with fixed_capacity(10_000):
+    with as_on_a_gpu(10_000):
         found = render(scene, "gpu")
     image = found.image[..., -1] if field == "background" else found.image
     assert not torch.isfinite(image).any()
@@ -86,18 +92,17 @@ def test_so_does_one_of_a_pose_that_is_on_the_gpu(name: str, value: float) -> No
     inputs = {name: tensor.to(DEVICE) for name, tensor in {**inputs_of(SCENE), name: pose}.items()}
     scene = with_inputs(SCENE, inputs)
     checked = _checked_options(SCENE.gaussians, SCENE.camera, SCENE.background, **options)
-    with fixed_capacity(10_000):
+    with as_on_a_gpu(10_000):
         found = splat_gpu(scene.gaussians, scene.camera, scene.background, **checked)
     assert found.image.isnan().all() and found.alpha.isnan().all()
-    CAPACITIES.forget()
-    with pytest.raises(CannotDraw, match=f"{name} has 1 non-finite of"):
+    with checked_drawings(), pytest.raises(CannotDraw, match=f"{name} has 1 non-finite of"):
         splat_gpu(scene.gaussians, scene.camera, scene.background, **checked)
 
 
 def test_a_value_that_is_not_finite_spoils_the_image_although_its_splat_is_hidden() -> None:
     opacities, sh = SCENE.gaussians.opacities.clone(), SCENE.gaussians.sh.clone()
     opacities[3], sh[3, 2, 1] = 0.0, torch.nan
-    with fixed_capacity(10_000):
+    with as_on_a_gpu(10_000):
         found = render(replace(SCENE, gaussians=SCENE.gaussians._replace(opacities=opacities, sh=sh)), "gpu")
     assert found.image.isnan().all()
 
@@ -107,43 +112,81 @@ def test_a_colour_that_overflows_spoils_the_image_if_it_would_show() -> None:
     sh = g.sh.clone()
     sh[7] = 3e38
     view = camera(20, 20, yaw=0.0)
-    with fixed_capacity(10_000):
+    with as_on_a_gpu(10_000):
         assert render(Scene(g._replace(sh=sh, means=g.means * 0.1), view), "gpu").image.isnan().all()
         aside = g.means * 0.1 + torch.tensor([30.0, 0.0, 0.0]) * (torch.arange(9) == 7)[:, None]
         assert torch.isfinite(render(Scene(g._replace(sh=sh, means=aside), view), "gpu").image).all()
 
 
-def test_no_capacity_is_refused() -> None:
-    with fixed_capacity(0), pytest.raises(ValueError, match="the capacity must be 1 to 67108864 pairs"):
-        render(SCENE, "gpu")
+KIND = Kind(DEVICE, splats=1000, tiles=1000, alpha_min=1 / 255)
 
 
-def test_the_fixed_capacity_ends_with_its_block() -> None:
-    with fixed_capacity(3):
-        assert CAPACITIES.known(Kind(torch.device("cuda", 0), 5, 5)) == 3
-    assert CAPACITIES.fixed is None
+def never() -> int:
+    raise AssertionError("a drawing waited")
 
 
-def test_capacities_are_learnt_by_kind_grow_and_are_forgotten() -> None:
-    capacities, one, other = Capacities(), Kind(torch.device("cuda", 0), 5, 5), Kind(torch.device("cuda", 0), 5, 6)
-    assert capacities.known(one) is None
-    first = capacities.learn(one, 100_000)
-    assert 150_000 <= first < 160_000 and capacities.known(one) == first and capacities.known(other) is None
-    for needed, expected in ((100_000, first), (first, roomy(first)), (MAX_PAIRS + 1, roomy(first))):
-        capacities._grow(one, needed)
-        assert capacities.known(one) == expected
-    capacities.forget()
-    assert capacities.known(one) is None
+def test_the_first_drawing_of_a_kind_waits_and_fixes_the_capacity_of_all() -> None:
+    with as_on_a_gpu():
+        capacity = capacity_of(KIND, lambda: 50_000)
+        assert capacity == HEADROOM * 50_000 == capacity_of(KIND, never)
+        assert capacity_of(KIND._replace(tiles=1001), lambda: 60_000) == HEADROOM * 60_000
+        assert capacity_of(KIND, never) == capacity
+        with checked_drawings():
+            assert capacity_of(KIND, lambda: capacity) == capacity
+            with pytest.raises(CannotDraw, match=f"needs {capacity + 1} pairs"):
+                capacity_of(KIND, lambda: capacity + 1)
 
 
-def test_where_triton_interprets_every_drawing_waits() -> None:
-    capacities, kind = Capacities(), Kind(torch.device("cpu"), 5, 5)
-    capacities.learn(kind, 10)
-    assert capacities.known(kind) is None
+def test_checked_drawings_fix_nothing_and_hold_what_each_needs() -> None:
+    with as_on_a_gpu() as fixed:
+        with checked_drawings():
+            for needed in (0, 50_000, 1_000_000, 7):
+                assert needed < capacity_of(KIND, lambda needed=needed: needed) <= needed + 4096
+        assert not fixed
+        with checked_drawings(), pytest.raises(KeyError), checked_drawings():
+            raise KeyError
+        assert capacity_of(KIND, lambda: 50_000) == HEADROOM * 50_000
 
 
-def test_there_is_room_where_nothing_is_needed_and_never_too_much() -> None:
-    assert roomy(0) > 0
-    assert roomy(MAX_PAIRS) == MAX_PAIRS
+def test_a_capacity_has_headroom_and_is_bounded() -> None:
+    nothing_drawn = roomy(KIND, 0, None)
+    assert 50_000 < nothing_drawn < 100_000, "a first drawing that shows nothing says nothing of the next"
+    assert roomy(KIND, 10, None) == nothing_drawn
+    assert roomy(KIND._replace(splats=3), 10, None) == most_pairs(KIND._replace(splats=3)) == 3000
+    huge = KIND._replace(splats=10**6)
+    assert roomy(huge, MAX_PAIRS - 1, None) == roomy(huge, MAX_PAIRS, None) == MAX_PAIRS
+    # Half of the free memory for the headroom; what is needed is asked for in any case.
+    assert roomy(huge, 10**6, 2 * BYTES * 1.5e6) == 1_500_000
+    assert roomy(huge, 10**6, 0.0) == 10**6
     # int32 finds every value of a record, with room for the tiles' rounding.
     assert 9 * (MAX_PAIRS + 32 * 2**20) < 2**31
+
+
+class Allocated(TorchDispatchMode):
+    """Bytes of the tensors that torch.empty and torch.sort give."""
+
+    total = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), named: Any = None) -> Any:
+        made = function(*arguments, **(named or {}))
+        if function.overloadpacket.__name__ in ("empty", "sort"):
+            self.total += sum(tensor.nbytes for tensor in (made if isinstance(made, tuple) else (made,)))
+        return made
+
+
+def test_the_bytes_of_a_pair_are_those_of_the_buffers() -> None:
+    totals = []
+    for capacity in (8_000, 16_000):
+        with as_on_a_gpu(capacity), Allocated() as allocated:
+            gradients(SCENE, "gpu", torch.ones(33, 17, 3), None)
+        totals.append(allocated.total)
+    sorting, wide_keys = 16, 4  # inside of torch.sort; a key takes 2 bytes in these few tiles
+    assert (totals[1] - totals[0]) / 8_000 + sorting + wide_keys == BYTES
+
+
+def test_other_cut_offs_are_another_kind_of_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("HEADROOM", 1), ("PER_SPLAT", 0), ("PER_TILE", 0)):
+        monkeypatch.setattr(gpu_buffers, name, value)
+    with as_on_a_gpu():
+        for alpha_min in (0.5, 0.0):
+            assert torch.isfinite(render(SCENE.with_options(alpha_min=alpha_min), "gpu").image).all(), alpha_min
