@@ -1,11 +1,12 @@
 """Corrections of the training frames' head poses, trained with the avatar, as gsplat's CameraOptModule does.
 
-A correction is a rotation vector w and a shift s in the camera's axes. With c the head's centre and p = R c + t,
+A correction is a rotation vector w and a shift s in the camera's axes, both small. It turns the head about its centre c:
 
-    R' = exp([w]x) R        t' = exp([w]x) (t - p) + p + s
+    R' = (I + [w]x) R        t' = t + s - [w]x R c
 
-Held-out frames and drivers keep the poses of their tracking. So the corrections' mean over the training frames is
-subtracted: a pose that all frames share is the avatar's.
+to first order in w: a correction of half a degree stretches the head by 4e-5. So R' and t' are linear in the correction,
+and a GPU needs a few launches for them. Held-out frames and drivers keep the poses of their tracking; therefore the
+corrections' mean over the training frames is subtracted: a pose that all frames share is the avatar's.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
+from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor, nn
 
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.model import Avatar
-from avatar.pose_refinement.motion import HeadPose, moved_pose
 from avatar.types import Camera
 
 TURN_UNIT, SHIFT_UNIT, DEPTH_UNIT = 0.5 * math.pi / 180, 1e-3, 0.5e-3  # radians, metres: a tracker's usual errors
@@ -38,21 +39,25 @@ def make_pose_corrections(avatar: Avatar, frames: int, config: TrainerConfig) ->
 class PoseCorrections(nn.Module):
     """One correction for each of `frames` training frames, zero at the start; `centre` of the head, metres."""
 
-    centre: Float[Tensor, "3"]
-    unit: Float[Tensor, "6"]
-
     def __init__(self, frames: int, centre: Float[Tensor, "3"]) -> None:
         super().__init__()
         self.moves = nn.Parameter(torch.zeros(frames, 6))  # w and s, in units
-        self.register_buffer("unit", torch.tensor([TURN_UNIT] * 3 + [SHIFT_UNIT] * 2 + [DEPTH_UNIT]), persistent=False)
-        self.register_buffer("centre", centre, persistent=False)
+        self._centre = centre
 
-    def forward(self, camera: Camera, row: Int[Tensor, ""]) -> Camera:
+    def jacobian(self, R: Float[Tensor, "3 3"]) -> Float[Tensor, "6 12"]:
+        """What one unit of each part of a correction adds to (R row by row, t) of a camera; all on the CPU."""
+        turns = TURN_UNIT * vector_to_skew_symmetric_matrix(torch.eye(3, dtype=R.dtype)) @ R
+        shifts = torch.diag(torch.tensor([SHIFT_UNIT, SHIFT_UNIT, DEPTH_UNIT], dtype=R.dtype))
+        still = torch.zeros(3, 9, dtype=R.dtype)
+        turned = torch.cat((turns.flatten(1), -turns @ self._centre.to(R.dtype)), dim=1)
+        return torch.cat((turned, torch.cat((still, shifts), dim=1)))
+
+    def forward(self, camera: Camera, row: Int[Tensor, "1"], jacobian: Float[Tensor, "6 12"]) -> Camera:
         """The camera of training frame number `row`, corrected; differentiable in its correction."""
-        own = self.moves.index_select(0, row.reshape(1))[0] - self.moves.detach().mean(dim=0)
-        given = HeadPose(camera.R_cam_world, camera.t_cam_world)
-        pose = moved_pose((own * self.unit).to(given.t), given, self.centre.to(given.t))
-        return replace(camera, R_cam_world=pose.R, t_cam_world=pose.t)
+        own = self.moves.index_select(0, row)[0] - self.moves.detach().mean(dim=0)
+        given = torch.cat((camera.R_cam_world.flatten(), camera.t_cam_world))
+        R, t = torch.addmv(given, jacobian.T, own.to(given.dtype)).split((9, 3))
+        return replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t)
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Take the corrections of a checkpoint. Raises UserError where they are missing or are not of these frames."""

@@ -25,6 +25,7 @@ from avatar.types import Frame, HeadParams
 Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
 
 _IMAGES = ("image", "alpha", "head_mask", "mouth_mask")
+_OPTIONAL = ("noise", "row", "pose_jacobian")
 _PARAMS = tuple(field.name for field in fields(HeadParams))
 
 
@@ -33,23 +34,24 @@ class StepInputs(NamedTuple):
 
     frame: Frame
     vertices: Float[Tensor, "V 3"]  # posed by the frame's parameters, metres
-    row: Int[Tensor, ""]  # of the frame among the pose corrections
     noise: Float[Tensor, " C"] | None = None  # added to the network's input
+    row: Int[Tensor, "1"] | None = None  # of the frame among the pose corrections
+    pose_jacobian: Float[Tensor, "6 12"] | None = None  # of the frame's camera in its correction
 
     def tensors(self) -> dict[str, Tensor]:
         """All that differs between two steps, by name."""
         frame, camera = self.frame, self.frame.camera
         named = {name: getattr(frame, name) for name in _IMAGES} | {"R": camera.R_cam_world, "t": camera.t_cam_world}
         named |= {name: getattr(frame.params, name) for name in _PARAMS}
-        named |= {"vertices": self.vertices, "row": self.row}
-        return named if self.noise is None else named | {"noise": self.noise}
+        optional = {name: getattr(self, name) for name in _OPTIONAL}
+        return named | {"vertices": self.vertices} | {n: value for n, value in optional.items() if value is not None}
 
     def with_tensors(self, named: Mapping[str, Tensor]) -> StepInputs:
         """The same with other `tensors`."""
         camera = replace(self.frame.camera, R_cam_world=named["R"], t_cam_world=named["t"])
         params = HeadParams(**{name: named[name] for name in _PARAMS})
         frame = replace(self.frame, camera=camera, params=params, **{name: named[name] for name in _IMAGES})
-        return StepInputs(frame, named["vertices"], named["row"], named.get("noise"))
+        return StepInputs(frame, named["vertices"], **{name: named.get(name) for name in _OPTIONAL})
 
 
 class StepOutputs(NamedTuple):
@@ -88,7 +90,7 @@ def train_step(trainee: Trainee, step: int, inputs: StepInputs, judge: Judge | N
     if inputs.noise is not None:
         params = params.with_condition(params.condition() + inputs.noise)
     if trainee.pose_corrections is not None:
-        camera = trainee.pose_corrections(camera, inputs.row)
+        camera = trainee.pose_corrections(camera, inputs.row, inputs.pose_jacobian)
     try:
         gaussians = avatar(params, inputs.vertices, camera.R_cam_world.detach())
         image = objective.draw(step, gaussians, camera, avatar)

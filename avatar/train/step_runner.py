@@ -40,7 +40,7 @@ class Kind(NamedTuple):
 class StepRunner:
     """Makes the steps of one training.
 
-    rows  of the pose corrections, by the frame's index; needed where there are any
+    rows  of the pose corrections, by the frame's index; None: frame 0 is the only one
     """
 
     def __init__(
@@ -50,10 +50,11 @@ class StepRunner:
         rows: Mapping[int, int] | None = None,
         say: Callable[[str], object] = print,
     ) -> None:
-        self._trainee, self._noise, self._rows, self._say = trainee, noise, rows or {}, say
+        self._trainee, self._noise, self._rows, self._say = trainee, noise, rows or {0: 0}, say
         avatar = trainee.avatar
         self._device = avatar.code.device
         self._meshes = PosedMeshes(avatar)
+        self._jacobians: dict[int, Tensor] = {}  # of the frames' cameras in their corrections
         self._replays = on_gpu(avatar.code) and not avatar.code.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
         self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
@@ -82,15 +83,20 @@ class StepRunner:
 
     def inputs(self, step: int, frame: Frame) -> StepInputs:
         """What step `step` takes of a frame, where the avatar is."""
-        device = self._device
-        if on_gpu(self._trainee.avatar.code):
+        vertices, camera = self._meshes.vertices(frame), frame.camera
+        noise = None if self._noise is None else to_device(self._noise.of(step), self._device)
+        corrections, row, jacobian = self._trainee.pose_corrections, None, None
+        if corrections is not None:
+            row = torch.full((1,), self._rows[frame.index], device=self._device)
+            if frame.index not in self._jacobians:
+                self._jacobians[frame.index] = to_device(corrections.jacobian(camera.R_cam_world), self._device)
+            jacobian = self._jacobians[frame.index]
+        if on_gpu(vertices):
             from avatar.splat.gpu import pose_on  # imports Triton, which is not there on every machine
 
-            pose = pose_on(frame.camera, device)
-            frame = replace(frame, camera=replace(frame.camera, R_cam_world=pose[:9].view(3, 3), t_cam_world=pose[9:]))
-        row = torch.full((), self._rows.get(frame.index, 0), device=device)
-        noise = None if self._noise is None else to_device(self._noise.of(step), device)
-        return StepInputs(frame, self._meshes.vertices(frame), row, noise)
+            R, t = pose_on(camera, self._device).float().split((9, 3))
+            frame = replace(frame, camera=replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t))
+        return StepInputs(frame, vertices, noise, row, jacobian)
 
     def _kind(self, step: int, frame: Frame) -> Kind | None:
         """None: to be launched."""

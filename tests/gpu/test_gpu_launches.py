@@ -21,7 +21,7 @@ from avatar.types import Gaussians
 pytest.importorskip("triton", reason="Triton is not installed")
 pytestmark = pytest.mark.without_kernels  # the meta device has none
 
-MOST_IN_A_STEP, MOST_IN_A_FRAME, MOST_IN_A_MOVING_STEP = 150, 60, 900
+MOST_IN_A_STEP, MOST_ON_AVERAGE, MOST_IN_A_FRAME = 150, 175, 60
 STAND_IN = PerceptualTerm("dssim", Weighted(dssim, 0.05))
 
 
@@ -46,12 +46,11 @@ def test_a_fast_step_and_a_frame_launch_little(counts: dict[str, Counter[str]]) 
     for name in ("step, first half", "step with D-SSIM"):
         assert 50 < counts[name].total() <= MOST_IN_A_STEP, name
     assert 20 < counts["rendered frame"].total() <= MOST_IN_A_FRAME
-    assert MOST_IN_A_STEP < counts["step that moves its frame"].total() <= MOST_IN_A_MOVING_STEP
 
 
 def test_so_does_a_step_on_average_with_lpips_in_every_tenth(counts: dict[str, Counter[str]]) -> None:
     first, second, tenth = (counts[name].total() for name in list(counts)[:3])
-    assert (first + 0.9 * second + 0.1 * tenth) / 2 <= MOST_IN_A_STEP
+    assert (first + 0.9 * second + 0.1 * tenth) / 2 <= MOST_ON_AVERAGE
 
 
 def test_every_kernel_of_a_step_is_ours_once_or_twice(counts: dict[str, Counter[str]]) -> None:

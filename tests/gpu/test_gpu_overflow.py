@@ -29,8 +29,8 @@ from avatar.runs.trained import TrainedAvatar
 from avatar.splat import CannotDraw, gpu_buffers
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
-from avatar.train.prune import coverage
 from avatar.train.objective import choose_perceptual
+from avatar.train.prune import coverage
 from avatar.train.trainer import train
 from avatar.types import Frame
 from avatar.view.stage import Look, Setting, Stage

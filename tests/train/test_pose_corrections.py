@@ -16,7 +16,14 @@ from avatar.pose_refinement.motion import HeadPose, moved_pose
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import make_optimizer
-from avatar.train.pose_corrections import PREFIX, PoseCorrections, make_pose_corrections
+from avatar.train.pose_corrections import (
+    DEPTH_UNIT,
+    PREFIX,
+    SHIFT_UNIT,
+    TURN_UNIT,
+    PoseCorrections,
+    make_pose_corrections,
+)
 from avatar.train.step import Trainee
 from avatar.train.step_runner import StepRunner
 from avatar.types import Camera
@@ -46,7 +53,8 @@ def corrected(avatar: Avatar, clip: Clip) -> tuple[PoseCorrections, Clip]:
         steps.make(step, replace(clip.pictures[index], camera=clip.recording.camera(index)), None)
     tracks = {name: value.clone() for name, value in clip.recording.tracks.items()}
     for index, row in rows.items():
-        camera = corrections(clip.recording.camera(index), torch.tensor(row))
+        given = clip.recording.camera(index)
+        camera = corrections(given, torch.tensor([row]), corrections.jacobian(given.R_cam_world))
         tracks["R"][index], tracks["t"][index] = camera.R_cam_world.detach(), camera.t_cam_world.detach()
     return corrections, replace(clip, recording=replace(clip.recording, tracks=tracks))
 
@@ -65,17 +73,22 @@ def test_a_correction_turns_the_head_about_its_centre_and_has_no_common_part() -
     corrections = PoseCorrections(3, centre)
     R, t = torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.01, 0.0, 0.8])
     camera = Camera(R, t, 90.0, 90.0, 16.0, 16.0, 32, 32)
-    assert torch.equal(corrections(camera, torch.tensor(1)).R_cam_world, camera.R_cam_world)
+
+    def pose() -> HeadPose:
+        moved = corrections(camera, torch.tensor([2]), corrections.jacobian(R))
+        return HeadPose(moved.R_cam_world.detach(), moved.t_cam_world.detach())
+
+    assert torch.equal(pose().R, R) and torch.equal(pose().t, t)
     with torch.no_grad():
-        corrections.moves.copy_(torch.arange(18.0).reshape(3, 6))
-    own = (corrections.moves[2] - corrections.moves.mean(dim=0)) * corrections.unit
-    expected = moved_pose(own, HeadPose(camera.R_cam_world, camera.t_cam_world), centre)
-    found = corrections(camera, torch.tensor(2))
-    torch.testing.assert_close(found.R_cam_world, expected.R)
-    torch.testing.assert_close(found.t_cam_world, expected.t)
-    with torch.no_grad():
-        corrections.moves += 5.0
-    torch.testing.assert_close(corrections(camera, torch.tensor(2)).t_cam_world, expected.t)
+        corrections.moves.copy_(0.1 * torch.arange(18.0).reshape(3, 6))
+    own = corrections.moves.detach()[2] - corrections.moves.detach().mean(dim=0)
+    units = torch.tensor([TURN_UNIT] * 3 + [SHIFT_UNIT] * 2 + [DEPTH_UNIT])
+    expected = moved_pose(own * units, HeadPose(R, t), centre)
+    for found in (pose(), pose()):
+        torch.testing.assert_close(found.R, expected.R, atol=1e-4, rtol=0.0)  # the square of a hundredth
+        torch.testing.assert_close(found.R @ centre + found.t, expected.R @ centre + expected.t, atol=1e-6, rtol=0.0)
+        with torch.no_grad():
+            corrections.moves += 0.5
 
 
 def test_a_resumed_run_has_the_same_bits(tracked_folder: Path, tmp_path: Path) -> None:
