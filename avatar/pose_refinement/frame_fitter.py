@@ -19,9 +19,9 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, normalize
 
 from avatar.compute.device import on_gpu, to_device
+from avatar.gaussians.avatar import SH_DEGREE, Avatar
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
-from avatar.model import SH_DEGREE, Avatar
 from avatar.pose_refinement.motion import TURN, HeadPose, head_params, moved_pose, quaternion
 from avatar.splat.sh import C0, sh_colours
 from avatar.types import Camera, Frame, Gaussians, HeadParams

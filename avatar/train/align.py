@@ -29,7 +29,7 @@ from avatar.config import Config
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.pose_refinement.frame_fitter import OBSERVATIONS, PIXEL_SIGMA, FrameFitter
 from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose
 from avatar.pose_refinement.parameterization import PoseParameterization, find_parameterization
@@ -96,7 +96,7 @@ class Alignment:
     """The moves of a subject's training frames, from the given tracking; where the avatar is."""
 
     def __init__(self, avatar: Avatar, subject: Subject, config: Config) -> None:
-        trainer, device = config.trainer, avatar.code.device
+        trainer, device = config.trainer, avatar.device
         self._trainer, self._device = trainer, device
         self._begin = round(BEGIN * trainer.iterations)
         self._again = max(round(AGAIN * trainer.iterations), self._begin + 1)

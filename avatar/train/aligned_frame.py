@@ -105,7 +105,7 @@ def moving_step(
 ) -> None:
     """What step number `step` (from 0) takes where it moves its frame's tracking, for who times it; by nothing."""
     avatar, params = fitter.avatar, frame.params
-    given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world).on(avatar.code.device)
+    given = HeadPose(frame.camera.R_cam_world, frame.camera.t_cam_world).on(avatar.device)
     tracks = {name: getattr(params, name)[None] for name in ("neck", "jaw", "eyes", "eyelids", "expression")}
     values = values_of(tracks | {"t": given.t[None]})[0]
     degree = sh_degree(step)

@@ -14,8 +14,8 @@ from torch import Tensor
 from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
-from avatar.model import Avatar
 from avatar.pose_refinement.frame_fitter import FrameFitter
+from avatar.runs.models import make_avatar
 from avatar.train.align import MOVING_SHARE
 from avatar.train.aligned_frame import moving_step
 from avatar.train.optimizer import make_optimizer
@@ -52,7 +52,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     Raises UserError for frames that are too small to train on.
     """
     torch.manual_seed(config.trainer.seed)
-    avatar = Avatar(assets, identity, config.model)
+    avatar = make_avatar(assets, identity, config.model)
     optimizer = make_optimizer(avatar, config.trainer)
     size = frame.camera.width, frame.camera.height
     term = choose_perceptual(config.trainer, lambda _: None, size=size)

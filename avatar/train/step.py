@@ -15,6 +15,7 @@ from torch import Tensor
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
+from avatar.gaussians.avatar import SH_DEGREE, Avatar
 from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_WINDOW
@@ -27,11 +28,9 @@ from avatar.losses.photometric import (
     on_head,
     photometric_loss,
 )
-from avatar.model import SH_DEGREE, Avatar
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
 from avatar.train.optimizer import schedule, set_rates
-from avatar.train.points import move_points
 from avatar.types import Frame, Gaussians
 
 SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part
@@ -131,7 +130,7 @@ def training_step(
     """
     set_rates(optimizer, schedule(step, objective.config))
     outcome = descend(avatar, optimizer, objective, step, frame, vertices, judge, watched)
-    move_points(avatar, optimizer, step + 1, objective.config)
+    avatar.after_step(optimizer, step + 1, objective.config)
     return outcome
 
 

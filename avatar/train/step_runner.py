@@ -19,7 +19,7 @@ from torch import Tensor
 
 from avatar.compute.cuda_graph import Replay
 from avatar.compute.device import on_gpu, to_device
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.splat.capacity import CAPACITIES, fixed_capacity
 from avatar.splat.capacity import Kind as DrawingKind
 from avatar.train.align import Alignment, FrameCorrection, StepInput
@@ -69,7 +69,7 @@ class StepRunner:
         self._avatar, self._optimizer, self._objective = avatar, optimizer, objective
         self._noise, self._alignment, self._say = noise, alignment, say
         self._meshes = PosedMeshes(avatar)
-        self._replays = on_gpu(avatar.code) and not avatar.code.is_meta and avatar.is_fused
+        self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
         self._drawings: dict[Kind, DrawingKind] = {}  # of those that were launched
         self._captured: OrderedDict[Kind, CapturedStep] = OrderedDict()
@@ -178,7 +178,7 @@ class StepRunner:
         """What differs between steps of a kind, where the avatar is; in the order in which `_play` takes it."""
         from avatar.splat.gpu import pose_on  # imports Triton, which is not there on every machine
 
-        avatar, device = self._avatar, self._avatar.code.device
+        avatar, device = self._avatar, self._avatar.device
         shown = frame if seen is None else seen.frame
         few = [torch.zeros(1) if row is None else torch.tensor([row.rate])]
         few += [] if avatar.turning is None else [avatar.head_rotation(shown.camera.R_cam_world)]

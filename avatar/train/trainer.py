@@ -14,7 +14,7 @@ from avatar.config import Config
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
@@ -65,7 +65,7 @@ def train(
     optimizer = make_optimizer(avatar, trainer)
     if resume is not None:
         load_optimizer(optimizer, avatar, resume.tensors)
-    is_gpu = on_gpu(avatar.code)
+    is_gpu = on_gpu(avatar.quats)
     alignment = make_alignment(avatar, subject, config, None if resume is None else resume.tensors)
     background = torch.tensor(config.data.background).to(device)
     objective = Objective(trainer, background, perceptual)

@@ -15,7 +15,7 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.compute.device import CPU
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.pose_refinement.frame_fitter import FrameFitter
 from avatar.pose_refinement.motion import HeadPose
 from avatar.pose_refinement.parameterization import find_parameterization

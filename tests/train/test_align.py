@@ -15,7 +15,7 @@ from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, scr
 from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.errors import UserError
-from avatar.model import SH_DEGREE, Avatar
+from avatar.gaussians.avatar import SH_DEGREE, Avatar
 from avatar.pose_refinement.frame_fitter import FrameFitter, misfit, targets
 from avatar.pose_refinement.motion import HeadPose, moved_tracks
 from avatar.pose_refinement.parameterization import find_parameterization
