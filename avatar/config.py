@@ -60,7 +60,7 @@ class ModelConfig:
 
 @dataclass
 class LearningRates:
-    """Adam's learning rates of the Gaussians; `train/optimizer.py` has those that do not vary."""
+    """Adam's learning rates of the Gaussians; `gaussians/avatar.py` has those that do not vary."""
 
     sh_dc: Annotated[float, RATE, "base colour"] = 1.0e-2
     sh_rest: Annotated[float, RATE, "view-dependent colour"] = 2.5e-3

@@ -23,10 +23,7 @@ from avatar.types import Gaussians, HeadParams
 
 
 class FlashAvatar(Avatar):
-    """FlashAvatar: a network gives each Gaussian its offsets from a point on the posed head.
-
-    Optional parts: `model.skull_binding`, `model.head_rotation`, `model.teeth`.
-    """
+    """FlashAvatar: a network gives each Gaussian its offsets from a point on the posed head."""
 
     heads: ClassVar[type[Any] | None] = None  # made of the numbers of Gaussians and latent values; None: no latents
     is_fused = has_stages = True
@@ -57,7 +54,8 @@ class FlashAvatar(Avatar):
 
             packed, binding = None if self.hyper is None else self.hyper.packed, self.skull_binding(params)
             return compose_gpu(vertices, values, packed, *self.base(), self.embedding, self.grid, binding)
-        return self.compose(self.points(vertices, params), self.offsets(self.interpolate(values)))
+        latents = self.interpolate(values)
+        return self.compose(self.points(vertices, params), self.offsets(latents))
 
     def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "N 3"]:
         """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""

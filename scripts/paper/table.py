@@ -119,7 +119,7 @@ def drawn(run: Path, job: Job) -> tuple[float, int]:
 def count_parameters(avatar: Avatar) -> int:
     """As the paper counts: the network and the distributions, without what every Gaussian has."""
     state = avatar.state_dict()
-    return sum(value.numel() for name, value in state.items() if name.startswith(("deformation.", "hyper.", "ndgs.")))
+    return sum(value.numel() for name, value in state.items() if name.startswith(("deformation.", "hyper.")))
 
 
 def shown(row: Row) -> list[str]:
