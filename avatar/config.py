@@ -60,7 +60,7 @@ class ModelConfig:
 
 @dataclass
 class LearningRates:
-    """Adam's learning rates of the Gaussians; `train/optimizer.py` has those that do not vary."""
+    """Adam's learning rates of the Gaussians; `gaussians/avatar.py` has those that do not vary."""
 
     sh_dc: Annotated[float, RATE, "base colour"] = 1.0e-2
     sh_rest: Annotated[float, RATE, "view-dependent colour"] = 2.5e-3
@@ -96,7 +96,7 @@ class TrainerConfig:
     ] = 0.05
     pose_rate: Annotated[
         float, SHARE, "learning rate of the training frames' pose corrections, in half degrees and millimetres; 0: none"
-    ] = 0.005
+    ] = 0.01
     condition_noise: Annotated[
         float, SHARE, "noise on the network's input, as a share of each coefficient's standard deviation"
     ] = 0.2

@@ -28,8 +28,8 @@ from avatar.head.assets import HeadAssets
 from avatar.kernels.start import watched
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
-from avatar.model import Avatar
 from avatar.render import Renderer
+from avatar.runs.models import make_avatar
 from avatar.splat.scenes import head_camera
 from avatar.train.objective import SPARSE_EVERY, Objective, PerceptualTerm, Weighted
 from avatar.train.optimizer import make_optimizer, schedule, set_rates
@@ -100,7 +100,7 @@ class Rehearsal:
         device: torch.device = META,
     ) -> None:
         config = load_config([f"model.uv_size={uv_size}", *overrides])
-        avatar = Avatar(assets, torch.zeros(1), config.model)
+        avatar = make_avatar(assets, torch.zeros(1), config.model)
         avatar.embedding.touching(avatar.mesh.assets.num_vertices)  # made once, and only of numbers that are there
         self.avatar = avatar.to(device)
         self.config, self.trainer = config, config.trainer

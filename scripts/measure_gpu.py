@@ -172,7 +172,7 @@ def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: 
     functions: dict[str, Callable[[], object]] = {
         "splatting, forward": scene.forward,
         "splatting, backward": scene.backward,
-        "posing": settled(lambda: renderer.vertices(rehearsal.params)),
+        "posing": settled(lambda: renderer.avatar.vertices(rehearsal.params)),
         "network, HyperGaussians and placing": settled(lambda: renderer.gaussians(rehearsal.params)),
         "a rendered frame": settled(lambda: renderer.render(rehearsal.params, rehearsal.camera)),
         "a training step, first half": settled(lambda: rehearsal.train(STAND_IN, late=False)),

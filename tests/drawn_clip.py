@@ -16,8 +16,9 @@ from tracked_folder import write_head_model
 
 from avatar.data.recording import Recording
 from avatar.data.split import Split
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, EYES, JAW, POSE, SHIFT, TURN, moved_tracks, values_of
+from avatar.runs.models import make_avatar
 from avatar.splat.sh import C0
 from avatar.types import IDENTITY_6D, Frame
 
@@ -55,7 +56,7 @@ def patterned_avatar(folder: Path, *overrides: str) -> Avatar:
     assets = write_head_model(folder, EXPRESSIONS)
     torch.manual_seed(0)
     config = small_config("model.uv_size=48", "model.initial_opacity=0.8", *overrides)
-    avatar = Avatar(assets, torch.tensor([0.5, -0.3]), config.model)
+    avatar = make_avatar(assets, torch.tensor([0.5, -0.3]), config.model)
     places = avatar.embedding.points(avatar.head.neutral_vertices())
     pattern = 0.5 + 0.35 * torch.sin(150.0 * places + torch.tensor([0.0, 1.0, 2.0]))
     with torch.no_grad():

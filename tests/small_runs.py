@@ -11,10 +11,11 @@ import torch
 from avatar.config import Config, chosen_options, load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
+from avatar.gaussians.avatar import Avatar
 from avatar.head.assets import HeadAssets
-from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
 from avatar.runs.checkpoint import Checkpoint
+from avatar.runs.models import make_avatar
 from avatar.runs.run import start_run
 from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
@@ -42,7 +43,7 @@ def open_small(folder: Path, config: Config) -> tuple[Source, Subject, HeadAsset
 
 def new_avatar(assets: HeadAssets, subject: Subject, config: Config) -> Avatar:
     torch.manual_seed(config.trainer.seed)
-    return Avatar(assets, subject.identity, config.model)
+    return make_avatar(assets, subject.identity, config.model)
 
 
 def train_small(

@@ -16,7 +16,7 @@ ORDER = [
     *("avatar.compute", "avatar.types", "avatar.kernels"),
     *("avatar.head", "avatar.data", "avatar.config_values", "avatar.config"),
     *("data_prep", "data_prep.formats", "data_prep.prepare", "data_prep.check", "data_prep.track", "data_prep.live"),
-    *("avatar.losses", "avatar.splat", "avatar.gaussians", "avatar.model", "avatar.render"),
+    *("avatar.losses", "avatar.splat", "avatar.gaussians", "avatar.model", "avatar.baselines", "avatar.render"),
     *("avatar.pose_refinement", "avatar.motion", "avatar.runs", "avatar.train", "avatar.evaluation"),
     *("avatar.pipeline", "avatar.report", "avatar.view", "avatar.export", "avatar.sweep"),
     *("avatar.demo", "avatar.bench", "avatar.commands", "avatar.cli", "avatar"),

@@ -11,8 +11,9 @@ from heads import EXPRESSIONS, grid_head, random_params
 from avatar.compute.workers import single_threaded_workers
 from avatar.config import load_config
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.render import AHEAD_PER_WORKER, Renderer
+from avatar.runs.models import make_avatar
 from avatar.types import Camera, HeadParams
 
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
@@ -22,17 +23,18 @@ CAMERA = Camera(torch.eye(3), torch.tensor([0.0, 0.0, 0.5]), 120.0, 120.0, 30.0,
 def trained_looking(*overrides: str) -> Avatar:
     """An avatar none of whose parameters is where it starts."""
     config = load_config(["model.uv_size=24", "model.mlp_width=32", "model.mlp_layers=3", *overrides])
-    avatar = Avatar(grid_head(), torch.zeros(3), config.model)
+    avatar = make_avatar(grid_head(), torch.zeros(3), config.model)
     with torch.no_grad():
         for parameter in avatar.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
         avatar.opacity_logits += 2.0
-        if avatar.mesh_points is not None:  # a place is in metres
+        if hasattr(avatar, "mesh_points"):  # a place is in metres
             avatar.mesh_points.place *= 0.02
             avatar.mesh_points.walk()
-        if avatar.count is not None:
+        if hasattr(avatar, "count"):
             avatar.count.fill_(len(avatar) // 2)
-        if avatar.deformation is not None:  # offsets that stay in the picture, and latents near those of NDGS
+            avatar.encode_points()
+        if hasattr(avatar, "deformation"):  # offsets that stay in the picture, and latents near those of NDGS
             for parameter in avatar.deformation.output.parameters():
                 parameter *= 0.1
     return avatar

@@ -25,16 +25,17 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.evaluation.lpips_networks import find_lpips
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
+from avatar.gaussians.avatar import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
-from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
 from avatar.pipeline.plan import WITH_REFINEMENT, round_steps
 from avatar.pose_refinement.motion import EXPRESSION, values_of
 from avatar.pose_refinement.refine import refine_subject
 from avatar.render import Renderer
+from avatar.runs.models import make_avatar
 from avatar.train.objective import choose_perceptual
 from avatar.train.order import planned_steps, within_passes
 from avatar.train.trainer import train
@@ -121,7 +122,7 @@ class Trial:
         trainer = within_passes(self.config.trainer, len(recording.split.train))
         config, subject = replace(self.config, trainer=trainer), replace(self.subject, recording=recording)
         torch.manual_seed(config.trainer.seed)
-        avatar = Avatar(self.assets, subject.identity, config.model)
+        avatar = make_avatar(self.assets, subject.identity, config.model)
         term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
         if train(avatar, subject, config, self.scratch / name, term) < config.trainer.iterations:
             raise KeyboardInterrupt

@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
+from torch import Tensor
 
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
@@ -24,6 +25,7 @@ from avatar.bench.results import write_report
 from avatar.bench.splat_gpu import settle
 from avatar.compute.device import on_gpu, to_device
 from avatar.errors import UserError
+from avatar.model import FlashAvatar
 from avatar.render import Renderer
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
@@ -82,9 +84,9 @@ def describe(trained: TrainedAvatar) -> dict[str, Any]:
 
 def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> list[Row]:
     """Compare, then time, where the avatar is. Raises UserError when the renderer draws another picture: its time would
-    say nothing; and for an avatar without a network, whose steps are others. On a GPU the steps are one launch or two, and
+    say nothing; and for an avatar whose steps are others. On a GPU the steps are one launch or two, and
     not timed apart."""
-    if trained.avatar.deformation is None:
+    if not trained.avatar.has_stages:
         raise UserError(
             f"the steps of a frame of model={trained.config.model.name} are not timed; choose another avatar"
         )
@@ -146,22 +148,26 @@ def compare(trained: TrainedAvatar, renderer: Renderer, frames: Sequence[Input])
 def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callable[[], object]]]:
     """For each step one call per frame, on what the steps before it gave."""
     calls: dict[str, list[Callable[[], object]]] = {name: [] for name in STEPS}
+    avatar = cast(FlashAvatar, renderer.avatar)
+
+    def latents(params: HeadParams, camera: Camera) -> Tensor:
+        return avatar.interpolate(avatar.deformation(avatar.code, avatar.condition(params, camera.R_cam_world)))
+
     for params, camera in frames:
-        vertices = renderer.vertices(params)
-        points, latents = renderer.points(vertices, params), renderer.latents(params, camera)
-        offsets = renderer.offsets(latents)
-        gaussians = renderer.place(points, offsets)
-        calls["skinning"].append(partial(renderer.vertices, params))
-        calls["embedding"].append(partial(renderer.points, vertices, params))
-        calls["network"].append(partial(renderer.latents, params, camera))
-        calls["heads"].append(partial(renderer.offsets, latents))
-        calls["compose"].append(partial(renderer.place, points, offsets))
+        vertices, z = avatar.vertices(params), latents(params, camera)
+        points, offsets = avatar.points(vertices, params), avatar.offsets(z)
+        gaussians = avatar.compose(points, offsets)
+        calls["skinning"].append(partial(avatar.vertices, params))
+        calls["embedding"].append(partial(avatar.points, vertices, params))
+        calls["network"].append(partial(latents, params, camera))
+        calls["heads"].append(partial(avatar.offsets, z))
+        calls["compose"].append(partial(avatar.compose, points, offsets))
         calls["splat"].append(partial(renderer.draw, gaussians, camera, renderer.background))
     return calls
 
 
 def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
-    background = to_device(torch.tensor(trained.config.data.background), trained.avatar.code.device)
+    background = to_device(torch.tensor(trained.config.data.background), trained.avatar.device)
     return trained.avatar.draw(trained.avatar(params, None, camera.R_cam_world), camera, background)
 
 

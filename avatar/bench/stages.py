@@ -5,17 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.gaussians.compose import compose_raw
-from avatar.gaussians.deformation import DeformationMLP
+from avatar.gaussians.avatar import Avatar
 from avatar.gaussians.skull_binding import bind_to_skull
 from avatar.losses.photometric import PhotometricLoss
-from avatar.model import Avatar
+from avatar.model import FlashAvatar
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import Trainee, check_step, gradients_of
 from avatar.types import Frame, Gaussians
@@ -47,7 +46,7 @@ class StagedStep:
     """A training step of `avatar`, stage by stage: the operations of `train_step`, without pose corrections."""
 
     def __init__(self, trainee: Trainee) -> None:
-        self.avatar, self.optimizer, self.objective = trainee.avatar, trainee.optimizer, trainee.objective
+        self.avatar, self.optimizer, self.objective = with_stages(trainee.avatar), trainee.optimizer, trainee.objective
         self.watch = Stopwatch()
         self._chain: list[Link] = []
 
@@ -61,21 +60,17 @@ class StagedStep:
         points = watch.measure("embedding", lambda: avatar.embedding.points(vertices))
         condition = avatar.condition(frame.params, frame.camera.R_cam_world)
 
-        deformation = network_of(avatar)
-        (raw,) = self._forward(
-            "network", lambda: (deformation(avatar.code, condition),), [], list(deformation.parameters())
-        )
+        network = avatar.deformation
+        (raw,) = self._forward("network", lambda: (network(avatar.code, condition),), [], list(network.parameters()))
         if avatar.grid is not None:
-            interpolate = avatar.grid.interpolate
-            (raw,) = self._forward("interpolation", lambda z: (interpolate(z),), [raw])
+            (raw,) = self._forward("interpolation", lambda z: (avatar.interpolate(z),), [raw])
         if avatar.hyper is not None:
-            heads = avatar.hyper
-            (raw,) = self._forward("heads", lambda z: (heads(z),), [raw], list(heads.parameters()))
+            (raw,) = self._forward("heads", lambda z: (avatar.offsets(z),), [raw], list(avatar.hyper.parameters()))
         base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
         skull_binding = avatar.skull_binding(frame.params)
         gaussians = self._forward(
             "compose",
-            lambda z: compose_raw(bind_to_skull(points, skull_binding), *base[:3], torch.cat(base[3:], dim=1), z),  # type: ignore[arg-type]
+            lambda z: avatar.compose(bind_to_skull(points, skull_binding), z),
             [raw],
             base if avatar.skull_logits is None else [*base, avatar.skull_logits],
         )
@@ -124,11 +119,11 @@ class StagedStep:
                     cotangents.append(gradient)
 
 
-def network_of(avatar: Avatar) -> DeformationMLP:
+def with_stages(avatar: Avatar) -> FlashAvatar:
     """Raises UserError for an avatar whose steps are others than the stages that are timed."""
-    if avatar.deformation is None or avatar.mesh_points is not None:
+    if not avatar.has_stages:
         raise UserError(f"the stages of a step of model={avatar.config.name} are not timed; choose another model")
-    return avatar.deformation
+    return cast(FlashAvatar, avatar)
 
 
 def gradients(link: Link, cotangents: Sequence[Tensor]) -> list[Tensor]:

@@ -13,7 +13,7 @@ from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians, time_of
 from avatar.bench.floor import floor_ms
 from avatar.bench.splat_gpu import settle
-from avatar.bench.stages import StagedStep, network_of
+from avatar.bench.stages import StagedStep, with_stages
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import on_gpu
 from avatar.config import Config, load_config
@@ -21,8 +21,10 @@ from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
+from avatar.model import FlashAvatar
 from avatar.pipeline.open import split_sizes
+from avatar.runs.models import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
@@ -80,7 +82,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     for recipe, own in RECIPES.items():
         config = load_config([*own, *overrides])
         torch.manual_seed(config.trainer.seed)
-        avatar = Avatar(assets, subject.identity, config.model)
+        avatar = make_avatar(assets, subject.identity, config.model)
         with torch.no_grad():  # opacities as after training: what is drawn decides what drawing costs
             avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
         avatar.to(torch.device(request.device))
@@ -95,12 +97,12 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
         Row(
             recipe,
             len(learner.avatar),
-            len(learner.avatar.code),
+            len(with_stages(learner.avatar).code),
             sum(p.numel() for p in learner.avatar.parameters()),
             times[recipe, False],
             per_step(times[recipe, True], steps_at_once(learner)),
-            {} if on_gpu(learner.avatar.code) else stages(learner, subject, repeats),
-            {} if on_gpu(learner.avatar.code) else floors(learner.avatar),
+            {} if on_gpu(learner.avatar.quats) else stages(learner, subject, repeats),
+            {} if on_gpu(learner.avatar.quats) else floors(with_stages(learner.avatar)),
         )
         for recipe, learner in learners.items()
     ]
@@ -115,7 +117,7 @@ def make_learner(
     """
     train = subject.split.train
     chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
-    device, is_gpu = avatar.code.device, on_gpu(avatar.code)
+    device, is_gpu = avatar.device, on_gpu(avatar.quats)
     frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None
     with FrameLoader(subject, config.data.size, frame_cache=frame_cache) as loader:
         frames = list(loader.frames(chosen))
@@ -148,7 +150,7 @@ def run_steps(learner: Learner, late: bool) -> None:
             learner.step(number)
     else:
         learner.step(perceptual_start(learner.config.trainer) - 1)
-    settle(learner.avatar.code.device)
+    settle(learner.avatar.device)
 
 
 def per_step(time: Time, steps: int) -> Time:
@@ -168,14 +170,14 @@ def stages(learner: Learner, subject: Subject, repeats: int) -> dict[str, Time]:
     return {name: time_of(values[2:]) for name, values in staged.watch.spans.items()}
 
 
-def floors(avatar: Avatar) -> dict[str, float]:
+def floors(avatar: FlashAvatar) -> dict[str, float]:
     """Milliseconds in which this machine does the products, or moves the bytes, that a stage cannot do without.
 
     Network: a product for the outputs, one for the weights' gradients and, behind the first layer, one for the inputs'.
     Heads: parameters and latents read twice, their gradients written once, offsets and their gradients moved once.
     Optimizer: parameters, gradients and both moments read, all but the gradients written. Check: gradients read.
     """
-    threads, places, network = torch.get_num_threads(), len(avatar.code), network_of(avatar)
+    threads, places, network = torch.get_num_threads(), len(avatar.code), avatar.deformation
     first, *others = [layer.weight for layer in network.modules() if isinstance(layer, torch.nn.Linear)]
     code = first[:, : network.code_size].numel()
     products = 2 * code + 3 * sum(weight.numel() for weight in others)

@@ -32,10 +32,10 @@ from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer as Truth
 from avatar.demo.subject import make_subject, tracking_bias
+from avatar.gaussians.avatar import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import psnr
-from avatar.model import Avatar
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.pipeline.open import split_sizes

@@ -30,7 +30,7 @@ def bake_texture(trained: TrainedAvatar, params: HeadParams, size: int) -> UInt8
     """The map of a face as posed, rows from the top. What no side sees takes the Gaussians' own colour there."""
     texels = uv_texels(trained.assets, size)
     embedding = Embedding(trained.assets, texels)
-    vertices = trained.renderer.vertices(params)
+    vertices = trained.avatar.vertices(params)
     points = embedding.points(vertices)
     normals = _normals(vertices, trained.assets.faces)[texels.face]
     colours, weights = torch.zeros(len(points), 3), torch.zeros(len(points))

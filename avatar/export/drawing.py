@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.gaussians.deformation import DeformationMLP
+from avatar.gaussians.deformation import FoldedNetwork
 from avatar.head.assets import JOINT_NAMES, HeadAssets
-from avatar.model import Avatar
+from avatar.model import FlashAvatar
 from avatar.runs.trained import TrainedAvatar
 
 # The arrays of csrc/web/portrait.h, in its order.
@@ -64,34 +65,28 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
 
     Raises UserError for an avatar that does not fold.
     """
-    model, assets = trained.avatar, trained.avatar.mesh.assets
-    if model.ndgs is not None:
+    if (unknown := trained.avatar.unknown_to_browsers) is not None:
         raise UserError(
-            "an avatar of model=ndgs cannot be exported for browsers, which do not know its opacities; train one with "
-            "model=hypergaussians"
+            f"an avatar of model={trained.config.model.name} cannot be exported for browsers, which do not know {unknown}; "
+            "train one with model=hypergaussians"
         )
-    if model.mesh_points is not None or model.deformation is None:
-        raise UserError(
-            f"an avatar of model={model.config.name} cannot be exported for browsers, which do not know points that have "
-            "left their texel; train one with model=hypergaussians"
-        )
+    model, assets = cast(FlashAvatar, trained.avatar), trained.avatar.mesh.assets
     moved = (trained.recording.tracks["expression"] != 0).any(dim=0).nonzero().flatten()
     used, corners = torch.unique(model.embedding.corners, return_inverse=True)
     arrays: dict[str, Tensor] = {
         **_head_arrays(model, assets, used, moved),
         "barycentric": model.embedding.barycentric,
-        **_network_arrays(model, model.deformation, moved, assets.num_expressions),
+        **_network_arrays(model, moved, assets.num_expressions),
         "quats": model.quats,
         "log_scales": model.log_scales,
         "opacity_logits": model.opacity_logits,
         "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1),
-        "rigidity": torch.zeros(0) if model.skull_shares is None else model.skull_shares,
+        "rigidity": torch.zeros(0) if model.skull_logits is None else torch.sigmoid(model.skull_logits),
     }
-    grid = None if model.grid is None else model.grid.interpolate
-    empty = torch.zeros(0)
+    grid, empty = model.grid, torch.zeros(0)
     arrays["grid_weights"] = empty if grid is None else grid.weights
     folded = None if model.hyper is None else model.hyper.fold()
-    arrays["head_matrix"], arrays["head_bias"] = (empty, empty) if folded is None else folded
+    arrays["head_matrix"], arrays["head_bias"] = (empty, empty) if folded is None else (folded.matrix, folded.bias)
     sizes = {
         "vertices": len(used),
         "expressions": len(moved),
@@ -103,7 +98,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "coefficients": arrays["sh"].shape[1],
         "has_grid": int(grid is not None),
         "has_heads": int(folded is not None),
-        "has_rigidity": int(model.skull_shares is not None),
+        "has_rigidity": int(model.skull_logits is not None),
         "has_facing": int(model.turning is not None),
     }
     return Drawing(
@@ -117,7 +112,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
 
 
 def _head_arrays(
-    model: Avatar, assets: HeadAssets, used: Int[Tensor, " v"], moved: Int[Tensor, " e"]
+    model: FlashAvatar, assets: HeadAssets, used: Int[Tensor, " v"], moved: Int[Tensor, " e"]
 ) -> dict[str, Tensor]:
     """Skinning of the vertices that Gaussians are bound to; joints with the expressions folded in."""
     identity = model.mesh.neutral_vertices()
@@ -135,18 +130,17 @@ def _head_arrays(
     }
 
 
-def _network_arrays(
-    model: Avatar, network: DeformationMLP, moved: Int[Tensor, " e"], expressions: int
-) -> dict[str, Tensor]:
+def _network_arrays(model: FlashAvatar, moved: Int[Tensor, " e"], expressions: int) -> dict[str, Tensor]:
     """The deformation network with the first layer's product with the positional code done."""
-    for_code, for_condition = network.input.weight.split((network.code_size, network.condition_size), dim=1)
-    conditions = torch.cat((moved, torch.arange(expressions, network.condition_size)))
+    network = FoldedNetwork(model.deformation, model.code)
+    conditions = torch.cat((moved, torch.arange(expressions, network.for_condition.shape[1])))
+    *hidden, (output_weights, output_bias) = network.layers
     return {
-        "of_code": model.code @ for_code.T,
-        "for_condition": for_condition[:, conditions].T,
-        "input_bias": network.input.bias,
-        "hidden_weights": torch.cat([torch.zeros(0), *(layer.weight.T.reshape(-1) for layer in network.hidden)]),  # type: ignore[union-attr]
-        "hidden_biases": torch.cat([torch.zeros(0), *(layer.bias for layer in network.hidden)]),  # type: ignore[union-attr]
-        "output_weights": network.output.weight.T,
-        "output_bias": network.output.bias,
+        "of_code": network.of_code,
+        "for_condition": network.for_condition[:, conditions].T,
+        "input_bias": network.bias,
+        "hidden_weights": torch.cat([torch.zeros(0), *(weight.reshape(-1) for weight, _ in hidden)]),
+        "hidden_biases": torch.cat([torch.zeros(0), *(bias for _, bias in hidden)]),
+        "output_weights": output_weights,
+        "output_bias": output_bias,
     }

@@ -33,7 +33,7 @@ def encode_glb(trained: TrainedAvatar, params: HeadParams, size: int, licence: s
     corners = torch.stack((assets.faces.reshape(-1), assets.uv_faces.reshape(-1)), dim=1)
     unique, index = torch.unique(corners, dim=0, return_inverse=True)
     of_vertex, of_uv = unique.unbind(dim=1)
-    base = trained.renderer.vertices(params)[: assets.num_vertices]
+    base = trained.avatar.vertices(params)[: assets.num_vertices]
     image = Image.fromarray(bake_texture(trained, params, size))
     material = PBRMaterial(
         name=trained.name, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True

@@ -56,51 +56,6 @@ def compose(
     )
 
 
-def compose_slice(
-    points: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    log_scales: Float[Tensor, "N 3"],
-    opacity_logits: Float[Tensor, " N"],
-    sh: Float[Tensor, "N K 3"],
-    position: Float[Tensor, "N 3"],
-    density: Float[Tensor, " N"],
-) -> Gaussians:
-    """Gaussians that move and fade, and do not turn or grow: a slice of N-dimensional ones (`avatar.gaussians.ndgs`).
-
-    position  offsets, metres, through tanh as FlashAvatar's are
-    density   the opacity's factor, in [0, 1]
-    """
-    return Gaussians(
-        means=points + torch.tanh(position),
-        quats=torch.nn.functional.normalize(quats, dim=-1),
-        scales=torch.exp(log_scales),
-        opacities=torch.sigmoid(opacity_logits) * density,
-        sh=sh,
-    )
-
-
-def compose_carried(
-    points: Float[Tensor, "N 3"],
-    turns: Float[Tensor, "N 4"],
-    quats: Float[Tensor, "N 4"],
-    log_scales: Float[Tensor, "N 3"],
-    opacity_logits: Float[Tensor, " N"],
-    sh: Float[Tensor, "N K 3"],
-) -> Gaussians:
-    """Gaussians that a mesh carries and that are otherwise the same in every frame (`avatar.gaussians.mesh_points`).
-
-    turns   the mesh's rotation at each, unit quaternions
-    """
-    base = torch.nn.functional.normalize(quats, dim=-1)
-    return Gaussians(
-        means=points,
-        quats=torch.nn.functional.normalize(quaternion_product(turns, base), dim=-1),
-        scales=torch.exp(log_scales),
-        opacities=torch.sigmoid(opacity_logits),
-        sh=sh,
-    )
-
-
 def compose_raw(
     points: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -30,3 +32,31 @@ class DeformationMLP(nn.Module):
         for layer in self.hidden:
             x = torch.relu_(layer(x))
         return self.output(x)
+
+
+class FoldedNetwork(nn.Module):
+    """A network that is not trained any more, with the first layer's product with the code done; the same to rounding."""
+
+    def __init__(self, network: DeformationMLP, code: Float[Tensor, "N C"]) -> None:
+        super().__init__()
+        for_code, for_condition = network.input.weight.detach().split((network.code_size, network.condition_size), 1)
+        self.of_code = code @ for_code.T
+        self.for_condition, self.bias = for_condition.clone(), network.input.bias.detach().clone()
+        self.layers = [
+            (layer.get_parameter("weight").detach().T.clone(), layer.get_parameter("bias").detach().clone())
+            for layer in (*network.hidden, network.output)
+        ]
+        self._of_thread = threading.local()  # megabytes: fresh memory in every frame would cost page faults
+
+    def forward(self, _: Tensor, condition: Float[Tensor, " D"]) -> Float[Tensor, "N O"]:
+        """What the network gives for its code, which it has already, and this condition; no gradients."""
+        of_frame, own = torch.addmv(self.bias, self.for_condition, condition), self._of_thread
+        if not hasattr(own, "pair"):
+            own.pair = torch.empty_like(self.of_code), torch.empty_like(self.of_code)
+        x, spare = own.pair
+        torch.add(self.of_code, of_frame, out=x).relu_()
+        for weight, bias in self.layers[:-1]:
+            torch.addmm(bias, x, weight, out=spare).relu_()
+            x, spare = spare, x
+        weight, bias = self.layers[-1]
+        return torch.addmm(bias, x, weight)

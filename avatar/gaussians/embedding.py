@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from avatar.gaussians.hyper_cpu import Touching, touching_lists
 from avatar.gaussians.uv import UVTexels
@@ -22,13 +25,22 @@ class Embedding:
         self.barycentric: Float[Tensor, "N 3"] = texels.barycentric
         self._flat_corners = self.corners.reshape(-1)
         self._touching: Touching | None = None
+        self._is_folded = False
 
     def __len__(self) -> int:
         return len(self.corners)
 
     def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
+        if self._is_folded:
+            return embedding_bag(self.corners, vertices, mode="sum", per_sample_weights=self.barycentric)
         corners = vertices.index_select(0, self._flat_corners).reshape(-1, 3, 3)
         return (corners * self.barycentric.to(vertices.dtype)[:, :, None]).sum(dim=1)
+
+    def fold(self) -> Embedding:
+        """The same to rounding, in one operator, for inference."""
+        folded = copy(self)
+        folded._is_folded = True
+        return folded
 
     def touching(self, num_vertices: int) -> Touching:
         """The Gaussians that hang on each vertex; made when it is first asked for."""

@@ -199,12 +199,17 @@ class HyperHeads(nn.Module):
             self.set_heads({name: HyperHead(*values) for name, values in parts.items()})
 
 
-class FoldedHeads(NamedTuple):
+class FoldedHeads(nn.Module):
     """Heads that are not trained any more: offsets = bias + latents times matrix, for each Gaussian its own."""
 
     matrix: Float[Tensor, "N n 10"]
     bias: Float[Tensor, "N 10"]
 
-    def __call__(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
+    def __init__(self, matrix: Float[Tensor, "N n 10"], bias: Float[Tensor, "N 10"]) -> None:
+        super().__init__()
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("bias", bias)
+
+    def forward(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N 10"]:
         """What the heads gave when they were folded, to rounding; no gradients."""
         return apply_folded(self.matrix, self.bias, latents)

@@ -87,16 +87,6 @@ def apply_folded(
     return offsets
 
 
-def interpolate(
-    grid_values: Float[Tensor, "G n"], cells: Int[Tensor, "N 4"], weights: Float[Tensor, "N 4"]
-) -> Float[Tensor, "N n"]:
-    """(grid_values[cells] * weights[..., None]).sum(1), differentiable in `grid_values`.
-
-    For more than one call with the same cells an `Interpolation` does the sorting for the backward pass only once.
-    """
-    return Interpolation(cells, weights, len(grid_values))(grid_values)
-
-
 class Touching(NamedTuple):
     """For each place the Gaussians that take part of it, place by place, in the order of the Gaussians."""
 

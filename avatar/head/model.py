@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avatar.compute.device import CPU, to_device
 from avatar.head.assets import HeadAssets
 from avatar.tensors import check_shapes
 from avatar.types import HeadParams
@@ -70,6 +71,7 @@ class HeadModel:
         self._weights = assets.weights.to(dtype)
         self._eyelid_dirs = assets.eyelid_dirs.to(dtype)
         self._parents = assets.parents
+        self._pose_tensors: PoseTensors | None = None
 
     def pose_tensors(self, device: torch.device) -> PoseTensors | None:
         """Copies for posing on a GPU; None for a head whose joints hang together in another way than FLAME's."""
@@ -144,6 +146,16 @@ class HeadModel:
         blended_R = (self._weights @ R.reshape(-1, 9)).reshape(-1, 3, 3)
         posed = (blended_R @ shape[:, :, None]).squeeze(-1) + self._weights @ t
         return posed + torch.einsum("s,svc->vc", params.eyelids.to(dtype), self._eyelid_dirs)
+
+    def vertices_on_gpu(self, params: HeadParams, device: torch.device) -> Float[Tensor, "V 3"]:
+        """`vertices` there, without gradients; `params` may be on either side."""
+        if self._pose_tensors is None or self._pose_tensors.shape.device != device:
+            self._pose_tensors = self.pose_tensors(device)
+        if self._pose_tensors is None:
+            return to_device(self.vertices(params.to(CPU)), device)
+        from avatar.head.pose_gpu import pose_gpu  # imports Triton, which is not there on every machine
+
+        return pose_gpu(self._pose_tensors, params.to(device))
 
     def still_vertices(
         self, expression: Float[Tensor, "N E"], jaw: Float[Tensor, "N 3 3"], rows: Int[Tensor, " R"]

@@ -15,14 +15,15 @@ from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.files.lock import locked
+from avatar.gaussians.avatar import Avatar
 from avatar.head.assets import HeadAssets
-from avatar.model import Avatar
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import check_data, moved_source, split_sizes
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.memory_estimate import training_needs
+from avatar.runs.models import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.objective import PerceptualTerm, choose_perceptual
 from avatar.train.order import within_passes
@@ -100,7 +101,7 @@ def new_avatar(assets: HeadAssets, subject: Subject, config: Config, perceptual:
     needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual)
     check_memory("training", needs, free_bytes(device))
     torch.manual_seed(config.trainer.seed)
-    return Avatar(assets, subject.identity, config.model)
+    return make_avatar(assets, subject.identity, config.model)
 
 
 def finish_training(

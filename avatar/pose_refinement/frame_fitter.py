@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from avatar.compute.device import to_device
+from avatar.gaussians.avatar import Avatar
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
-from avatar.model import Avatar
 from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose
 from avatar.types import Camera, Frame
 

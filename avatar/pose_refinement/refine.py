@@ -27,7 +27,7 @@ from avatar.compute.native import thread_count
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.pose_refinement.descent import Descent, Problem, curvature, descend
 from avatar.pose_refinement.frame_fitter import FrameFitter, Measure, Target, coarse_levels, head_psnr, targets
 from avatar.pose_refinement.motion import HeadPose, moved_tracks
@@ -149,7 +149,7 @@ class _Work:
     def __init__(self, avatar: Avatar, subject: Subject, size: int | None, background: Tensor) -> None:
         self.subject, self.size, self.background = subject, size, background
         self.centre = avatar.head.neutral_vertices().mean(dim=0)
-        self.device, self.waits = avatar.code.device, not on_gpu(avatar.code)
+        self.device, self.waits = avatar.device, not on_gpu(avatar.quats)
         self.fitter = FrameFitter(avatar, to_device(background, self.device), to_device(self.centre, self.device))
         self.tracks = subject.recording.tracks
         self.parameterization: PoseParameterization = find_parameterization(

@@ -28,13 +28,14 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import safe_name
 from avatar.files.opening import MissingFile, open_file
+from avatar.gaussians.avatar import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames, parse_expression_names
 from avatar.head.packed import head_from_tensors, head_tensors
-from avatar.model import Avatar
 from avatar.motion.rest import RestPose
 from avatar.runs.checkpoint import check_fit, load_module, module_tensors
-from avatar.runs.memory_estimate import count_gaussians, drawing_needs, parameter_shapes
+from avatar.runs.memory_estimate import count_gaussians, drawing_needs
+from avatar.runs.models import MODELS, make_avatar
 from avatar.version import __version__
 
 AVATAR_FILE = "avatar.safetensors"
@@ -206,9 +207,10 @@ def build_avatar(portrait: Portrait, assets: HeadAssets, source: Path | str) -> 
     check_head(portrait.recording.head_fingerprint, assets, source)
     config = portrait.config.model
     gaussians = count_gaussians(config, assets)
-    check_fit(parameter_shapes(config, assets, gaussians), portrait.parameters, source)
+    shapes = MODELS[config.name].shapes(config, assets.num_expressions, gaussians)
+    check_fit(shapes, portrait.parameters, source)
     check_memory(f"opening {source}", drawing_needs(config, assets, gaussians))
-    model = Avatar(assets, portrait.recording.identity, config)
+    model = make_avatar(assets, portrait.recording.identity, config)
     load_module(model, portrait.parameters, source)
     return model.eval()
 

@@ -11,14 +11,11 @@ from avatar.compute.memory import Need
 from avatar.config import Config, ModelConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES, FRAMES_AHEAD, WORKERS
 from avatar.errors import UserError
-from avatar.gaussians.covariance import triangle_size
 from avatar.gaussians.encoding import encoded_size
-from avatar.gaussians.head_rotation import VALUES
-from avatar.gaussians.hyper_cpu import HEADS, OFFSETS
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.teeth import with_teeth
-from avatar.model import CONDITION_EXTRAS, SH_DEGREE, WITH_LATENTS
+from avatar.runs.models import MODELS
 
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
 
@@ -48,41 +45,6 @@ def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
         raise UserError(f"model.uv_size={config.uv_size} is too small: {error}") from None
 
 
-def parameter_shapes(config: ModelConfig, assets: HeadAssets, gaussians: int) -> Shapes:
-    """The shape of every tensor in the state dict of the `Avatar` that this makes."""
-    N, n, width = gaussians, config.latent_dim, config.mlp_width
-    inputs = encoded_size() + assets.num_expressions + CONDITION_EXTRAS
-    inputs += VALUES if config.head_rotation else 0
-    shapes: Shapes = {
-        "log_scales": (N, 3),
-        "quats": (N, 4),
-        "opacity_logits": (N,),
-        "sh_dc": (N, 1, 3),
-        "sh_rest": (N, (SH_DEGREE + 1) ** 2 - 1, 3),
-    }
-    layers = [("input", inputs, width), *((f"hidden.{i}", width, width) for i in range(config.mlp_layers - 1))]
-    if config.name != "splattingavatar":
-        for name, given, made in (*layers, ("output", width, n if config.name in WITH_LATENTS else OFFSETS)):
-            shapes |= {f"deformation.{name}.weight": (made, given), f"deformation.{name}.bias": (made,)}
-    if config.head_rotation and config.name != "splattingavatar":
-        shapes["turning"] = (VALUES, 9)
-    if config.name in ("splattingavatar", "monogaussianavatar"):
-        shapes |= {"mesh_points.face": (N,), "mesh_points.place": (N, 3)}
-    if config.name == "monogaussianavatar":
-        shapes["count"] = ()
-    if config.skull_binding and config.name not in ("splattingavatar", "monogaussianavatar"):
-        shapes["skull_logits"] = (N,)
-    if config.name == "ndgs":
-        shapes |= {"ndgs.mean": (3 + n, N), "ndgs.root": (triangle_size(n), N), "ndgs.cross": (3, n, N)}
-    for name, m in HEADS.items():
-        if config.name == "covariance":
-            shapes |= {f"hyper.{name}.mean": (m + n, N), f"hyper.{name}.factor": (triangle_size(m + n), N)}
-        elif config.name == "hypergaussians":
-            shapes |= {f"hyper.{name}.mean": (N, m + n), f"hyper.{name}.lower": (N, m, m)}
-            shapes |= {f"hyper.{name}.cross": (N, n, m)}
-    return shapes
-
-
 def training_needs(
     config: Config, assets: HeadAssets, *, frames: int, size: tuple[int, int], perceptual: str
 ) -> list[Need]:
@@ -93,7 +55,7 @@ def training_needs(
     """
     model, pixels = config.model, size[0] * size[1]
     gaussians = count_gaussians(model, assets)
-    shapes = parameter_shapes(model, assets, gaussians)
+    shapes = MODELS[model.name].shapes(model, assets.num_expressions, gaussians)
     cached = min(CACHE_BYTES, frames * pixels * BYTES_PER_PIXEL)
     ahead = WORKERS * FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
     lasting = [
@@ -105,26 +67,29 @@ def training_needs(
         *parameter_needs(shapes, STEP_COPIES),
         Need(
             "the network's layers at every place",
-            FLOAT * places(model, gaussians) * layers,
+            FLOAT * MODELS[model.name].most_places(model, gaussians) * layers,
             "model.mlp_width, model.mlp_layers or model.latent_grid",
         ),
         Need("drawing", FLOAT * gaussians * (STEP_FLOATS + 3 * model.latent_dim), "model.uv_size"),
+        *MODELS[model.name].step_needs(model, gaussians),
     ]
-    if model.name == "covariance":  # of each head: the factor as a square, and that of the latent's block
-        squares = sum((m + model.latent_dim) ** 2 + model.latent_dim**2 for m in HEADS.values())
-        step.append(Need("the covariances", FLOAT * gaussians * squares, "model.uv_size or model.latent_dim"))
     saving = parameter_needs(shapes, SAVING_COPIES, UNPACKING_COPIES)
     return [*lasting, *max(step, saving, key=lambda needs: sum(need.size for need in needs))]
 
 
 def drawing_needs(config: ModelConfig, assets: HeadAssets, gaussians: int) -> list[Need]:
     """What opening a trained avatar and drawing it takes."""
-    shapes = parameter_shapes(config, assets, gaussians)
+    shapes = MODELS[config.name].shapes(config, assets.num_expressions, gaussians)
     # The first layer's, and two that are filled in turn.
     layers = encoded_size() + 3 * config.mlp_width
+    places = MODELS[config.name].most_places(config, gaussians)
     return [
         *parameter_needs(shapes, DRAWING_COPIES, UNPACKING_COPIES),
-        Need("the network's layers at every place", FLOAT * places(config, gaussians) * layers, "model.mlp_width"),
+        Need(
+            "the network's layers at every place",
+            FLOAT * places * layers,
+            "model.mlp_width",
+        ),
     ]
 
 
@@ -132,15 +97,6 @@ def parameter_needs(shapes: Shapes, copies: int, more_of_heads: int = 0) -> list
     """What the parameters take, `copies` times; `more_of_heads`: and the HyperGaussians so many times more."""
     sizes = dict.fromkeys((_NETWORK, _HEADS, _OTHERS), 0)
     for name, shape in shapes.items():
-        part = (
-            _NETWORK if name.startswith("deformation.") else _HEADS if name.startswith(("hyper.", "ndgs.")) else _OTHERS
-        )
+        part = _NETWORK if name.startswith("deformation.") else _HEADS if name.startswith("hyper.") else _OTHERS
         sizes[part] += FLOAT * math.prod(shape) * (copies + more_of_heads * (part is _HEADS))
     return [Need(what, size, lower) for (what, lower), size in sizes.items()]
-
-
-def places(config: ModelConfig, gaussians: int) -> int:
-    """Where the network is evaluated: at every Gaussian, or at the nodes of a grid, of which each needs four at most."""
-    if config.name not in WITH_LATENTS or config.latent_grid is None:
-        return gaussians
-    return min(4 * gaussians, (config.latent_grid + 2) ** 2)

@@ -14,7 +14,7 @@ from torch import Tensor
 from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
-from avatar.model import Avatar
+from avatar.runs.models import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
@@ -52,7 +52,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     Raises UserError for frames that are too small to train on.
     """
     torch.manual_seed(config.trainer.seed)
-    avatar = Avatar(assets, identity, config.model)
+    avatar = make_avatar(assets, identity, config.model)
     corrections = make_pose_corrections(avatar, frames, config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     size = frame.camera.width, frame.camera.height

@@ -15,6 +15,7 @@ from torch import Tensor
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
+from avatar.gaussians.avatar import SH_DEGREE, Avatar
 from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_WINDOW
@@ -27,7 +28,6 @@ from avatar.losses.photometric import (
     on_head,
     photometric_loss,
 )
-from avatar.model import SH_DEGREE, Avatar
 from avatar.types import Camera, Frame, Gaussians
 
 SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part

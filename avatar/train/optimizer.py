@@ -12,12 +12,9 @@ from torch import Tensor, nn
 from avatar.compute.device import on_gpu, to_device
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.train.pose_corrections import PoseCorrections
 
-OPACITY_RATE = 0.05  # of the logits of opacity and of rigidity
-NETWORK_RATE = 1e-4  # of the deformation network
-HYPER_RATE = 1e-4  # of the HyperGaussian heads, and of learned places on the mesh (metres)
 EPSILON = 1e-15  # Adam's
 WARM_UP = 20  # steps
 FINAL_SHARE = 0.05  # of the learning rates, at the last step
@@ -26,31 +23,15 @@ FINAL_SHARE = 0.05  # of the learning rates, at the last step
 def make_optimizer(
     avatar: Avatar, config: TrainerConfig, pose_corrections: PoseCorrections | None = None
 ) -> torch.optim.Adam:
-    """Adam with the paper's groups: colour, opacity, scale, rotation, deformation network, HyperGaussian heads."""
-    rates = config.learning_rates
-    logits = [avatar.opacity_logits] + ([] if avatar.skull_logits is None else [avatar.skull_logits])
-    groups: list[dict[str, Any]] = [
-        {"params": [avatar.sh_dc], "lr": rates.sh_dc},
-        {"params": [avatar.sh_rest], "lr": rates.sh_rest},
-        {"params": logits, "lr": OPACITY_RATE},
-        {"params": [avatar.log_scales], "lr": rates.scale},
-        {"params": [avatar.quats], "lr": rates.rotation},
-    ]
-    if avatar.deformation is not None:
-        groups.append({"params": list(avatar.deformation.parameters()), "lr": NETWORK_RATE})
-    if avatar.mesh_points is not None and avatar.mesh_points.place.requires_grad:
-        groups.append({"params": [avatar.mesh_points.place], "lr": HYPER_RATE})
-    for distributions in (avatar.hyper, avatar.ndgs):
-        if distributions is not None:
-            groups.append({"params": list(distributions.parameters()), "lr": HYPER_RATE})
+    """Adam with the model's groups of parameters, and that of the pose corrections."""
+    named = list(avatar.parameter_groups(config.learning_rates).values())
     if pose_corrections is not None:
-        groups.append({"params": [pose_corrections.moves], "lr": config.pose_rate})
-    for group in groups:
-        group["full_lr"] = group["lr"]
+        named.append(([pose_corrections.moves], config.pose_rate))
+    groups: list[dict[str, Any]] = [{"params": params, "lr": rate, "full_lr": rate} for params, rate in named]
     # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.
-    optimizer = torch.optim.Adam(groups, eps=EPSILON, fused=True, capturable=avatar.code.is_cuda)
-    if on_gpu(avatar.code) and not avatar.code.is_meta:  # where they are read: a graph is for any step's rates
-        rates_there = torch.zeros(len(groups), device=avatar.code.device)
+    optimizer = torch.optim.Adam(groups, eps=EPSILON, fused=True, capturable=avatar.quats.is_cuda)
+    if on_gpu(avatar.quats) and not avatar.quats.is_meta:  # where they are read: a graph is for any step's rates
+        rates_there = torch.zeros(len(groups), device=avatar.quats.device)
         for group, rate in zip(optimizer.param_groups, rates_there, strict=True):
             group["lr"] = rate
     return optimizer

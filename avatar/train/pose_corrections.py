@@ -1,6 +1,7 @@
 """Corrections of the training frames' head poses, trained with the avatar, as gsplat's CameraOptModule does.
 
-A correction is a rotation vector w and a shift s in the camera's axes, both small. It turns the head about its centre c:
+A correction is a rotation vector w and a shift s across the image, in the camera's axes, both small; depth, which hardly
+shows in a picture, stays. It turns the head about its centre c:
 
     R' = (I + [w]x) R        t' = t + s - [w]x R c
 
@@ -22,10 +23,10 @@ from torch import Tensor, nn
 
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.types import Camera
 
-TURN_UNIT, SHIFT_UNIT, DEPTH_UNIT = 0.5 * math.pi / 180, 1e-3, 0.5e-3  # radians, metres: a tracker's usual errors
+TURN_UNIT, SHIFT_UNIT = 0.5 * math.pi / 180, 1e-3  # radians, metres: a tracker's usual errors
 PREFIX = "pose_corrections."  # in a checkpoint
 
 
@@ -33,7 +34,7 @@ def make_pose_corrections(avatar: Avatar, frames: int, config: TrainerConfig) ->
     """For a training on so many frames, where the avatar is; None at `pose_rate` 0."""
     if config.pose_rate == 0:
         return None
-    return PoseCorrections(frames, avatar.head.neutral_vertices().mean(dim=0)).to(avatar.code.device)
+    return PoseCorrections(frames, avatar.head.neutral_vertices().mean(dim=0)).to(avatar.device)
 
 
 class PoseCorrections(nn.Module):
@@ -41,18 +42,17 @@ class PoseCorrections(nn.Module):
 
     def __init__(self, frames: int, centre: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.moves = nn.Parameter(torch.zeros(frames, 6))  # w and s, in units
+        self.moves = nn.Parameter(torch.zeros(frames, 5))  # w and the two parts of s, in units
         self._centre = centre
 
-    def jacobian(self, R: Float[Tensor, "3 3"]) -> Float[Tensor, "6 12"]:
+    def jacobian(self, R: Float[Tensor, "3 3"]) -> Float[Tensor, "5 12"]:
         """What one unit of each part of a correction adds to (R row by row, t) of a camera; all on the CPU."""
         turns = TURN_UNIT * vector_to_skew_symmetric_matrix(torch.eye(3, dtype=R.dtype)) @ R
-        shifts = torch.diag(torch.tensor([SHIFT_UNIT, SHIFT_UNIT, DEPTH_UNIT], dtype=R.dtype))
-        still = torch.zeros(3, 9, dtype=R.dtype)
         turned = torch.cat((turns.flatten(1), -turns @ self._centre.to(R.dtype)), dim=1)
-        return torch.cat((turned, torch.cat((still, shifts), dim=1)))
+        shifted = SHIFT_UNIT * torch.eye(12, dtype=R.dtype)[9:11]
+        return torch.cat((turned, shifted))
 
-    def forward(self, camera: Camera, row: Int[Tensor, "1"], jacobian: Float[Tensor, "6 12"]) -> Camera:
+    def forward(self, camera: Camera, row: Int[Tensor, "1"], jacobian: Float[Tensor, "5 12"]) -> Camera:
         """The camera of training frame number `row`, corrected; differentiable in its correction."""
         own = self.moves.index_select(0, row)[0] - self.moves.detach().mean(dim=0)
         given = torch.cat((camera.R_cam_world.flatten(), camera.t_cam_world))

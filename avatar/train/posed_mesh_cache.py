@@ -5,8 +5,8 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.gaussians.avatar import Avatar
 from avatar.head.model import HeadModel
-from avatar.model import Avatar
 from avatar.types import Frame
 
 LIMIT_BYTES = 2**28  # 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again

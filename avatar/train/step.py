@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avatar.errors import UserError
+from avatar.gaussians.avatar import Avatar
 from avatar.losses.photometric import PhotometricLoss
-from avatar.model import Avatar
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
 from avatar.train.objective import Objective
@@ -36,7 +36,7 @@ class StepInputs(NamedTuple):
     vertices: Float[Tensor, "V 3"]  # posed by the frame's parameters, metres
     noise: Float[Tensor, " C"] | None = None  # added to the network's input
     row: Int[Tensor, "1"] | None = None  # of the frame among the pose corrections
-    pose_jacobian: Float[Tensor, "6 12"] | None = None  # of the frame's camera in its correction
+    pose_jacobian: Float[Tensor, "5 12"] | None = None  # of the frame's camera in its correction
 
     def tensors(self) -> dict[str, Tensor]:
         """All that differs between two steps, by name."""

@@ -20,7 +20,6 @@ from avatar.compute.device import on_gpu, to_device
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
-from avatar.train.points import move_points
 from avatar.train.posed_mesh_cache import PosedMeshes
 from avatar.train.step import Judge, StepInputs, StepOutputs, Trainee, train_step
 from avatar.types import Frame
@@ -52,10 +51,10 @@ class StepRunner:
     ) -> None:
         self._trainee, self._noise, self._rows, self._say = trainee, noise, rows or {0: 0}, say
         avatar = trainee.avatar
-        self._device = avatar.code.device
+        self._device = avatar.device
         self._meshes = PosedMeshes(avatar)
         self._jacobians: dict[int, Tensor] = {}  # of the frames' cameras in their corrections
-        self._replays = on_gpu(avatar.code) and not avatar.code.is_meta and avatar.is_fused
+        self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
         self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
         self.replayed = 0  # steps so far
@@ -76,7 +75,7 @@ class StepRunner:
             self.replayed += 1
             return replay(inputs.tensors())
         outputs = train_step(trainee, step, inputs, judge)
-        move_points(trainee.avatar, trainee.optimizer, step + 1, config)
+        trainee.avatar.after_step(trainee.optimizer, step + 1, config)
         if kind is not None and judge is not None:
             self._launched[kind] += 1
         return outputs

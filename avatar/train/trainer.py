@@ -14,7 +14,7 @@ from avatar.config import Config
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
@@ -71,7 +71,7 @@ def train(
         if corrections is not None:
             corrections.load(resume.tensors)
         load_optimizer(optimizer, trainee.named_parameters(), resume.tensors)
-    is_gpu = on_gpu(avatar.code)
+    is_gpu = on_gpu(avatar.quats)
     meta = {
         "head_fingerprint": avatar.head.assets.fingerprint,
         "data_hash": subject.data_hash,

@@ -116,7 +116,7 @@ class Stage:
         with checked_drawings():
             picture = to_bytes(self.rendered(params, camera).image)
         if setting.overlay == "mesh":
-            _draw_mesh(picture, self.trained.renderer.vertices(params).cpu(), self.trained.assets.faces, camera)
+            _draw_mesh(picture, self.trained.avatar.vertices(params).cpu(), self.trained.assets.faces, camera)
         beside = [picture]
         if self.truth is not None and recorded is not None and (setting.with_truth or setting.overlay == "error"):
             truth = self.truth(recorded, width)

@@ -25,6 +25,7 @@ from pathlib import Path
 import torch
 from write_report import machine, run, table, write_report
 
+from avatar.baselines.covariance import conditional_mean
 from avatar.bench.hyper import (
     COVARIANCE_FLOATS,
     COVARIANCE_TOLERANCE,
@@ -41,7 +42,6 @@ from avatar.bench.hyper import (
 )
 from avatar.bench.results import new_figure
 from avatar.files.atomic import write_atomically
-from avatar.gaussians.covariance import conditional_mean
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import HEADS
 from avatar.splat.scenes import HEAD_SPLATS
@@ -71,7 +71,7 @@ def by_columns(leaves: Leaves) -> torch.Tensor:
 
 
 def column_leaves(heads: HyperHeads) -> Leaves:
-    """`covariance_leaves` as `avatar.gaussians.covariance` holds them: Gaussians last, triangles row by row."""
+    """`covariance_leaves` as `avatar.baselines.covariance` holds them: Gaussians last, triangles row by row."""
     given = covariance_leaves(heads)
     leaves = {"latents": given["latents"]}
     for head, m in HEADS.items():

@@ -36,7 +36,6 @@ from avatar.evaluation.measure import to_8_bit
 from avatar.files.atomic import write_atomically
 from avatar.head.assets import HeadAssets
 from avatar.losses.metrics import psnr, ssim
-from avatar.model import Avatar
 from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
 from avatar.runs.checkpoint import (
@@ -47,6 +46,7 @@ from avatar.runs.checkpoint import (
     module_tensors,
     save_checkpoint,
 )
+from avatar.runs.models import make_avatar
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
@@ -69,7 +69,7 @@ class Learner:
     def __init__(self, name: str, folder: Path, subject: Subject, assets: HeadAssets, config: Config) -> None:
         self.name, self.folder, self.subject, self.config = name, folder, subject, config
         torch.manual_seed(config.trainer.seed)
-        self.avatar = Avatar(assets, subject.identity, config.model)
+        self.avatar = make_avatar(assets, subject.identity, config.model)
         self.optimizer = make_optimizer(self.avatar, config.trainer)
         self.background = torch.tensor(config.data.background)
         term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))

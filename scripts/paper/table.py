@@ -26,7 +26,7 @@ from avatar.bench.render import inputs, stream_rate
 from avatar.bench.results import new_figure
 from avatar.errors import UserError
 from avatar.evaluation.compare import Cell
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.render import Renderer
 from avatar.runs.run import open_trained
 from avatar.sweep.results import fold_results
@@ -119,7 +119,7 @@ def drawn(run: Path, job: Job) -> tuple[float, int]:
 def count_parameters(avatar: Avatar) -> int:
     """As the paper counts: the network and the distributions, without what every Gaussian has."""
     state = avatar.state_dict()
-    return sum(value.numel() for name, value in state.items() if name.startswith(("deformation.", "hyper.", "ndgs.")))
+    return sum(value.numel() for name, value in state.items() if name.startswith(("deformation.", "hyper.")))
 
 
 def shown(row: Row) -> list[str]:

@@ -31,7 +31,7 @@ from write_report import run, table, write_report
 from avatar.bench.quality import held_out_frames
 from avatar.bench.results import new_figure
 from avatar.data.loader import FrameLoader
-from avatar.gaussians.hyper import HyperHead, HyperHeads
+from avatar.gaussians.hyper import HyperHead
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.losses.metrics import squared_error
 from avatar.pipeline.open import open_run
@@ -129,7 +129,6 @@ def mean_over_frames(
 @torch.no_grad()
 def variance_of(run: Run) -> Tensor:
     """The conditional variance of an attribute of each Gaussian, geometric mean of its ten (supplement, eq. 3); [N]."""
-    assert run.avatar.hyper is not None
     return torch.exp(run.avatar.hyper.uncertainty() / OFFSETS)
 
 
@@ -201,8 +200,6 @@ def arbitrariness(run: Run, frame: Frame, variances: Tensor) -> tuple[float, flo
     Returns the largest change of a picture's value, and the rank correlation of the variances before and after.
     """
     hyper = run.avatar.hyper
-    if not isinstance(hyper, HyperHeads):
-        raise TypeError("the variance of a head that is held through its precision was asked for")
     before, kept = picture_of(run, frame), hyper.heads()
     generator = torch.Generator().manual_seed(0)
     hyper.set_heads({name: rescaled(head, generator) for name, head in kept.items()})

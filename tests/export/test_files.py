@@ -135,7 +135,7 @@ def test_the_texture_is_what_is_seen(trained: TrainedAvatar) -> None:
     from avatar.head.rasterize import rasterize_mesh
 
     assets = trained.assets
-    vertices = camera.project(trained.renderer.vertices(params)).numpy()
+    vertices = camera.project(trained.avatar.vertices(params)).numpy()
     raster = rasterize_mesh(vertices, assets.faces.numpy(), 96, 96)
     uv = (assets.uvs.numpy()[assets.uv_faces.numpy()][raster.face_id] * raster.barycentric[..., None]).sum(axis=2)
     drawn = cv2.remap(

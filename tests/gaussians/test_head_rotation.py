@@ -11,9 +11,10 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.config import load_config
+from avatar.gaussians.avatar import Avatar
 from avatar.gaussians.head_rotation import LIMIT, VALUES, head_rotation_input, learned_turning
-from avatar.model import Avatar
 from avatar.render import Renderer
+from avatar.runs.models import make_avatar
 from avatar.types import Camera
 
 SMALL = ["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2"]
@@ -36,7 +37,7 @@ def turns() -> Tensor:
 def small_avatar(told: bool = True, **options: object) -> Avatar:
     extra = [f"{key}={value}" for key, value in options.items()]
     torch.manual_seed(2)
-    avatar = Avatar(
+    avatar = make_avatar(
         grid_head(), torch.zeros(3), load_config([*SMALL, f"model.head_rotation={str(told).lower()}", *extra]).model
     )
     assert avatar.hyper is not None
@@ -89,7 +90,7 @@ def test_without_it_the_camera_makes_no_difference() -> None:
 
 @pytest.mark.parametrize("model", ["flashavatar", "monogaussianavatar", "ndgs"])
 def test_other_networks_can_be_told_too(model: str) -> None:
-    avatar = Avatar(
+    avatar = make_avatar(
         grid_head(), torch.zeros(3), load_config([*SMALL, f"model={model}", "model.head_rotation=true"]).model
     )
     avatar.learn_head_rotation(rotations(turns(), a_mean()))
@@ -98,7 +99,7 @@ def test_other_networks_can_be_told_too(model: str) -> None:
 
 
 def test_where_there_is_no_network_nobody_is_told() -> None:
-    avatar = Avatar(grid_head(), torch.zeros(3), load_config([*SMALL, "model=splattingavatar"]).model)
+    avatar = make_avatar(grid_head(), torch.zeros(3), load_config([*SMALL, "model=splattingavatar"]).model)
     assert avatar.turning is None
 
 
@@ -124,7 +125,7 @@ def test_an_avatar_is_drawn_with_its_own_blur() -> None:
 
 def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """On torch's meta device, where nothing can be read back, what is told is computed beside the camera."""
-    import avatar.model
+    import avatar.gaussians.avatar
 
     R = rotations(turns(), a_mean())
     avatar_there = small_avatar()
@@ -136,7 +137,7 @@ def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.Mon
         told.append(head_rotation_input(turning, rotation))
         return told[-1]
 
-    monkeypatch.setattr(avatar.model, "head_rotation_input", recorded)
+    monkeypatch.setattr(avatar.gaussians.avatar, "head_rotation_input", recorded)
     avatar_there.to("meta")
     condition = avatar_there.condition(random_params(), R[3])
     assert condition.is_meta and told[0].is_cpu

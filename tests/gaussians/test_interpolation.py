@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from avatar.bench.machine import available_simd
-from avatar.gaussians.hyper_cpu import Interpolation, interpolate
+from avatar.gaussians.hyper_cpu import Interpolation
 
 
 def mixture(num: int, cells: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -29,7 +29,7 @@ def test_values_and_gradients_are_those_of_plain_torch(
     cells, weights = mixture(num, 50)
     grid = torch.randn(50, n, requires_grad=True)
     exact = grid.detach().double().requires_grad_()
-    found, expected = interpolate(grid, cells, weights), plain(exact, cells, weights.double())
+    found, expected = Interpolation(cells, weights, len(grid))(grid), plain(exact, cells, weights.double())
     cotangent = torch.randn(num, n)
     found.backward(cotangent)
     expected.backward(cotangent.double())
@@ -54,19 +54,19 @@ def test_a_strided_grid_and_cotangent() -> None:
     cells, weights = mixture(20, 9)
     wide = torch.randn(6, 9, requires_grad=True)
     cotangent = torch.randn(6, 20).T
-    found = torch.autograd.grad(interpolate(wide.T, cells, weights), wide, cotangent)[0]
+    found = torch.autograd.grad(Interpolation(cells, weights, wide.shape[1])(wide.T), wide, cotangent)[0]
     torch.testing.assert_close(found, torch.autograd.grad(plain(wide.T, cells, weights), wide, cotangent)[0])
 
 
 def test_float64_goes_through_torch() -> None:
     cells, weights = mixture(5, 4)
     grid = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda g: interpolate(g, cells, weights), (grid,))
+    assert torch.autograd.gradcheck(lambda g: Interpolation(cells, weights, len(g))(g), (grid,))
 
 
 def test_a_cell_that_nobody_mixes_has_zero_gradient() -> None:
     grid = torch.randn(3, 2, requires_grad=True)
-    interpolate(grid, torch.tensor([[0, 0, 2, 2]]), torch.ones(1, 4)).sum().backward()
+    Interpolation(torch.tensor([[0, 0, 2, 2]]), torch.ones(1, 4), len(grid))(grid).sum().backward()
     assert grid.grad is not None and grid.grad.tolist() == [[2, 2], [0, 0], [2, 2]]
 
 

@@ -12,7 +12,7 @@ from avatar.gaussians.latent_grid import latent_grid, uv_charts
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from avatar.model import Avatar
+from avatar.runs.models import make_avatar
 
 RASTER = 32
 
@@ -64,7 +64,7 @@ def test_a_grid_as_fine_as_the_raster_is_no_grid() -> None:
     avatars = []
     for model in (config, fine):
         torch.manual_seed(0)
-        avatar = Avatar(assets, torch.zeros(0), model)
+        avatar = make_avatar(assets, torch.zeros(0), model)
         for parameter in avatar.hyper.parameters():
             torch.nn.init.normal_(parameter, std=0.1)
         avatars.append(avatar(random_params()))

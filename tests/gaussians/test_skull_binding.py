@@ -9,11 +9,12 @@ from heads import EXPRESSIONS, grid_head, random_params, rest_params
 from torch import Tensor
 
 from avatar.config import load_config
+from avatar.gaussians.avatar import Avatar
 from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel, matrix_from_6d
-from avatar.model import Avatar
+from avatar.runs.models import make_avatar
 
 SMALL = ["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2", "model.skull_binding=true"]
 
@@ -27,7 +28,7 @@ def parts() -> tuple[HeadModel, Embedding, Skull]:
 
 def small_avatar() -> Avatar:
     """Shares from nearly none to nearly all; offsets that the expression moves."""
-    avatar = Avatar(grid_head(), torch.zeros(3), load_config(SMALL).model)
+    avatar = make_avatar(grid_head(), torch.zeros(3), load_config(SMALL).model)
     assert avatar.skull_logits is not None and avatar.hyper is not None
     with torch.no_grad():
         avatar.skull_logits += 3.0 * torch.randn_like(avatar.skull_logits)
@@ -91,9 +92,9 @@ def test_gradients_are_those_of_the_definition() -> None:
 
 
 def test_an_avatar_begins_near_the_skin_and_learns_its_shares() -> None:
-    avatar = Avatar(grid_head(), torch.zeros(3), load_config(SMALL).model)
-    assert avatar.skull_shares is not None and avatar.skull_logits is not None
-    assert torch.equal(avatar.skull_shares, torch.sigmoid(torch.full((len(avatar),), INITIAL_LOGIT)))
+    avatar = make_avatar(grid_head(), torch.zeros(3), load_config(SMALL).model)
+    assert avatar.skull_logits is not None
+    assert torch.equal(avatar.skull_logits, torch.full((len(avatar),), INITIAL_LOGIT))
     gaussians = avatar(random_params())
     gaussians.means.square().sum().backward()
     assert avatar.skull_logits.grad is not None and (avatar.skull_logits.grad != 0).all()
@@ -101,10 +102,10 @@ def test_an_avatar_begins_near_the_skin_and_learns_its_shares() -> None:
 
 def test_where_it_is_not_asked_for_nothing_is_learned() -> None:
     for overrides in (["model.skull_binding=false"], ["model=splattingavatar"], ["model=monogaussianavatar"]):
-        avatar = Avatar(grid_head(), torch.zeros(3), load_config([*SMALL, *overrides]).model)
-        assert avatar.skull is None and avatar.skull_shares is None
+        avatar = make_avatar(grid_head(), torch.zeros(3), load_config([*SMALL, *overrides]).model)
+        assert getattr(avatar, "skull", None) is None
         assert not any("skull_logits" in name for name in avatar.state_dict())
-        assert avatar.points(avatar.vertices(rest_params()), rest_params()).shape[1] == 3
+        assert avatar(rest_params()).means.shape[1] == 3
 
 
 def test_few_expression_coefficients_make_no_difference_to_the_skull() -> None:

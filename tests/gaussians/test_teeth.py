@@ -14,7 +14,7 @@ from avatar.head.model import HeadModel
 from avatar.head.teeth import GRID, ROWS
 from avatar.pose_refinement.frame_fitter import FrameFitter
 from avatar.runs.avatar_file import read_portrait, write_portrait
-from avatar.runs.memory_estimate import count_gaussians, parameter_shapes
+from avatar.runs.memory_estimate import count_gaussians
 from avatar.runs.trained import TrainedAvatar, load_avatar
 
 TEETH = "model.teeth=true"
@@ -34,7 +34,7 @@ def test_they_are_gaussians_more_and_the_head_stays(open_mouth_folder: Path) -> 
     gaussians = count_gaussians(config.model, assets)
     assert gaussians == len(avatar) > len(without) == count_gaussians(plain.model, assets)
     shapes = {name: tuple(value.shape) for name, value in avatar.state_dict().items()}
-    assert parameter_shapes(config.model, assets, gaussians) == shapes
+    assert avatar.shapes(config.model, assets.num_expressions, gaussians) == shapes
     assert avatar.head.assets is assets and without.mesh is without.head
     assert avatar.mesh.assets.num_vertices == assets.num_vertices + len(ROWS) * COUNT
     params = subject.recording.params(3)
@@ -71,6 +71,6 @@ def test_a_packed_head_model_is_the_one_that_was_given(trained: TrainedAvatar, t
     assert again.assets.fingerprint == trained.assets.fingerprint == portrait.recording.head_fingerprint
     assert again.assets.num_vertices == trained.assets.num_vertices
     params = again.rest_params()
-    assert torch.equal(again.renderer.vertices(params), trained.renderer.vertices(params))
+    assert torch.equal(again.avatar.vertices(params), trained.avatar.vertices(params))
     own = HeadModel(again.assets, again.recording.identity).vertices(params)
-    torch.testing.assert_close(again.renderer.vertices(params)[: len(own)], own, rtol=0, atol=1e-6)
+    torch.testing.assert_close(again.avatar.vertices(params)[: len(own)], own, rtol=0, atol=1e-6)

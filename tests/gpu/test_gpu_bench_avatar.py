@@ -28,7 +28,7 @@ def test_a_timed_step_is_the_gpus_and_is_not_cut(tracked_folder: Path, tmp_path:
     before = learner.avatar.sh_dc.detach().clone()
     train.run_steps(learner, late=True)
     assert learner.judge is not None, "nothing is read back in a step"
-    assert next(learner.frames).image.device.type == learner.avatar.code.device.type == DEVICE.type
+    assert next(learner.frames).image.device.type == learner.avatar.device.type == DEVICE.type
     assert not torch.equal(learner.avatar.sh_dc, before)
     once = Time(1.0, 2.0, 3)
     rows = [train.Row("default", 5, 4, 9, once, once, {}, {})]

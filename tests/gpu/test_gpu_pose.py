@@ -11,7 +11,7 @@ from interpreter import DEVICE, error, the_cpus_way
 
 from avatar.config import load_config
 from avatar.head.model import HeadModel
-from avatar.model import Avatar
+from avatar.runs.models import make_avatar
 
 HEAD = HeadModel(grid_head(rows=13, columns=11), 0.5 * torch.randn(20, generator=torch.Generator().manual_seed(2)))
 
@@ -37,7 +37,9 @@ def test_at_rest_nothing_moves() -> None:
 
 def test_a_head_whose_joints_hang_together_otherwise_is_posed_on_the_cpu() -> None:
     assets = replace(grid_head(), parents=(-1, 0, 1, 2, 2))
-    avatar = Avatar(assets, torch.zeros(3), load_config(["model.uv_size=12", "model.mlp_width=8"]).model).to(DEVICE)
+    avatar = make_avatar(assets, torch.zeros(3), load_config(["model.uv_size=12", "model.mlp_width=8"]).model).to(
+        DEVICE
+    )
     params = random_params()
     with the_cpus_way():
         expected = avatar.head.vertices(params)

@@ -10,8 +10,9 @@ from heads import grid_head, random_params
 from interpreter import DEVICE, error, the_cpus_way
 
 from avatar.config import load_config
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.render import Renderer
+from avatar.runs.models import make_avatar
 from avatar.splat.scenes import head_camera
 from avatar.types import Gaussians
 
@@ -21,7 +22,7 @@ RECIPES = ("model=hypergaussians", "experiment=paper", "model=flashavatar")
 def avatar_of(recipe: str) -> Avatar:
     config = load_config([recipe, "model.uv_size=18", "model.mlp_width=16", "model.initial_opacity=0.6"])
     torch.manual_seed(0)
-    avatar = Avatar(grid_head(), torch.zeros(3), config.model)
+    avatar = make_avatar(grid_head(), torch.zeros(3), config.model)
     with torch.no_grad():
         for parameter in avatar.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))

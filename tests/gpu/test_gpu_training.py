@@ -14,7 +14,7 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
@@ -65,7 +65,7 @@ def test_thirty_steps_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path:
     avatar, found = trained(tracked_folder, tmp_path / "gpu", *steps)
     assert len(found) == len(expected) == 30
     assert found == pytest.approx(expected, rel=1e-4)
-    assert avatar.code.device.type == DEVICE.type
+    assert avatar.device.type == DEVICE.type
     saved = newest_checkpoint(tmp_path / "gpu")
     assert saved.step == 30 and saved.meta["device"] == DEVICE.type
     assert all(tensor.is_cpu for tensor in saved.tensors.values())

@@ -15,7 +15,7 @@ from avatar.head.assets import HeadAssets
 from avatar.head.features import mouth_rim
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.head.teeth import GRID, ROWS, with_teeth
-from avatar.model import Avatar
+from avatar.runs.models import make_avatar
 from avatar.types import IDENTITY_6D, HeadParams
 
 COUNT = GRID[0] * GRID[1]  # vertices of a row
@@ -79,9 +79,9 @@ def test_a_head_without_an_opening_between_the_lips_has_none() -> None:
     assets = grid_head()
     assert len(mouth_rim(assets)) == 0 and with_teeth(assets) is assets
     config = load_config(["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2", "model.teeth=true"]).model
-    avatar = Avatar(assets, torch.zeros(3), config)
+    avatar = make_avatar(assets, torch.zeros(3), config)
     assert avatar.mesh is avatar.head and len(avatar) == len(
-        Avatar(assets, torch.zeros(3), replace(config, teeth=False))
+        make_avatar(assets, torch.zeros(3), replace(config, teeth=False))
     )
 
 

@@ -12,8 +12,8 @@ import torch
 from drawn_clip import BACKGROUND, EXPRESSIONS, SIZE, Clip, drawn_clip, patterned_avatar, wrongly_tracked
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
+from avatar.gaussians.avatar import Avatar
 from avatar.losses.metrics import psnr
-from avatar.model import Avatar
 from avatar.pose_refinement import frame_fitter as fitter_module
 from avatar.pose_refinement.frame_fitter import (
     OBSERVATIONS,
@@ -69,7 +69,7 @@ def test_the_gradient_is_that_through_the_reference(fitter: FrameFitter, clip: C
 def test_the_gradient_of_gaussians_that_never_turn_is_that_through_the_reference(tmp_path: Path) -> None:
     avatar = patterned_avatar(tmp_path, "model=ndgs")
     with torch.no_grad():
-        for parameter in (avatar.ndgs or avatar).parameters():
+        for parameter in avatar.hyper.parameters():
             parameter += 0.02 * torch.randn_like(parameter)
     with frozen(avatar):
         check_gradient(

@@ -10,8 +10,8 @@ from heads import grid_head
 from small_runs import small_config
 
 from avatar.errors import UserError
-from avatar.model import Avatar
-from avatar.runs.memory_estimate import count_gaussians, drawing_needs, parameter_shapes, places, training_needs
+from avatar.runs.memory_estimate import count_gaussians, drawing_needs, training_needs
+from avatar.runs.models import make_avatar
 
 MIB = 2**20
 PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
@@ -33,18 +33,20 @@ PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
 )
 def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, ...]) -> None:
     config, assets = small_config(*overrides).model, grid_head()
-    avatar = Avatar(assets, torch.zeros(3), config)
+    avatar = make_avatar(assets, torch.zeros(3), config)
     gaussians = count_gaussians(config, assets)
     assert gaussians == len(avatar)
-    assert parameter_shapes(config, assets, gaussians) == {k: tuple(v.shape) for k, v in avatar.state_dict().items()}
-    assert len(avatar.code) <= places(config, gaussians)
+    assert avatar.shapes(config, assets.num_expressions, gaussians) == {
+        k: tuple(v.shape) for k, v in avatar.state_dict().items()
+    }
+    assert len(getattr(avatar, "code", ())) <= avatar.most_places(config, gaussians)
 
 
 def test_gaussians_of_a_finer_raster_are_counted() -> None:
     config, assets = small_config("model.uv_detail=2").model, grid_head(rows=31, columns=41)
     coarse = small_config("model.uv_detail=1").model
     gaussians = count_gaussians(config, assets)
-    assert gaussians == len(Avatar(assets, torch.zeros(3), config)) > count_gaussians(coarse, assets)
+    assert gaussians == len(make_avatar(assets, torch.zeros(3), config)) > count_gaussians(coarse, assets)
 
 
 def test_a_map_too_coarse_for_a_single_gaussian_gets_a_sentence() -> None:

@@ -10,7 +10,8 @@ from heads import grid_head, rest_params
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
-from avatar.model import Avatar
+from avatar.gaussians.avatar import Avatar
+from avatar.runs.models import make_avatar
 from avatar.splat.sh import C0
 from avatar.train import init_colours as colours_module
 from avatar.train.init_colours import colour_from_frames, sample, seen_colours
@@ -94,7 +95,7 @@ def two_sheets(apart: float) -> tuple[Avatar, Frame]:
         uv_faces=torch.cat((sheet.uv_faces, sheet.uv_faces + len(sheet.uvs))),
         regions={},
     )
-    avatar = Avatar(assets, torch.zeros(0), small_config().model)
+    avatar = make_avatar(assets, torch.zeros(0), small_config().model)
     camera = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0, 1]), 400, 400, 64, 64, 128, 128)
     ones = torch.ones(128, 128)
     ramp = torch.linspace(0, 1, 128).expand(128, 128)[..., None].repeat(1, 1, 3)

@@ -11,7 +11,7 @@ from poison import poisoned_recording
 from small_runs import open_small, small_config, train_small
 
 from avatar.data.subject import Subject
-from avatar.model import Avatar
+from avatar.model import HyperGaussianAvatar
 from avatar.train.condition_noise import ConditionNoise, make_noise
 
 SHARE = 0.3
@@ -64,21 +64,21 @@ def test_training_poses_the_mesh_without_it(
     known, posed, told = set(), set(), set()
     for index in range(len(subject)):
         known.add(tuple(subject.recording.params(index).condition().tolist()))
-    forward, vertices = Avatar.forward, Avatar.vertices
+    forward, vertices = HyperGaussianAvatar.forward, HyperGaussianAvatar.vertices
 
-    def listening(self: Avatar, params, *given, **named):  # type: ignore[no-untyped-def]
+    def listening(self: HyperGaussianAvatar, params, *given, **named):  # type: ignore[no-untyped-def]
         if torch.is_grad_enabled():
             told.add(tuple(params.condition().tolist()))
         else:
             assert tuple(params.condition().tolist()) in known
         return forward(self, params, *given, **named)
 
-    def posing(self: Avatar, params):  # type: ignore[no-untyped-def]
+    def posing(self: HyperGaussianAvatar, params):  # type: ignore[no-untyped-def]
         posed.add(tuple(params.condition().tolist()))
         return vertices(self, params)
 
-    monkeypatch.setattr(Avatar, "forward", listening)
-    monkeypatch.setattr(Avatar, "vertices", posing)
+    monkeypatch.setattr(HyperGaussianAvatar, "forward", listening)
+    monkeypatch.setattr(HyperGaussianAvatar, "vertices", posing)
     train_small(tracked_folder, tmp_path / "run", [f"trainer.condition_noise={share}"])
     assert told and (told <= known if share == 0 else not told & known)
     assert posed <= known

@@ -17,7 +17,6 @@ from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import (
-    DEPTH_UNIT,
     PREFIX,
     SHIFT_UNIT,
     TURN_UNIT,
@@ -80,10 +79,10 @@ def test_a_correction_turns_the_head_about_its_centre_and_has_no_common_part() -
 
     assert torch.equal(pose().R, R) and torch.equal(pose().t, t)
     with torch.no_grad():
-        corrections.moves.copy_(0.1 * torch.arange(18.0).reshape(3, 6))
+        corrections.moves.copy_(0.1 * torch.arange(15.0).reshape(3, 5))
     own = corrections.moves.detach()[2] - corrections.moves.detach().mean(dim=0)
-    units = torch.tensor([TURN_UNIT] * 3 + [SHIFT_UNIT] * 2 + [DEPTH_UNIT])
-    expected = moved_pose(own * units, HeadPose(R, t), centre)
+    units = torch.tensor([TURN_UNIT] * 3 + [SHIFT_UNIT] * 2)
+    expected = moved_pose(torch.cat((own * units, torch.zeros(1))), HeadPose(R, t), centre)
     for found in (pose(), pose()):
         torch.testing.assert_close(found.R, expected.R, atol=1e-4, rtol=0.0)  # the square of a hundredth
         torch.testing.assert_close(found.R @ centre + found.t, expected.R @ centre + expected.t, atol=1e-6, rtol=0.0)
@@ -112,8 +111,8 @@ def test_a_checkpoint_without_them_or_of_other_frames_is_refused(tracked_folder:
     tensors = newest_checkpoint(tmp_path / "run").tensors
     assert not [name for name in tensors if "pose_corrections" in name]
     corrections = PoseCorrections(4, torch.zeros(3))
-    for damaged in (tensors, {f"{PREFIX}moves": torch.zeros(5, 6)}):
+    for damaged in (tensors, {f"{PREFIX}moves": torch.zeros(5, 5)}):
         with pytest.raises(UserError, match="pose corrections of 4 training frames"):
             corrections.load(damaged)
-    corrections.load({f"{PREFIX}moves": torch.ones(4, 6)})
+    corrections.load({f"{PREFIX}moves": torch.ones(4, 5)})
     assert bool((corrections.moves == 1.0).all())

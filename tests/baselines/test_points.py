@@ -9,22 +9,22 @@ import torch
 from heads import grid_head
 from small_runs import open_small, small_config, train_small
 
+from avatar.baselines.monogaussianavatar import alive_after, drawn
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
+from avatar.gaussians.avatar import Avatar
 from avatar.gaussians.encoding import positional_encoding
-from avatar.gaussians.growth import alive_after
-from avatar.model import Avatar
 from avatar.runs.checkpoint import load_module, module_tensors, newest_checkpoint
+from avatar.runs.models import make_avatar
 from avatar.runs.trained import load_avatar
 from avatar.train.optimizer import make_optimizer
-from avatar.train.points import drawn, move_points
 from avatar.types import HeadParams
 
 
 def started(model: str) -> tuple[Avatar, torch.optim.Adam, TrainerConfig]:
     """An avatar after one optimizer step whose gradients are 1."""
     config = small_config("experiment=paper", f"model={model}", "trainer.iterations=100")
-    avatar = Avatar(grid_head(), torch.zeros(3), config.model)
+    avatar = make_avatar(grid_head(), torch.zeros(3), config.model)
     optimizer = make_optimizer(avatar, config.trainer)
     for parameter in avatar.parameters():
         parameter.grad = torch.ones_like(parameter)
@@ -40,10 +40,9 @@ def params() -> HeadParams:
 def test_a_set_grows_beside_what_is_seen_and_covers_as_much() -> None:
     avatar, optimizer, config = started("monogaussianavatar")
     points, N = avatar.mesh_points, len(avatar)
-    assert points is not None and avatar.count is not None
     alive = alive_after(0, 100, N)
     assert int(avatar.count) == alive == len(avatar(params()).means) < N
-    move_points(avatar, optimizer, 9, config)
+    avatar.after_step(optimizer, 9, config)
     assert int(avatar.count) == alive
     with torch.no_grad():
         avatar.opacity_logits[:alive] = torch.linspace(0.0, 1.0, alive)  # each has a value of its own
@@ -52,7 +51,7 @@ def test_a_set_grows_beside_what_is_seen_and_covers_as_much() -> None:
     optimizer.state[avatar.quats]["exp_avg"][:alive] = torch.arange(alive)[:, None] + 1.0
     before, scales = avatar.opacity_logits.detach().clone(), avatar.log_scales.detach().clone()
     places = points.points(avatar.head.neutral_vertices())
-    move_points(avatar, optimizer, 10, config)
+    avatar.after_step(optimizer, 10, config)
     doubled = alive_after(10, 100, N)
     assert int(avatar.count) == doubled == len(avatar(params()).means) >= 2 * alive
 
@@ -71,7 +70,7 @@ def test_a_set_grows_beside_what_is_seen_and_covers_as_much() -> None:
     assert torch.equal(now[others], places[others])
     away = (now[born] - places[parents]).norm(dim=1) / avatar.log_scales[born].mean(dim=1).exp()
     assert 0.3 < float(away.median()) < 3.0 and float(away.max()) < 6.0
-    torch.testing.assert_close(avatar.code, positional_encoding(now))
+    torch.testing.assert_close(avatar.code, positional_encoding(now[:doubled]))
 
 
 def test_growth_repeats_to_the_bit_and_another_seed_is_another_set() -> None:
@@ -79,8 +78,7 @@ def test_growth_repeats_to_the_bit_and_another_seed_is_another_set() -> None:
         torch.manual_seed(0)
         avatar, optimizer, config = started("monogaussianavatar")
         config.seed = seed
-        move_points(avatar, optimizer, 10, config)
-        assert avatar.mesh_points is not None
+        avatar.after_step(optimizer, 10, config)
         return avatar.mesh_points.place
 
     assert torch.equal(grown(1), grown(1)) and not torch.equal(grown(1), grown(2))
@@ -95,19 +93,18 @@ def test_what_is_transparent_throughout_does_not_stop_the_growth() -> None:
     avatar, optimizer, config = started("monogaussianavatar")
     with torch.no_grad():
         avatar.opacity_logits.fill_(-20.0)
-    move_points(avatar, optimizer, 100, config)
-    assert avatar.count is not None and int(avatar.count) == len(avatar)
+    avatar.after_step(optimizer, 100, config)
+    assert int(avatar.count) == len(avatar)
 
 
 def test_places_walk_with_their_momentum_and_stay_on_the_mesh() -> None:
     avatar, optimizer, config = started("splattingavatar")
     points = avatar.mesh_points
-    assert points is not None and avatar.deformation is None
     before = points.face.clone()
     with torch.no_grad():
         points.place[:, 0] += 0.004
     was = optimizer.state[points.place]["exp_avg"].clone()
-    move_points(avatar, optimizer, 1, config)
+    avatar.after_step(optimizer, 1, config)
     moved = points.face != before
     assert bool(moved.any()) and bool((points.barycentric() >= -1e-5).all())
     now = optimizer.state[points.place]["exp_avg"]
@@ -119,9 +116,8 @@ def test_places_walk_with_their_momentum_and_stay_on_the_mesh() -> None:
 
 def test_the_default_has_neither() -> None:
     avatar, optimizer, config = started("hypergaussians")
-    assert avatar.mesh_points is None and avatar.count is None
     before = {name: value.clone() for name, value in avatar.state_dict().items()}
-    move_points(avatar, optimizer, 50, config)
+    avatar.after_step(optimizer, 50, config)
     assert all(torch.equal(value, before[name]) for name, value in avatar.state_dict().items())
     assert not any(name.startswith(("mesh_points", "count")) for name in before)
 
@@ -129,7 +125,7 @@ def test_the_default_has_neither() -> None:
 def test_a_run_whose_set_grew_is_opened_as_it_was_trained(tracked_folder: Path, tmp_path: Path) -> None:
     overrides = ["model=monogaussianavatar", "trainer.iterations=12"]
     avatar, _ = train_small(tracked_folder, tmp_path / "run", overrides)
-    assert avatar.count is not None and int(avatar.count) == len(avatar)
+    assert int(avatar.count) == len(avatar)
     trained = load_avatar(tmp_path / "run", tracked_folder / "head_model")
     assert torch.equal(trained.avatar.code, avatar.code)
     frame = trained.recording.params(0)
@@ -150,7 +146,7 @@ def test_points_that_cannot_be_there_get_a_sentence(
 ) -> None:
     config = small_config(f"model={model}")
     _, subject, assets = open_small(tracked_folder, config)
-    avatar = Avatar(assets, subject.identity, config.model)
+    avatar = make_avatar(assets, subject.identity, config.model)
     tensors = module_tensors(avatar)
     tensors[f"model.{name}"] = torch.full_like(tensors[f"model.{name}"], value)
     with pytest.raises(UserError, match=says):

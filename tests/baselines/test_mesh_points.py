@@ -9,7 +9,7 @@ import torch
 from heads import grid_head
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-from avatar.gaussians.mesh_points import MeshPoints, frame_quats
+from avatar.baselines.mesh_points import MeshPoints, frame_quats
 from avatar.head.normals import vertex_normals
 
 SQUARE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
@@ -20,7 +20,7 @@ def in_square(places: list[list[float]], faces: torch.Tensor = HALVES) -> MeshPo
     """Points of the first triangle at these places of its plane, which is that of the square."""
     count = len(places)
     first = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).repeat(count, 1)
-    points = MeshPoints(faces, SQUARE, torch.zeros(count, dtype=torch.long), first, learned=True)
+    points = MeshPoints(count, learned=True).double().bind(faces, SQUARE, torch.zeros(count, dtype=torch.long), first)
     with torch.no_grad():
         points.place[:, :2] = torch.tensor(places, dtype=torch.float64)
     return points
@@ -32,7 +32,8 @@ def head_points(count: int = 200, seed: int = 0) -> tuple[MeshPoints, torch.Tens
     vertices = assets.template.double()
     face = torch.randint(0, len(assets.faces), (count,), generator=generator)
     weights = torch.rand(count, 3, generator=generator, dtype=torch.float64)
-    return MeshPoints(assets.faces, vertices, face, weights / weights.sum(1, keepdim=True), learned=True), vertices
+    points = MeshPoints(count, learned=True).double()
+    return points.bind(assets.faces, vertices, face, weights / weights.sum(1, keepdim=True)), vertices
 
 
 def test_a_point_is_where_its_barycentric_coordinates_say_and_above_it() -> None:

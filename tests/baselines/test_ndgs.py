@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from avatar.gaussians.compose import compose_slice
-from avatar.gaussians.ndgs import NdGaussians
+from avatar.baselines.ndgs import NdGaussians, NdgsAvatar, Slice
 
 
 def random_gaussians(num: int, n: int, spread: float = 0.4) -> NdGaussians:
@@ -67,7 +68,8 @@ def test_a_slice_is_the_conditional_distribution_of_the_joint_one(n: int) -> Non
     assert float(density.min()) < 0.9 and float(density.max()) <= 1.0
 
     points, logits = torch.randn(num, 3, dtype=torch.float64), torch.randn(num, dtype=torch.float64)
-    splats = compose_slice(points, quats, log_scales, logits, torch.zeros(num, 1, 3), 1e-3 * position, density)
+    avatar = SimpleNamespace(base=lambda: (quats, log_scales, logits, torch.zeros(num, 1, 3)))
+    splats = NdgsAvatar.compose(avatar, points, Slice(1e-3 * position, density))
     torch.testing.assert_close(splats.means, points + torch.tanh(1e-3 * expected))
     torch.testing.assert_close(splats.opacities, torch.sigmoid(logits) * density)
     assert torch.equal(splats.scales, log_scales.exp())

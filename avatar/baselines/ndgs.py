@@ -23,13 +23,17 @@ Gaussians lie last, so that each step of the substitution is one operation on co
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from copy import deepcopy
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
-from avatar.gaussians.covariance import range_of_rows, triangle_size
+from avatar.baselines.covariance import triangle_size
+from avatar.model import FlashAvatar
+from avatar.types import Gaussians
 
 
 class Slice(NamedTuple):
@@ -60,13 +64,29 @@ class NdGaussians(nn.Module):
         position = mean_a + (self.cross * whitened).sum(dim=1)
         return Slice(position.T, torch.exp(-0.5 * whitened.square().sum(dim=0)))
 
+    def fold(self) -> Self:
+        """There is nothing to be computed once."""
+        return deepcopy(self)
+
 
 def substitute(triangle: Float[Tensor, "T N"], right: Float[Tensor, "n N"]) -> Float[Tensor, "n N"]:
     """w with B w = right. `triangle` holds B row by row: the strictly lower part as it is, the diagonal through exp."""
     n = len(right)
     solved: list[Tensor] = []
-    for row, value in zip(triangle.split(range_of_rows(n)), right.unbind(), strict=True):
+    for row, value in zip(triangle.split(list(range(1, n + 1))), right.unbind(), strict=True):
         if solved:
             value = value - (row[:-1] * torch.stack(solved)).sum(dim=0)
         solved.append(value * torch.exp(-row[-1]))
     return torch.stack(solved)
+
+
+class NdgsAvatar(FlashAvatar):
+    heads = NdGaussians
+    is_fused = has_stages = False
+    unknown_to_browsers = "its opacities"
+
+    def compose(self, points: Float[Tensor, "N 3"], offsets: Slice) -> Gaussians:
+        """Gaussians that move, through tanh as FlashAvatar's do, and fade; they do not turn or grow."""
+        quats, log_scales, opacity_logits, sh = self.base()
+        means, opacities = points + torch.tanh(offsets.position), torch.sigmoid(opacity_logits) * offsets.density
+        return Gaussians(means, normalize(quats, dim=-1), torch.exp(log_scales), opacities, sh)

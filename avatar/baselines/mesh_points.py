@@ -17,6 +17,7 @@ nothing goes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 import torch
@@ -33,13 +34,7 @@ LEAST_HEIGHT = 1e-7  # metres, of a triangle: a degenerate one takes part as one
 
 
 class MeshPoints(nn.Module):
-    """N points on a mesh of F triangles.
-
-    neutral     the vertices that places are measured on, metres
-    face        each point's triangle at first
-    barycentric its place there, sums of 1
-    learned     whether places are trained
-    """
+    """N points on a mesh of F triangles; `learned`: places are trained."""
 
     face: Int[Tensor, " N"]
     place: Float[Tensor, "N 3"]  # metres: x and y in the triangle's plane, height
@@ -50,25 +45,34 @@ class MeshPoints(nn.Module):
     _shift: Float[Tensor, "F 3 2"]
     _frames: Float[Tensor, "F 4"]  # orientations of the neutral triangles
 
-    def __init__(
+    def __init__(self, num_points: int, *, learned: bool) -> None:
+        super().__init__()
+        self.register_buffer("face", torch.zeros(num_points, dtype=torch.long))
+        place = torch.zeros(num_points, 3)  # x, y, height
+        self.register_load_state_dict_post_hook(lambda points, _: points.check())
+        self.register_parameter("place", nn.Parameter(place)) if learned else self.register_buffer("place", place)
+
+    @torch.no_grad()
+    def bind(
         self,
         faces: Int[Tensor, "F 3"],
         neutral: Float[Tensor, "V 3"],
         face: Int[Tensor, " N"],
         barycentric: Float[Tensor, "N 3"],
-        *,
-        learned: bool,
-    ) -> None:
-        super().__init__()
+    ) -> Self:
+        """Put the points on a mesh; places are measured on its vertices `neutral`, metres.
+
+        face         each point's triangle at first
+        barycentric  its place there, sums of 1
+        """
         corners = flat_corners(neutral[faces])
         constants = dict(zip(("across", "turn", "shift"), unfolding(faces, corners), strict=True))
         constants |= {"faces": faces, "corners": corners, "frames": frame_quats(neutral[faces])}
         for name, value in constants.items():
             self.register_buffer(f"_{name}", value, persistent=False)
-        self.register_buffer("face", face.clone())
-        flat = torch.einsum("nc,ncd->nd", barycentric, corners[face])
-        place = nn.functional.pad(flat, (0, 1))  # x, y, height
-        self.register_parameter("place", nn.Parameter(place)) if learned else self.register_buffer("place", place)
+        self.face.copy_(face)
+        self.place[:, :2] = torch.einsum("nc,ncd->nd", barycentric, corners[face])
+        return self
 
     def barycentric(self) -> Float[Tensor, "N 3"]:
         """Of the places; outside a triangle one or two are negative."""

@@ -22,8 +22,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from avatar.compute.memory import Need
+from avatar.config import ModelConfig
 from avatar.gaussians.hyper import FoldedHeads
 from avatar.gaussians.hyper_cpu import HEADS
+from avatar.model import FlashAvatar
 
 
 def triangle_size(size: int) -> int:
@@ -34,15 +37,10 @@ def triangle_size(size: int) -> int:
 def dense_factor(factor: Float[Tensor, "T N"], size: int) -> Float[Tensor, "size size N"]:
     """L from its lower triangle, row by row: the strictly lower part as it is, the diagonal through exp."""
     L = factor.new_zeros(size, size, factor.shape[1])
-    for i, row in enumerate(factor.split(range_of_rows(size))):
+    for i, row in enumerate(factor.split(list(range(1, size + 1)))):
         L[i, : i + 1] = row
         L[i, i].exp_()
     return L
-
-
-def range_of_rows(size: int) -> list[int]:
-    """The length of each row of a lower triangle."""
-    return list(range(1, size + 1))
 
 
 def conditional_mean(
@@ -78,7 +76,7 @@ class _ConditionalMean(torch.autograd.Function):
         first, second = _rows_times(L[m:], solved), _rows_times(L[m:], by_latents)
         second[:m] -= by_pulled
         by_factor = grad.new_empty(triangle_size(m + n), grad.shape[1])
-        for i, row in enumerate(by_factor.split(range_of_rows(m + n))):
+        for i, row in enumerate(by_factor.split(list(range(1, m + n + 1)))):
             if i < m:
                 torch.mul(grad[i], pulled[: i + 1], out=row)
             else:
@@ -143,20 +141,11 @@ class CovarianceHead(nn.Module):
     def forward(self, latents: Float[Tensor, "n N"]) -> Float[Tensor, "m N"]:
         return conditional_mean(self.mean, self.factor, latents)
 
-    def covariance(self) -> Float[Tensor, "N m+n m+n"]:
-        """Sigma in float64."""
-        L = dense_factor(self.factor.detach().double(), len(self.mean)).permute(2, 0, 1)
-        return L @ L.mT
-
     def slope(self) -> Float[Tensor, "N m n"]:
         """Sigma_ab Sigma_bb^-1 in float64."""
-        sigma, m = self.covariance(), self.attribute_size
+        L, m = dense_factor(self.factor.detach().double(), len(self.mean)).permute(2, 0, 1), self.attribute_size
+        sigma = L @ L.mT
         return torch.linalg.solve(sigma[:, m:, m:], sigma[:, m:, :m]).mT
-
-    def log_det_covariance(self) -> Float[Tensor, " N"]:
-        """log det Cov[a | b] = log det Sigma - log det Sigma_bb, of Schur's complement."""
-        sigma, m = self.covariance(), self.attribute_size
-        return torch.logdet(sigma) - torch.logdet(sigma[:, m:, m:])
 
 
 class CovarianceHeads(nn.Module):
@@ -189,8 +178,13 @@ class CovarianceHeads(nn.Module):
         dtype = self.get_parameter("position.mean").dtype
         return FoldedHeads(torch.cat(matrices, dim=-1).to(dtype).contiguous(), torch.cat(biases, dim=-1).to(dtype))
 
-    @torch.no_grad()
-    def uncertainty(self) -> Float[Tensor, " N"]:
-        """The paper's uncertainty, the log-determinants of the conditional covariances summed over the heads."""
-        found = torch.stack([head.log_det_covariance() for head in self.heads().values()]).sum(dim=0)
-        return found.to(self.get_parameter("position.mean").dtype)
+
+class CovarianceAvatar(FlashAvatar):
+    heads = CovarianceHeads
+    is_fused = False
+
+    @classmethod
+    def step_needs(cls, config: ModelConfig, gaussians: int) -> list[Need]:
+        """Of each head: the factor as a square, and that of the latent's block."""
+        squares = sum((m + config.latent_dim) ** 2 + config.latent_dim**2 for m in HEADS.values())
+        return [Need("the covariances", 4 * gaussians * squares, "model.uv_size or model.latent_dim")]

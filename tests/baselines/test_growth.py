@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from heads import grid_head
 
-from avatar.gaussians.growth import alive_after, evenly_ordered
+from avatar.baselines.monogaussianavatar import alive_after, evenly_ordered
 from avatar.gaussians.uv import UVTexels, uv_texels
 
 

@@ -1,0 +1,204 @@
+"""What every model is to the rest of the program: a frame's head parameters in, Gaussians out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from avatar.compute.device import on_gpu, to_device
+from avatar.compute.memory import Need
+from avatar.config import LearningRates, ModelConfig, TrainerConfig
+from avatar.gaussians.deformation import DeformationMLP
+from avatar.gaussians.embedding import Embedding, knn_scales
+from avatar.gaussians.encoding import encoded_size
+from avatar.gaussians.head_rotation import VALUES, head_rotation_input, learned_turning
+from avatar.gaussians.uv import UVTexels, bound_texels
+from avatar.head.assets import HeadAssets
+from avatar.head.model import HeadModel
+from avatar.head.teeth import with_teeth
+from avatar.splat import splat
+from avatar.types import Camera, Gaussians, HeadParams, Rendering
+
+CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
+SH_DEGREE = 3  # of the view-dependent colour
+OPACITY_RATE = 0.05  # of logits: of opacities and of skull shares
+NETWORK_RATE = 1e-4  # of the deformation network
+HYPER_RATE = 1e-4  # of the HyperGaussian heads, and of learned places on the mesh (metres)
+
+Groups = dict[str, tuple[Sequence[Tensor], float]]  # parameters and their learning rate, by what they are
+
+
+class Avatar(nn.Module):
+    """One person's avatar: Gaussians that are bound to the UV map of a head model.
+
+    A model is a subclass. It gives `forward`, makes its parameters in `make_parameters`, and gives of the other methods
+    those in which it differs. `avatar.runs.models` lists the models by name.
+
+    With `config.teeth`, `mesh`, which Gaussians are bound to, goes on after the vertices and triangles of `head`; else it
+    is `head`. `to(device)` moves all that drawing needs. `head` and `mesh` stay on the CPU; cameras and head parameters may
+    be on either side.
+    """
+
+    is_fused = False  # whether a GPU has kernels for all that follows the network, in place of torch's own operations
+    has_stages = False  # whether a frame goes through the stages of `avatar.model`, which `avatar bench` times
+    unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
+    turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
+
+    def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        mesh = with_teeth(assets) if config.teeth else assets
+        self.head = HeadModel(assets, identity)
+        self.mesh = self.head if mesh is assets else HeadModel(mesh, identity)
+        self.embedding = Embedding(mesh, self.ordered(bound_texels(assets, mesh, config.uv_size, config.uv_detail)))
+        self.make_parameters(config, assets.num_expressions, len(self))
+        with torch.no_grad():
+            self.log_scales.copy_(torch.log(knn_scales(self.neutral_points()))[:, None])
+        self.register_load_state_dict_post_hook(lambda avatar, _: avatar.after_load())
+
+    def __len__(self) -> int:
+        """The number of Gaussians."""
+        return len(self.embedding)
+
+    def forward(
+        self,
+        params: HeadParams,
+        vertices: Float[Tensor, "V 3"] | None = None,
+        rotation: Float[Tensor, "3 3"] | None = None,
+    ) -> Gaussians:
+        """The Gaussians of one frame, world space.
+
+        vertices  the head posed by `params` already, metres
+        rotation  R_cam_world of the camera that sees it; None: the head is turned as on average in training
+        """
+        raise NotImplementedError
+
+    def make_parameters(self, config: ModelConfig, num_expressions: int, N: int) -> None:
+        """Make every tensor of the state dict; from sizes alone, so that `shapes` needs no memory."""
+        self.register_buffer("turning", None)
+        self.log_scales = nn.Parameter(torch.zeros(N, 3))
+        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(N, 1))
+        self.opacity_logits = nn.Parameter(torch.logit(torch.tensor(config.initial_opacity)).repeat(N))
+        self.sh_dc = nn.Parameter(torch.zeros(N, 1, 3))
+        self.sh_rest = nn.Parameter(torch.zeros(N, (SH_DEGREE + 1) ** 2 - 1, 3))
+
+    def make_network(self, config: ModelConfig, num_expressions: int, out_size: int) -> DeformationMLP:
+        """A network that takes `condition`; for `make_parameters`."""
+        condition_size = num_expressions + CONDITION_EXTRAS
+        if config.head_rotation:
+            self.turning, condition_size = torch.zeros(VALUES, 9), condition_size + VALUES
+            self._turning_on_cpu = self.turning
+        return DeformationMLP(encoded_size(), condition_size, out_size, config.mlp_width, config.mlp_layers)
+
+    @staticmethod
+    def ordered(texels: UVTexels) -> UVTexels:
+        """The order of the Gaussians."""
+        return texels
+
+    @classmethod
+    def shapes(cls, config: ModelConfig, num_expressions: int, gaussians: int) -> dict[str, tuple[int, ...]]:
+        """The shape of every tensor in the state dict, by name; nothing is allocated."""
+        with torch.device("meta"):
+            blank = cls.__new__(cls)
+            nn.Module.__init__(blank)
+            blank.make_parameters(config, num_expressions, gaussians)
+            return {name: tuple(value.shape) for name, value in blank.state_dict().items()}
+
+    @classmethod
+    def most_places(cls, config: ModelConfig, gaussians: int) -> int:
+        """At how many places the network is evaluated, at most."""
+        return gaussians
+
+    @classmethod
+    def step_needs(cls, config: ModelConfig, gaussians: int) -> list[Need]:
+        """What a training step takes beside what those of all models take."""
+        return []
+
+    def parameter_groups(self, rates: LearningRates) -> Groups:
+        """Adam's groups of parameters with their learning rates."""
+        return {
+            "colour": ([self.sh_dc], rates.sh_dc),
+            "view-dependent colour": ([self.sh_rest], rates.sh_rest),
+            "logits": ([self.opacity_logits], OPACITY_RATE),
+            "scale": ([self.log_scales], rates.scale),
+            "rotation": ([self.quats], rates.rotation),
+        }
+
+    def after_step(self, optimizer: torch.optim.Adam, steps: int, config: TrainerConfig) -> None:
+        """Called after `steps` steps. A function of parameters, step and seed, so that a resumed run repeats them."""
+
+    def after_load(self) -> None:
+        """Called after parameters were loaded. Raises ValueError for those that cannot be."""
+        if self.turning is not None and not self.turning.is_meta:
+            self._turning_on_cpu = self.turning.cpu()
+
+    def frozen(self) -> Self:
+        """A copy for inference, the same to rounding: without gradients, and what never changes is computed once."""
+        shared = {id(part): part for part in (self.head, self.mesh)}
+        copy = deepcopy(self, shared | {id(part): other for part, other in self.folded().items()}).requires_grad_(False)
+        base = copy.base()
+        copy.base = lambda: base
+        del copy.sh_dc, copy.sh_rest  # which `base` has in one
+        return copy
+
+    def folded(self) -> dict[Any, Any]:
+        """Parts, and what takes their place in a frozen copy."""
+        return {}
+
+    def base(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Quaternions, log-scales, logits of the opacities and colours of the Gaussians that are drawn."""
+        return self.quats, self.log_scales, self.opacity_logits, torch.cat((self.sh_dc, self.sh_rest), dim=1)
+
+    def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
+        """`splat` with this avatar's blur; `options` as there."""
+        return splat(gaussians, camera, background, **{"blur": self.config.blur, **options})
+
+    @property
+    def device(self) -> torch.device:
+        return self.quats.device
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)
+        for part in vars(self).values():
+            if hasattr(part, "move"):  # it is no module
+                part.move(self.device)
+        return self
+
+    def neutral_points(self) -> Float[Tensor, "N 3"]:
+        """Where the Gaussians are bound to the neutral mesh, metres; on the CPU, before the avatar is moved."""
+        return self.embedding.points(self.mesh.neutral_vertices())
+
+    def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
+        """The posed mesh where the avatar is, metres, the head model's vertices first; on a GPU without gradients."""
+        return self.mesh.vertices_on_gpu(params, self.device) if on_gpu(self.quats) else self.mesh.vertices(params)
+
+    def condition(self, params: HeadParams, rotation=None) -> Float[Tensor, " D"]:
+        """A network's input for what `forward` takes; coefficients that the frame does not carry are zeros."""
+        parts = [params.expression, params.jaw, params.eyes, params.eyelids]
+        missing = self.head.assets.num_expressions - len(params.expression)
+        if missing > 0:
+            parts.insert(1, params.jaw.new_zeros(missing))
+        if self.turning is not None:
+            turned = params.jaw.new_zeros(VALUES) if rotation is None else self.head_rotation(rotation)
+            parts.append(to_device(turned, params.jaw.device))
+        return to_device(torch.cat(parts), self.device)
+
+    def head_rotation(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+        """The network's input for the head's rotation before a camera with this R_cam_world (`model.head_rotation`).
+
+        Where `rotation` is, so that a camera on the CPU costs a GPU one copy.
+        """
+        assert self.turning is not None
+        beside = self.turning if self.turning.device == rotation.device else self._turning_on_cpu
+        return head_rotation_input(beside, rotation)
+
+    def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:
+        """Before training: how heads are turned in its frames, whose R_cam_world these are."""
+        if self.turning is not None:
+            self.turning.copy_(learned_turning(rotations))
+            self._turning_on_cpu = self.turning.cpu()
