@@ -28,7 +28,6 @@ def lively_avatar(folder: Path, run: Path, *overrides: str, seed: int = 3) -> Tr
         "sh_rest": 0.05,
         "deformation": 0.02,
         "hyper": 0.02,
-        "ndgs": 0.02,
         "mesh_points": 0.002,
         "skull_logits": 2.0,
     }

@@ -88,4 +88,4 @@ def read_parameters(job: Path) -> dict:
     from safetensors import safe_open
 
     with safe_open(job / "run" / "avatar.safetensors", framework="pt") as file:
-        return {name.rpartition(".")[2]: file.get_tensor(name) for name in file.keys() if ".ndgs." in name}  # noqa: SIM118
+        return {name.rpartition(".")[2]: file.get_tensor(name) for name in file.keys() if ".hyper." in name}  # noqa: SIM118
