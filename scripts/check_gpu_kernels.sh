@@ -17,14 +17,10 @@ part() { echo "gpu-check: $1 ($SECONDS s)"; }
 
 export OMP_NUM_THREADS=1 TRITON_CACHE_DIR=$work/triton # compiled anew, each time
 part "the kernels in the interpreter"
-# Two halves at a time: the interpreter has one thread.
-TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider tests/splat -k gpu >"$work/splat" 2>&1 &
-splat=$!
-TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider tests/gpu && gpu=0 || gpu=$?
-wait "$splat" && splat=0 || splat=$?
-cat "$work/splat"
-[ "$gpu" = 0 ] || exit "$gpu" # set -e does not see the first of two tests joined by &&
-[ "$splat" = 0 ] || exit "$splat"
+for tests in "tests/gpu" "tests/splat -k gpu"; do # the interpreter has one thread
+  # shellcheck disable=SC2086
+  TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider -n "$jobs" --dist worksteal $tests
+done
 part "mistakes in the kernels"
 TRITON_INTERPRET=1 "$python" scripts/mutate_kernels.py --jobs "$jobs" --changed-only
 part "launches, and compiling"

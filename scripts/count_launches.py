@@ -34,7 +34,7 @@ from avatar.splat.scenes import head_camera
 from avatar.train.objective import SPARSE_EVERY, Objective, PerceptualTerm, Weighted
 from avatar.train.optimizer import make_optimizer, schedule, set_rates
 from avatar.train.pose_corrections import make_pose_corrections
-from avatar.train.step import Trainee, train_step
+from avatar.train.step import TrainState, train_step
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import StepRunner
 from avatar.types import IDENTITY_6D, Frame, HeadParams
@@ -115,7 +115,7 @@ class Rehearsal:
         planes = [torch.rand(size, size, *channels, device=device) for channels in ((3,), (), (), ())]
         box = slice(size // 8, size), slice(size // 4, 3 * size // 4)
         self.frame = Frame(0, "rehearsed", self.camera, self.params, *planes, head_box=box)
-        self.steps = StepRunner(self.trainee(PerceptualTerm("none")))
+        self.steps = StepRunner(self.state(PerceptualTerm("none")))
         self.steps.pose([self.frame])
         self.lpips = Lpips("squeeze").on(device)
 
@@ -130,11 +130,11 @@ class Rehearsal:
     def train(self, perceptual: PerceptualTerm, late: bool) -> None:
         step = self.number(late)
         set_rates(self.optimizer, schedule(step, self.trainer))
-        train_step(self.trainee(perceptual), step, self.steps.inputs(step, self.frame), self.guard.judge)
+        train_step(self.state(perceptual), step, self.steps.inputs(step, self.frame), self.guard.judge)
 
-    def trainee(self, perceptual: PerceptualTerm) -> Trainee:
+    def state(self, perceptual: PerceptualTerm) -> TrainState:
         objective = Objective(self.trainer, self.background, perceptual)
-        return Trainee(self.avatar, self.optimizer, objective, self.corrections)
+        return TrainState(self.avatar, self.optimizer, objective, self.corrections)
 
     def number(self, late: bool) -> int:
         """Of a step in the second half, or in the first."""

@@ -117,7 +117,7 @@ class Replays:
 
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.rehearsal = rehearsal
-        self.steps = StepRunner(rehearsal.trainee(STAND_IN))
+        self.steps = StepRunner(rehearsal.state(STAND_IN))
 
     def train(self, late: bool) -> None:
         r = self.rehearsal

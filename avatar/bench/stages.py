@@ -16,7 +16,7 @@ from avatar.gaussians.skull_binding import bind_to_skull
 from avatar.losses.photometric import PhotometricLoss
 from avatar.model import FlashAvatar
 from avatar.train.optimizer import schedule, set_rates
-from avatar.train.step import Trainee, check_step, gradients_of
+from avatar.train.step import TrainState, check_step, gradients_of
 from avatar.types import Frame, Gaussians
 
 
@@ -45,8 +45,8 @@ class Link:
 class StagedStep:
     """A training step of `avatar`, stage by stage: the operations of `train_step`, without pose corrections."""
 
-    def __init__(self, trainee: Trainee) -> None:
-        self.avatar, self.optimizer, self.objective = with_stages(trainee.avatar), trainee.optimizer, trainee.objective
+    def __init__(self, state: TrainState) -> None:
+        self.avatar, self.optimizer, self.objective = with_stages(state.avatar), state.optimizer, state.objective
         self.watch = Stopwatch()
         self._chain: list[Link] = []
 

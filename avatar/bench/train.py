@@ -28,7 +28,7 @@ from avatar.runs.models import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
-from avatar.train.step import Judge, Trainee
+from avatar.train.step import Judge, TrainState
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Frame
@@ -60,14 +60,14 @@ class Learner:
     """An avatar in training and some frames."""
 
     config: Config
-    trainee: Trainee
+    state: TrainState
     frames: Iterator[Frame]
     steps: StepRunner
     judge: Judge | None  # None: every step is checked at once
 
     @property
     def avatar(self) -> Avatar:
-        return self.trainee.avatar
+        return self.state.avatar
 
     def step(self, number: int) -> None:
         self.steps.make(number, next(self.frames), self.judge)
@@ -125,11 +125,11 @@ def make_learner(
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
     corrections = make_pose_corrections(avatar, len(train), config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
-    trainee = Trainee(avatar, optimizer, objective, corrections)
+    state = TrainState(avatar, optimizer, objective, corrections)
     judge = Guard(optimizer, device).judge if is_gpu else None
-    steps = StepRunner(trainee, rows={index: row for row, index in enumerate(train)}, say=say)
+    steps = StepRunner(state, rows={index: row for row, index in enumerate(train)}, say=say)
     steps.pose(frames)
-    return Learner(config, trainee, cycle(frames), steps, judge)
+    return Learner(config, state, cycle(frames), steps, judge)
 
 
 def silent(_: str) -> None:
@@ -138,7 +138,7 @@ def silent(_: str) -> None:
 
 def steps_at_once(learner: Learner) -> int:
     """So many steps hold one with the perceptual term."""
-    return learner.trainee.objective.perceptual.every
+    return learner.state.objective.perceptual.every
 
 
 def run_steps(learner: Learner, late: bool) -> None:
@@ -158,7 +158,7 @@ def per_step(time: Time, steps: int) -> Time:
 
 
 def stages(learner: Learner, subject: Subject, repeats: int) -> dict[str, Time]:
-    staged = StagedStep(learner.trainee)
+    staged = StagedStep(learner.state)
     size = learner.config.data.size
     pixels = [
         (frame.index, subject.pixels(frame.index, size)) for frame in (next(learner.frames) for _ in range(FRAMES))

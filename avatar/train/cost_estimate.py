@@ -18,7 +18,7 @@ from avatar.runs.models import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
-from avatar.train.step import Trainee
+from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
 from avatar.types import Frame
 
@@ -58,7 +58,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     size = frame.camera.width, frame.camera.height
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = Objective(config.trainer, torch.tensor(config.data.background), term)
-    steps = StepRunner(Trainee(avatar, optimizer, objective, corrections))
+    steps = StepRunner(TrainState(avatar, optimizer, objective, corrections))
 
     def seconds(step: int) -> float:
         taken = []

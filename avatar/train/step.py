@@ -63,7 +63,7 @@ class StepOutputs(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Trainee:
+class TrainState:
     """What is trained, how, and on what loss."""
 
     avatar: Avatar
@@ -78,37 +78,37 @@ class Trainee:
         return named
 
 
-def train_step(trainee: Trainee, step: int, inputs: StepInputs, judge: Judge | None = None) -> StepOutputs:
+def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | None = None) -> StepOutputs:
     """Step number `step` (from 0) at the optimizer's rates.
 
     Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
     is not finite; with a `judge` the latter is for it to see to.
     """
-    avatar, objective, frame = trainee.avatar, trainee.objective, inputs.frame
+    avatar, objective, frame = state.avatar, state.objective, inputs.frame
     target = frame.composite(objective.background)
     params, camera = frame.params, frame.camera
     if inputs.noise is not None:
         params = params.with_condition(params.condition() + inputs.noise)
-    if trainee.pose_corrections is not None:
-        camera = trainee.pose_corrections(camera, inputs.row, inputs.pose_jacobian)
+    if state.pose_corrections is not None:
+        camera = state.pose_corrections(camera, inputs.row, inputs.pose_jacobian)
     try:
         gaussians = avatar(params, inputs.vertices, camera.R_cam_world.detach())
         image = objective.draw(step, gaussians, camera, avatar)
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
     loss = objective.loss(step, frame, image, target)
-    trainee.optimizer.zero_grad()
+    state.optimizer.zero_grad()
     loss.total.backward()
-    gradients = gradients_of(trainee)
+    gradients = gradients_of(state)
     if judge is None:
         check_step(step, frame, loss, gradients)
     else:
         judge(loss, list(gradients.values()))
-    trainee.optimizer.step()
+    state.optimizer.step()
     return StepOutputs(PhotometricLoss(*(term.detach() for term in loss)), image.detach(), target)
 
 
-def gradients_of(module: Trainee | nn.Module) -> dict[str, Tensor]:
+def gradients_of(module: TrainState | nn.Module) -> dict[str, Tensor]:
     """By the parameter's name, of those that have one."""
     return {name: p.grad for name, p in dict(module.named_parameters()).items() if p.grad is not None}
 

@@ -21,7 +21,7 @@ from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.posed_mesh_cache import PosedMeshes
-from avatar.train.step import Judge, StepInputs, StepOutputs, Trainee, train_step
+from avatar.train.step import Judge, StepInputs, StepOutputs, TrainState, train_step
 from avatar.types import Frame
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
@@ -44,13 +44,13 @@ class StepRunner:
 
     def __init__(
         self,
-        trainee: Trainee,
+        state: TrainState,
         noise: ConditionNoise | None = None,
         rows: Mapping[int, int] | None = None,
         say: Callable[[str], object] = print,
     ) -> None:
-        self._trainee, self._noise, self._rows, self._say = trainee, noise, rows or {0: 0}, say
-        avatar = trainee.avatar
+        self._state, self._noise, self._rows, self._say = state, noise, rows or {0: 0}, say
+        avatar = state.avatar
         self._device = avatar.device
         self._meshes = PosedMeshes(avatar)
         self._jacobians: dict[int, Tensor] = {}  # of the frames' cameras in their corrections
@@ -67,15 +67,15 @@ class StepRunner:
     def make(self, step: int, frame: Frame, judge: Judge | None) -> StepOutputs:
         """Step number `step` (from 0) on one frame. See `train_step` for `judge` and what is raised. What a replayed step
         gives is overwritten by the next one."""
-        trainee, config = self._trainee, self._trainee.objective.config
-        set_rates(trainee.optimizer, schedule(step, config))
+        state, config = self._state, self._state.objective.config
+        set_rates(state.optimizer, schedule(step, config))
         inputs, kind = self.inputs(step, frame), self._kind(step, frame)
         replay = None if kind is None or judge is None else self._ready(kind, step, inputs, judge)
         if replay is not None:
             self.replayed += 1
             return replay(inputs.tensors())
-        outputs = train_step(trainee, step, inputs, judge)
-        trainee.avatar.after_step(trainee.optimizer, step + 1, config)
+        outputs = train_step(state, step, inputs, judge)
+        state.avatar.after_step(state.optimizer, step + 1, config)
         if kind is not None and judge is not None:
             self._launched[kind] += 1
         return outputs
@@ -84,7 +84,7 @@ class StepRunner:
         """What step `step` takes of a frame, where the avatar is."""
         vertices, camera = self._meshes.vertices(frame), frame.camera
         noise = None if self._noise is None else to_device(self._noise.of(step), self._device)
-        corrections, row, jacobian = self._trainee.pose_corrections, None, None
+        corrections, row, jacobian = self._state.pose_corrections, None, None
         if corrections is not None:
             row = torch.full((1,), self._rows[frame.index], device=self._device)
             if frame.index not in self._jacobians:
@@ -99,7 +99,7 @@ class StepRunner:
 
     def _kind(self, step: int, frame: Frame) -> Kind | None:
         """None: to be launched."""
-        term = self._trainee.objective.term(step)
+        term = self._state.objective.term(step)
         if not self._replays or (term is not None and term.crops):
             return None
         return Kind((frame.camera.width, frame.camera.height), sh_degree(step), term)
@@ -110,7 +110,7 @@ class StepRunner:
             return self._captured.get(kind)
 
         def play(tensors: Mapping[str, Tensor]) -> StepOutputs:
-            return train_step(self._trainee, step, inputs.with_tensors(tensors), judge)
+            return train_step(self._state, step, inputs.with_tensors(tensors), judge)
 
         try:
             replay = Replay(play, inputs.tensors())

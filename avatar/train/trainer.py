@@ -28,7 +28,7 @@ from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_ten
 from avatar.train.order import frame_order
 from avatar.train.pose_corrections import PREFIX, make_pose_corrections
 from avatar.train.prune import prune_background_gaussians, prune_step
-from avatar.train.step import Trainee, stopped
+from avatar.train.step import TrainState, stopped
 from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor
 from avatar.train.step_runner import StepRunner
 
@@ -66,11 +66,11 @@ def train(
     corrections = make_pose_corrections(avatar, len(recording.split.train), trainer)
     optimizer = make_optimizer(avatar, trainer, corrections)
     background = torch.tensor(config.data.background).to(device)
-    trainee = Trainee(avatar, optimizer, Objective(trainer, background, perceptual), corrections)
+    state = TrainState(avatar, optimizer, Objective(trainer, background, perceptual), corrections)
     if resume is not None:
         if corrections is not None:
             corrections.load(resume.tensors)
-        load_optimizer(optimizer, trainee.named_parameters(), resume.tensors)
+        load_optimizer(optimizer, state.named_parameters(), resume.tensors)
     is_gpu = on_gpu(avatar.quats)
     meta = {
         "head_fingerprint": avatar.head.assets.fingerprint,
@@ -82,7 +82,7 @@ def train(
     }
 
     def save(step: int) -> None:
-        tensors = module_tensors(avatar) | optimizer_tensors(optimizer, trainee.named_parameters())
+        tensors = module_tensors(avatar) | optimizer_tensors(optimizer, state.named_parameters())
         if corrections is not None:
             tensors[f"{PREFIX}moves"] = corrections.moves.detach()
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
@@ -98,7 +98,7 @@ def train(
     ):
         progress = AsyncStepMonitor(log, optimizer, device) if is_gpu else SyncStepMonitor(log)
         rows = {index: row for row, index in enumerate(recording.split.train)}
-        steps = StepRunner(trainee, make_noise(recording, trainer), rows, log.say)
+        steps = StepRunner(state, make_noise(recording, trainer), rows, log.say)
         order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
         try:
             for frame in loader.frames(order):

@@ -50,7 +50,7 @@ from avatar.runs.models import make_avatar
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
-from avatar.train.step import Trainee
+from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
 from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
@@ -74,7 +74,7 @@ class Learner:
         self.background = torch.tensor(config.data.background)
         term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
         self.objective = Objective(config.trainer, self.background, term)
-        self.steps = StepRunner(Trainee(self.avatar, self.optimizer, self.objective))
+        self.steps = StepRunner(TrainState(self.avatar, self.optimizer, self.objective))
         self.step, self.points = 0, [{"mark": 0.0, "seconds": 0.0, "step": 0}]
         recorded = {"data_hash": subject.data_hash, "config": config.to_dict(), "perceptual": term.name}
         self.recorded = json.loads(json.dumps(recorded))  # as a checkpoint gives it back

@@ -14,7 +14,7 @@ from avatar.bench.train_report import run
 from avatar.errors import UserError
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import make_optimizer
-from avatar.train.step import Trainee
+from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
 
 
@@ -31,9 +31,9 @@ def test_a_step_in_stages_is_the_trainings_step(tracked_folder: Path, overrides:
         objective = Objective(config.trainer, torch.ones(3), choose_perceptual(config.trainer, lambda _: None))
         for _ in range(2):
             if staged:
-                StagedStep(Trainee(avatar, optimizer, objective))(number, lambda: frame)
+                StagedStep(TrainState(avatar, optimizer, objective))(number, lambda: frame)
             else:
-                StepRunner(Trainee(avatar, optimizer, objective)).make(number, frame, None)
+                StepRunner(TrainState(avatar, optimizer, objective)).make(number, frame, None)
         avatars.append(dict(avatar.named_parameters()))
     whole, staged = avatars
     assert not [name for name in whole if not torch.equal(whole[name], staged[name])]

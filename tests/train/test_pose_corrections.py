@@ -23,7 +23,7 @@ from avatar.train.pose_corrections import (
     PoseCorrections,
     make_pose_corrections,
 )
-from avatar.train.step import Trainee
+from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
 from avatar.types import Camera
 
@@ -46,7 +46,7 @@ def corrected(avatar: Avatar, clip: Clip) -> tuple[PoseCorrections, Clip]:
     for group in optimizer.param_groups[:-1]:
         group["full_lr"] = 0.0
     rows = {index: row for row, index in enumerate(train)}
-    steps = StepRunner(Trainee(avatar, optimizer, objective, corrections), rows=rows)
+    steps = StepRunner(TrainState(avatar, optimizer, objective, corrections), rows=rows)
     for step in range(STEPS):
         index = train[step % len(train)]
         steps.make(step, replace(clip.pictures[index], camera=clip.recording.camera(index)), None)
