@@ -17,12 +17,6 @@ BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
 FRAMES_AHEAD = 3  # of every worker
 
 
-def cache_estimate(subject: Subject, size: int | None = None, count: int | None = None) -> int:
-    """Bytes that `count` decoded frames (all of them by default) take in the cache."""
-    width, height = subject.image_size(size)
-    return width * height * BYTES_PER_PIXEL * (len(subject) if count is None else count)
-
-
 class FrameLoader:
     """Decoded frames of a subject. Keeps the most recently used ones as uint8, at most `cache_bytes` of them.
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tracked_folder import write_tracked_folder
 
-from avatar.data.loader import FrameLoader, cache_estimate
+from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
 from avatar.data.subject import FramePixels, Subject
 from avatar.errors import UserError
@@ -55,7 +55,7 @@ def test_memory_is_bounded_and_used(subject: Subject, monkeypatch: pytest.Monkey
         for _ in loader.frames(itertools.islice(itertools.cycle(range(12)), 60)):
             assert loader.cached_bytes <= 12 * FRAME_BYTES
         assert sorted(decoded) == list(range(12)), "every frame is decoded once"
-        assert loader.cached_bytes == cache_estimate(subject) == 12 * FRAME_BYTES
+        assert loader.cached_bytes == 12 * FRAME_BYTES
     decoded.clear()
     with FrameLoader(subject, cache_bytes=4 * FRAME_BYTES) as loader:
         for _ in loader.frames(itertools.islice(itertools.cycle(range(12)), 60)):
@@ -99,11 +99,6 @@ def test_closing_stops_the_threads(subject: Subject) -> None:
     assert threading.active_count() == before and loader.cached_bytes == 0
     with pytest.raises(RuntimeError, match="the frame loader is closed"):
         next(loader.frames([0]))
-
-
-def test_estimates(subject: Subject) -> None:
-    assert cache_estimate(subject, size=32) == 12 * 32 * 32 * 6
-    assert cache_estimate(subject, count=500) == 500 * FRAME_BYTES
 
 
 @pytest.mark.parametrize(

@@ -120,10 +120,3 @@ def gaze_axes(angles: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B 3 2"]:
     cy, sy = angles[..., 0].cos(), angles[..., 0].sin()
     o, one = torch.zeros_like(cy), torch.ones_like(cy)
     return torch.stack((o, cy, one, o, o, -sy), dim=-1).reshape(*cy.shape, 3, 2)
-
-
-def gaze_angles(R: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 2"]:
-    """Yaw and pitch of eyes' rotations; a torsion is lost."""
-    forward = R[..., :, 2]
-    pitch = torch.atan2(-forward[..., 1], torch.hypot(forward[..., 0], forward[..., 2]))
-    return torch.stack((torch.atan2(forward[..., 0], forward[..., 2]), pitch), dim=-1)

@@ -164,17 +164,3 @@ class _Factors:
 def _right_solve(matrix: Tensor, factor: Tensor) -> Tensor:
     """matrix factor'^-1 of a lower triangular factor."""
     return torch.linalg.solve_triangular(factor.T, matrix, upper=True, left=False)
-
-
-def condition_number(equations: NormalEquations) -> float:
-    """Of the reduced matrix of the shared unknowns, scaled to a unit diagonal; 1 where there are none.
-
-    Large values say that the clip does not tell the shared unknowns apart.
-    """
-    if len(equations.shared) == 0:
-        return 1.0
-    factors = _Factors(equations.diagonal, equations.before, equations.before_that)
-    schur = equations.shared - torch.einsum("tdg,tdh->gh", equations.border, factors.solve(equations.border))
-    scale = schur.diagonal().rsqrt()
-    values = torch.linalg.eigvalsh(schur * scale[:, None] * scale)
-    return float(values[-1] / values[0].clamp(min=1e-300))

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.head.expression_names import ExpressionNames, plain
+from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.landmarks import BLENDSHAPES, Landmarks
 from data_prep.track.fit.motion import Columns, Motion
 from data_prep.track.fit.normal_equations import NormalEquations
@@ -144,8 +144,3 @@ def make_priors(
     named_negative = (mean[:, expression] < 0).any(0)  # mapped to with a negative weight: goes both ways
     low[expression] = torch.where(named_negative, -BOX[1], low[expression])
     return Priors(mean, deviation.pow(-2), low, high)
-
-
-def names_anything(names: ExpressionNames) -> bool:
-    """Whether a head model's coefficients are known by name, so that scores speak about them."""
-    return any(names.targets(blendshape) for blendshape in BLENDSHAPES) or any(map(plain, filter(None, names.names)))

@@ -17,7 +17,6 @@ from data_prep.track.fit.motion import (
     NUM_FIXED,
     Columns,
     Motion,
-    gaze_angles,
     gaze_rotations,
     left_jacobians,
     rotations,
@@ -130,11 +129,3 @@ def test_rotation_vectors(angle: float) -> None:
     moved = torch.autograd.functional.jacobian(lambda d: rotations(v + d) @ R.T, torch.zeros(3, dtype=torch.float64))
     turned = torch.stack((moved[2, 1], moved[0, 2], moved[1, 0]))
     torch.testing.assert_close(left_jacobians(v), turned, rtol=0, atol=1e-9)
-
-
-def test_gaze_angles_come_back() -> None:
-    angles = torch.tensor([[0.3, -0.2], [-1.2, 0.4], [0.0, 0.0]], dtype=torch.float64)
-    torch.testing.assert_close(gaze_angles(gaze_rotations(angles)), angles, rtol=0, atol=1e-12)
-    left = gaze_rotations(torch.tensor([0.1, 0.0], dtype=torch.float64)) @ torch.tensor([0.0, 0.0, 1.0]).double()
-    down = gaze_rotations(torch.tensor([0.0, 0.1], dtype=torch.float64)) @ torch.tensor([0.0, 0.0, 1.0]).double()
-    assert left[0] > 0.09 and down[1] < -0.09
