@@ -58,9 +58,15 @@ class ModelConfig:
     teeth: Annotated[bool, "add two rows of Gaussians behind the lips that move with skull and jaw"] = True
 
 
+# Adam's learning rates that do not vary; `LearningRates` has the others.
+OPACITY_RATE = 0.05  # of logits: of opacities and of skull shares
+NETWORK_RATE = 1e-4  # of the deformation network
+HYPER_RATE = 1e-4  # of the HyperGaussian heads, and of learned places on the mesh (metres)
+
+
 @dataclass
 class LearningRates:
-    """Adam's learning rates of the Gaussians; `gaussians/avatar.py` has those that do not vary."""
+    """Adam's learning rates of the Gaussians."""
 
     sh_dc: Annotated[float, RATE, "base colour"] = 1.0e-2
     sh_rest: Annotated[float, RATE, "view-dependent colour"] = 2.5e-3

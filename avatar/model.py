@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu
-from avatar.config import LearningRates, ModelConfig
-from avatar.gaussians.avatar import HYPER_RATE, NETWORK_RATE, OPACITY_RATE, Avatar, Groups
+from avatar.config import HYPER_RATE, NETWORK_RATE, OPACITY_RATE, LearningRates, ModelConfig
+from avatar.gaussians.base_model import Avatar, Groups
 from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.gaussians.encoding import positional_encoding

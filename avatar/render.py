@@ -19,7 +19,7 @@ from torch import Tensor
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.workers import single_threaded_workers
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.splat import CannotDraw
 from avatar.splat.cpu import thread_count
 from avatar.splat.gpu_buffers import checked_drawings

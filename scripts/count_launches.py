@@ -29,7 +29,7 @@ from avatar.kernels.start import watched
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.render import Renderer
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.splat.scenes import head_camera
 from avatar.train.objective import SPARSE_EVERY, Objective, PerceptualTerm, Weighted
 from avatar.train.optimizer import make_optimizer, schedule, set_rates

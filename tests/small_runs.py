@@ -11,11 +11,11 @@ import torch
 from avatar.config import Config, chosen_options, load_config
 from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.pipeline.open import split_sizes
 from avatar.runs.checkpoint import Checkpoint
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import start_run
 from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train

@@ -9,10 +9,19 @@ import pytest
 import torch
 from command_line import avatar
 
-from avatar.config import Config, config_from_dict, declared_keys, flatten, load_config
+from avatar.config import (
+    HYPER_RATE,
+    NETWORK_RATE,
+    OPACITY_RATE,
+    Config,
+    config_from_dict,
+    declared_keys,
+    flatten,
+    load_config,
+)
 from avatar.config_values import Range
 from avatar.errors import UserError
-from avatar.gaussians.avatar import HYPER_RATE, NETWORK_RATE, OPACITY_RATE, SH_DEGREE
+from avatar.gaussians.base_model import SH_DEGREE
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
 from avatar.train.objective import perceptual_start

@@ -11,9 +11,9 @@ from heads import EXPRESSIONS, grid_head, random_params
 from avatar.compute.workers import single_threaded_workers
 from avatar.config import load_config
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.render import AHEAD_PER_WORKER, Renderer
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.types import Camera, HeadParams
 
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])

@@ -1,1 +1,1 @@
-"""The systems that the paper compares with, each a model of its own (`avatar.gaussians.avatar.Avatar`)."""
+"""The systems that the paper compares with, each a model of its own (`avatar.gaussians.base_model.Avatar`)."""

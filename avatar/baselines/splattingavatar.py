@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from avatar.baselines.mesh_points import MeshPoints
-from avatar.config import LearningRates, ModelConfig, TrainerConfig
-from avatar.gaussians.avatar import HYPER_RATE, Avatar, Groups
+from avatar.config import HYPER_RATE, LearningRates, ModelConfig, TrainerConfig
+from avatar.gaussians.base_model import Avatar, Groups
 from avatar.gaussians.compose import quaternion_product
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams

@@ -25,17 +25,17 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.evaluation.lpips_networks import find_lpips
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.pipeline.open import split_sizes
-from avatar.pipeline.plan import WITH_REFINEMENT, round_steps
+from avatar.pipeline.refine_plan import WITH_REFINEMENT, round_steps
 from avatar.pose_refinement.motion import EXPRESSION, values_of
 from avatar.pose_refinement.refine import refine_subject
 from avatar.render import Renderer
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import choose_perceptual
 from avatar.train.order import planned_steps, within_passes
 from avatar.train.trainer import train

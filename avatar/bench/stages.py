@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.gaussians.skull_binding import bind_to_skull
 from avatar.losses.photometric import PhotometricLoss
 from avatar.model import FlashAvatar

@@ -34,7 +34,7 @@ from avatar.evaluation.lpips_networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.pipeline.open import split_sizes
-from avatar.pipeline.plan import WITH_REFINEMENT
+from avatar.pipeline.refine_plan import WITH_REFINEMENT
 from avatar.pipeline.track import bar
 from avatar.train.order import planned_steps
 from data_prep.formats.avatar_track import LANDMARKS_FILE, TrackingInfo

@@ -21,10 +21,10 @@ from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.model import FlashAvatar
 from avatar.pipeline.open import split_sizes
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections

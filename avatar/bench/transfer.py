@@ -32,14 +32,14 @@ from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer as Truth
 from avatar.demo.subject import make_subject, tracking_bias
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import psnr
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.pipeline.open import split_sizes
-from avatar.pipeline.plan import WITH_REFINEMENT
+from avatar.pipeline.refine_plan import WITH_REFINEMENT
 from avatar.render import Renderer
 from avatar.types import Camera, HeadParams
 from data_prep.prepare.open import open_subject

@@ -16,7 +16,7 @@ from avatar.sweep.engines import EngineOptions, make_engine
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Spec, read_spec
 from avatar.sweep.state import SWEEP_FILE, State, read_state, read_sweep, write_state, write_sweep
-from avatar.sweep.table import Progress, full_table, overview
+from avatar.sweep.status import Progress, full_table, overview
 
 FAILED = 1
 

@@ -14,7 +14,7 @@ from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.files.names import safe_name
 from avatar.pipeline.open import at_new_place, source_of
-from avatar.pipeline.plan import ROUNDS_FOLDER, Plan, plan_file
+from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, plan_file
 from avatar.pipeline.track import head_for_video, is_video, tracked_once
 from avatar.pipeline.train import resume_run, train_new
 from avatar.pipeline.train_refined import begin_rounds, train_refined

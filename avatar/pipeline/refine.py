@@ -12,7 +12,7 @@ from avatar.data.refinement import Refinement, Round
 from avatar.files.names import shortened
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.plan import FIRST_PASSES
+from avatar.pipeline.refine_plan import FIRST_PASSES
 from avatar.pose_refinement.record import frames_csv, sheet, summary
 from avatar.pose_refinement.refine import fingerprint, refine_subject
 from avatar.runs.run import Run

@@ -15,7 +15,7 @@ from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.files.lock import locked
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
@@ -23,7 +23,7 @@ from avatar.pipeline.open import check_data, moved_source, split_sizes
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.memory_estimate import training_needs
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.objective import PerceptualTerm, choose_perceptual
 from avatar.train.order import within_passes

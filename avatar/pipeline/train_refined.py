@@ -16,8 +16,8 @@ from avatar.files.lock import locked
 from avatar.files.names import safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.open import open_run
-from avatar.pipeline.plan import ROUNDS_FOLDER, Pace, Plan, steps_in_time
 from avatar.pipeline.refine import refine_run
+from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Pace, Plan, steps_in_time
 from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.run import RUN_FILE

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from avatar.compute.device import to_device
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose

@@ -16,7 +16,7 @@ from torch import Tensor
 from avatar.data.recording import Recording
 from avatar.data.subject import Subject
 from avatar.files.video import error_map, side_by_side
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.refine import Refined
 from avatar.render import Renderer
 from avatar.splat.gpu_buffers import checked_drawings

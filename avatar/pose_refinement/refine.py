@@ -27,7 +27,7 @@ from avatar.compute.native import thread_count
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.descent import Descent, Problem, curvature, descend
 from avatar.pose_refinement.frame_fitter import FrameFitter, Measure, Target, coarse_levels, head_psnr, targets
 from avatar.pose_refinement.motion import HeadPose, moved_tracks

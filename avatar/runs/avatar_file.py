@@ -28,14 +28,14 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import safe_name
 from avatar.files.opening import MissingFile, open_file
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames, parse_expression_names
 from avatar.head.packed import head_from_tensors, head_tensors
 from avatar.motion.rest import RestPose
 from avatar.runs.checkpoint import check_fit, load_module, module_tensors
 from avatar.runs.memory_estimate import count_gaussians, drawing_needs
-from avatar.runs.models import MODELS, make_avatar
+from avatar.runs.model_registry import MODELS, make_avatar
 from avatar.version import __version__
 
 AVATAR_FILE = "avatar.safetensors"

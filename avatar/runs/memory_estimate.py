@@ -15,7 +15,7 @@ from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.teeth import with_teeth
-from avatar.runs.models import MODELS
+from avatar.runs.model_registry import MODELS
 
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
 

@@ -24,7 +24,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import is_there, read_json
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.trained import TrainedAvatar, load_avatar, runs_in

@@ -16,7 +16,7 @@ from avatar.data.recording import Recording
 from avatar.errors import UserError
 from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.motion.rest import RestPose
 from avatar.motion.statistics import MotionStatistics, learn_statistics

@@ -10,7 +10,7 @@ from typing import Any
 from avatar.sweep.engines import Engine
 from avatar.sweep.spec import Spec
 from avatar.sweep.state import State, progress_mark, read_state, stored_state, write_state
-from avatar.sweep.table import Progress, duration
+from avatar.sweep.status import Progress, duration
 
 POLL_SECONDS = 0.5
 STILL_SECONDS = 15 * 60.0  # in which a worker that computes anything has used a second of its processor

@@ -14,7 +14,7 @@ from torch import Tensor
 from avatar.config import Config, TrainerConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.rasterize import rasterize_mesh
 from avatar.splat.sh import C0
 from avatar.types import Frame

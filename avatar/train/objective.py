@@ -15,7 +15,7 @@ from torch import Tensor
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.gaussians.avatar import SH_DEGREE, Avatar
+from avatar.gaussians.base_model import SH_DEGREE, Avatar
 from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_WINDOW

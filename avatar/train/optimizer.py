@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from avatar.compute.device import on_gpu, to_device
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.train.pose_corrections import PoseCorrections
 
 EPSILON = 1e-15  # Adam's

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.types import Camera
 
 TURN_UNIT, SHIFT_UNIT = 0.5 * math.pi / 180, 1e-3  # radians, metres: a tracker's usual errors

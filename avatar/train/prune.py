@@ -11,7 +11,7 @@ from torch import Tensor
 from avatar.config import TrainerConfig
 from avatar.data.loader import FrameLoader
 from avatar.data.split import evenly_spread
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.splat import CannotDraw
 from avatar.splat.gpu_buffers import checked_drawings
 from avatar.splat.sh import C0

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.losses.photometric import PhotometricLoss
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite

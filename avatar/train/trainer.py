@@ -14,7 +14,7 @@ from avatar.config import Config
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint

@@ -20,11 +20,11 @@ from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
 from avatar.view.auth import LOCAL, Gate
-from avatar.view.complaints import Complaints
 from avatar.view.live import Pace
 from avatar.view.messages import Door
 from avatar.view.panel import Panel, notes
 from avatar.view.player import Player
+from avatar.view.rate_limited_log import Complaints
 from avatar.view.stage import Look, Setting, Stage
 from avatar.view.web_server import WebServer
 

@@ -25,8 +25,8 @@ from websockets.protocol import State
 
 from avatar.errors import UserError
 from avatar.view.auth import Gate, Refusal
-from avatar.view.complaints import Complaints
 from avatar.view.messages import MAX_MESSAGE, Door, MessageError
+from avatar.view.rate_limited_log import Complaints
 
 MAX_WAITING = 64  # connections that have not been let in yet
 MAX_CLIENTS = 16

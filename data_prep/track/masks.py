@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from avatar.errors import UserError
+from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
 from data_prep.track.clothes import Colours
 from data_prep.track.faces.landmark_groups import OUTER_LIPS
-from data_prep.track.matting import band_radius, closed_form, within_limits
 from data_prep.track.neck_zones import SIDE, Zones
 
 # Heights above the neck ring; 1 is the middle of the head.

@@ -1,94 +1,130 @@
-"""Closed-form matting of a narrow band: how much of each of its pixels is foreground (Levin, Lischinski, Weiss 2008).
+"""Foreground mattes: the person against the background, by a small published network and the colours at its edge.
 
-In every 3x3 window the foreground's share is taken for a linear function of the colour. Of all functions that are known
-outside the band, the one is sought that comes nearest to that everywhere: a sparse linear system with one unknown for each
-pixel of the band.
+`selfie_segmentation` gives the probability of the foreground at 256x256, of the picture and of its mirror image;
+`selfie_multiclass` is taken instead where its file is. The network knows where the person ends to a pixel of its own; it
+fills gaps, which a camera that stands still shows (`plate.py`). Within that, around the head, closed-form matting says what
+the colours say (neither a guided filter nor GrabCut did).
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
-from scipy.sparse import csr_matrix, diags
-from scipy.sparse.linalg import splu
+from jaxtyping import Float, Float32, UInt8
 
-LARGEST = 1024  # pixels of the longer side of pictures that are matted: it bounds memory and time
-_MOST_UNKNOWN = 40_000  # pixels; a head's band has a fifth at most, and more is no band
-_NETWORK_SIDE = 320  # pixels of a picture that are one of the network's, its error included
-_OFFSETS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+from avatar.errors import UserError
+from avatar.files.third_party import SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find, require
+from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
+from data_prep.track.plate import Plate, shown
 
-
-def band_radius(height: int, width: int) -> int:
-    """Pixels on both sides of an edge found at the network's size, within which the true one lies."""
-    return max(1, round(max(height, width) / _NETWORK_SIDE))
-
-
-def within_limits(
-    refine: Callable[..., UInt8[np.ndarray, "h w"]], image: UInt8[np.ndarray, "H W 3"], *masks: UInt8[np.ndarray, "H W"]
-) -> UInt8[np.ndarray, "H W"]:
-    """`refine(image, *masks)`, of smaller pictures where these are larger than `LARGEST`."""
-    height, width = image.shape[:2]
-    if max(height, width) <= LARGEST:
-        return refine(image, *masks)
-    return cv2.resize(refine(*map(limited, (image, *masks))), (width, height), interpolation=cv2.INTER_LINEAR)
+SIDE = 256  # of the networks' pictures
+_SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network
+_STEEPER = 1.5  # times, about a half: closed-form matting spreads an edge over more pixels than it covers
+# How far hair, ears and neck reach beyond the landmarks' box, of its longer side: above, beside, below.
+_ABOVE, _BESIDE, _BELOW = 0.75, 0.5, 0.6
+_LOADING = threading.Lock()
+"""Two loads at once find operators unsupported, or crash: OpenCV's table of them is filled by the first."""
+Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
 
 
-def limited(pixels: UInt8[np.ndarray, "H W *C"]) -> UInt8[np.ndarray, "h w *C"]:
-    """A picture or mask at the size at which it is matted: a copy, smaller where it is larger than `LARGEST`."""
-    height, width = pixels.shape[:2]
-    scale = LARGEST / max(height, width)
-    if scale >= 1.0:
-        return pixels.copy()
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+def open_matter() -> tuple[Matter, str]:
+    """The best network that is there, as a function from a picture to its matte (0 to 255), and the network's name."""
+    if find(SELFIE_MULTICLASS) is not None:
+        return _with_mirrored(_multiclass()), SELFIE_MULTICLASS.name
+    return _with_mirrored(_segmentation()), SELFIE_SEGMENTATION.name
 
 
-def closed_form(
+def sharpened(
     image: UInt8[np.ndarray, "H W 3"],
-    guess: Float32[np.ndarray, "H W"],
-    band: Bool[np.ndarray, "H W"],
-    noise: float = 3e-3,
-    trust: float = 1e-3,
-) -> Float32[np.ndarray, "H W"]:
-    """`guess` with what the colours say in `band`, in [0, 1]; outside it is kept, and all where the band is too large.
+    matte: UInt8[np.ndarray, "H W"],
+    points: Float[np.ndarray, "L 2"],
+    plate: Plate | None = None,
+) -> UInt8[np.ndarray, "H W"]:
+    """A network's matte with the colours' edge around the head, whose landmarks are `points` in pixels of the image.
 
-    `noise` is the standard deviation of the picture's noise, levels / 255, which windows of one colour need. `trust` draws
-    the solution towards the guess, where colours say nothing.
+    `plate` is what stands behind the person, where it is known.
     """
-    result = np.ascontiguousarray(guess, np.float32).copy()
-    band = band.copy()
-    band[[0, -1]] = band[:, [0, -1]] = False  # windows end at the picture's border
-    if not 0 < np.count_nonzero(band) <= _MOST_UNKNOWN:
-        return result
-    height, width = band.shape
-    centres = np.flatnonzero(_inner(cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0))
-    pixels = centres[:, None] + np.array([y * width + x for y, x in _OFFSETS])  # [K, 9]
-    colours = image.reshape(-1, 3)[pixels].astype(np.float32) / 255.0
-    colours -= colours.mean(1, keepdims=True)
-    covariance = np.einsum("kic,kid->kcd", colours, colours) / 9.0 + noise**2 * np.eye(3, dtype=np.float32)
-    spread = colours @ np.linalg.inv(covariance)
-    weights = (1.0 + spread @ colours.transpose(0, 2, 1)) / 9.0  # affinities [K, 9, 9]
-    unknown = np.flatnonzero(band)
-    number = np.full(height * width, -1, np.int32)
-    number[unknown] = np.arange(len(unknown))
-    ours = number[pixels]
-    rows, columns = np.broadcast_arrays(ours[:, :, None], ours[:, None, :])
-    both = (rows >= 0) & (columns >= 0)
-    n = len(unknown)
-    affinity = csr_matrix((weights[both].astype(np.float64), (rows[both], columns[both])), (n, n))
-    windows = np.bincount(ours[ours >= 0], minlength=n)  # that hold each pixel
-    known = np.where(band, np.float32(0.0), result).reshape(-1)[pixels]
-    given = (weights @ known[:, :, None])[..., 0]
-    right = np.bincount(ours[ours >= 0], given[ours >= 0].astype(np.float64), minlength=n)
-    system = diags(windows + trust) - affinity
-    solution = splu(system.tocsc()).solve(right + trust * result.reshape(-1)[unknown])
-    result.reshape(-1)[unknown] = np.clip(solution, 0.0, 1.0)
-    return result
+    return within_limits(partial(_sharpened, plate), image, matte, _about_head(points, *matte.shape))
 
 
-def _inner(mask: np.ndarray) -> np.ndarray:
-    mask[[0, -1]] = mask[:, [0, -1]] = False
-    return mask
+def _sharpened(plate: Plate | None, image: np.ndarray, matte: np.ndarray, near_head: np.ndarray) -> np.ndarray:
+    probability = matte.astype(np.float32) / 255.0
+    person = (probability > 0.5).astype(np.uint8)
+    empty = np.zeros(matte.shape, bool) if plate is None else shown(plate, image, person > 0)
+    person[empty] = 0
+    reach = 2 * band_radius(*matte.shape) + 1
+    edge = cv2.morphologyEx(person, cv2.MORPH_GRADIENT, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    unsure = (probability > _SURE) & (probability < 1.0 - _SURE)
+    near = near_head > 0
+    band = ((edge > 0) | unsure) & near & ~empty
+    known = np.where(near & ~band, person.astype(np.float32), probability)
+    share = closed_form(image, known, band)
+    share[band] = np.clip(0.5 + _STEEPER * (share[band] - 0.5), 0.0, 1.0)
+    return np.rint(share * 255.0).astype(np.uint8)
+
+
+def _about_head(points: np.ndarray, height: int, width: int) -> UInt8[np.ndarray, "H W"]:
+    """255 where hair, ears and neck may be."""
+    inside = np.zeros((height, width), np.uint8)
+    if not np.isfinite(points).all():
+        return inside
+    (left, top), (right, bottom) = points.min(0), points.max(0)
+    side = max(right - left, bottom - top)
+    rows = np.clip([top - _ABOVE * side, bottom + _BELOW * side], 0, height).astype(int)
+    columns = np.clip([left - _BESIDE * side, right + _BESIDE * side], 0, width).astype(int)
+    inside[rows[0] : rows[1], columns[0] : columns[1]] = 255
+    return inside
+
+
+def _with_mirrored(matter: Matter) -> Matter:
+    """The mean of a picture's matte and its mirror image's, which errs less than either."""
+
+    def matte(image: np.ndarray) -> np.ndarray:
+        mirrored = matter(np.ascontiguousarray(image[:, ::-1]))[:, ::-1]
+        return cv2.addWeighted(matter(image), 0.5, mirrored, 0.5, 0.0)
+
+    return matte
+
+
+def _segmentation() -> Matter:
+    file = require(SELFIE_SEGMENTATION)
+    try:
+        with _LOADING:
+            net = cv2.dnn.readNetFromTFLite(str(file))
+    except cv2.error as error:
+        raise UserError(f"OpenCV cannot load {file} ({error.err}); fetch {SELFIE_SEGMENTATION.url} again") from None
+
+    def matte(image: np.ndarray) -> np.ndarray:
+        small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        net.setInput(cv2.dnn.blobFromImage(small, 1 / 255.0))
+        return enlarged(net.forward().reshape(SIDE, SIDE), image.shape[1], image.shape[0])
+
+    return matte
+
+
+def _multiclass() -> Matter:
+    """Through MediaPipe's own runner, which knows the file's normalisation. Class 0 is the background."""
+    file = require(SELFIE_MULTICLASS)
+    from data_prep.track.faces.detect import load_mediapipe, quiet
+
+    mediapipe, vision, options = load_mediapipe()
+    settings = vision.ImageSegmenterOptions(base_options=options(file), output_confidence_masks=True)
+    with quiet():
+        segmenter = vision.ImageSegmenter.create_from_options(settings)
+
+    def matte(image: np.ndarray) -> np.ndarray:
+        small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        found = segmenter.segment(mediapipe.Image(image_format=mediapipe.ImageFormat.SRGB, data=small))
+        background = np.asarray(found.confidence_masks[0].numpy_view(), np.float32).reshape(SIDE, SIDE)
+        return enlarged(1.0 - background, image.shape[1], image.shape[0])
+
+    return matte
+
+
+def enlarged(probability: Float32[np.ndarray, "h w"], width: int, height: int) -> UInt8[np.ndarray, "H W"]:
+    large = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.rint(np.clip(large, 0.0, 1.0) * 255.0).astype(np.uint8)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from data_prep.track.matting import band_radius, limited
+from data_prep.track.closed_form_matting import band_radius, limited
 
 CLIP_FRAMES = 40  # that the plate is the median of
 _SEEN = 3  # of these at least must show a pixel's background

@@ -33,7 +33,7 @@ from data_prep.track.frames import (
 from data_prep.track.inputs import head_inputs
 from data_prep.track.look import Look
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
-from data_prep.track.matte import open_matter, sharpened
+from data_prep.track.matting import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.own_mattes import OwnMattes

@@ -46,7 +46,7 @@ from avatar.runs.checkpoint import (
     module_tensors,
     save_checkpoint,
 )
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order

@@ -26,7 +26,7 @@ from avatar.bench.render import inputs, stream_rate
 from avatar.bench.results import new_figure
 from avatar.errors import UserError
 from avatar.evaluation.compare import Cell
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.render import Renderer
 from avatar.runs.run import open_trained
 from avatar.sweep.results import fold_results

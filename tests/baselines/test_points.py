@@ -12,10 +12,10 @@ from small_runs import open_small, small_config, train_small
 from avatar.baselines.monogaussianavatar import alive_after, drawn
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.gaussians.encoding import positional_encoding
 from avatar.runs.checkpoint import load_module, module_tensors, newest_checkpoint
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.runs.trained import load_avatar
 from avatar.train.optimizer import make_optimizer
 from avatar.types import HeadParams

@@ -19,7 +19,7 @@ from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGR
 from avatar.bench.refine import Figures, Row, coefficients_outside, recovered, report, vertex_errors
 from avatar.cli import main
 from avatar.data.recording import Recording
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, NECK, values_of
 from avatar.pose_refinement.record import movements
 

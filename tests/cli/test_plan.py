@@ -9,26 +9,31 @@ import pytest
 
 from avatar.data.source import Source
 from avatar.errors import UserError
-from avatar.pipeline import plan
+from avatar.pipeline import refine_plan
 
 
 def test_what_rounds_are_trained_for() -> None:
     """Five passes over the frames, and no more than a quarter of the run's own steps; a thousand where it has as many."""
-    assert plan.round_steps(12000, 400) == 2000 and plan.round_steps(6000, 900) == 1500
-    assert plan.round_steps(6000, 90) == plan.round_steps(2000, 400) == plan.round_steps(1000, 400) == 1000
-    assert plan.round_steps(300, 400) == 300 and plan.round_steps(1, 400) == 1
+    assert refine_plan.round_steps(12000, 400) == 2000 and refine_plan.round_steps(6000, 900) == 1500
+    assert (
+        refine_plan.round_steps(6000, 90)
+        == refine_plan.round_steps(2000, 400)
+        == refine_plan.round_steps(1000, 400)
+        == 1000
+    )
+    assert refine_plan.round_steps(300, 400) == 300 and refine_plan.round_steps(1, 400) == 1
     for seconds in (30.0, 60.0, 200.0, 900.0):
         for frames in (50, 400, 2000):
-            able = plan.affordable_iterations(seconds, 0.05, 10.0, 2, frames)
-            needed = (able + 2 * plan.round_steps(max(able, 1), frames)) * 0.05 + 2 * 10.0
+            able = refine_plan.affordable_iterations(seconds, 0.05, 10.0, 2, frames)
+            needed = (able + 2 * refine_plan.round_steps(max(able, 1), frames)) * 0.05 + 2 * 10.0
             assert needed == pytest.approx(seconds, abs=0.3)
-    assert plan.affordable_iterations(19.0, 0.05, 10.0, 2, 50) < 0
+    assert refine_plan.affordable_iterations(19.0, 0.05, 10.0, 2, 50) < 0
 
 
 def test_plan_survives_a_round_trip(tmp_path: Path) -> None:
-    made = plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), None, 1000, 77)
+    made = refine_plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), None, 1000, 77)
     made.save(tmp_path)
-    assert plan.Plan.load(tmp_path) == made
+    assert refine_plan.Plan.load(tmp_path) == made
 
 
 @pytest.mark.parametrize(
@@ -46,12 +51,12 @@ def test_plan_survives_a_round_trip(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_plan_is_refused(tmp_path: Path, key: str, value: object) -> None:
-    plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), 5.0, 1000, 77).save(tmp_path)
-    whole = json.loads(plan.plan_file(tmp_path).read_text())
-    plan.plan_file(tmp_path).write_text(json.dumps({**whole, key: value}))
+    refine_plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), 5.0, 1000, 77).save(tmp_path)
+    whole = json.loads(refine_plan.plan_file(tmp_path).read_text())
+    refine_plan.plan_file(tmp_path).write_text(json.dumps({**whole, key: value}))
     with pytest.raises(UserError, match="is damaged"):
-        plan.Plan.load(tmp_path)
+        refine_plan.Plan.load(tmp_path)
     del whole[key]
-    plan.plan_file(tmp_path).write_text(json.dumps(whole))
+    refine_plan.plan_file(tmp_path).write_text(json.dumps(whole))
     with pytest.raises(UserError, match=f"is damaged: {key} is missing"):
-        plan.Plan.load(tmp_path)
+        refine_plan.Plan.load(tmp_path)

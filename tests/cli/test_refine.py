@@ -18,7 +18,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.commands import train
 from avatar.data.source import Source
-from avatar.pipeline import plan, train_refined
+from avatar.pipeline import refine_plan, train_refined
 from avatar.pipeline.open import source_of
 from avatar.pose_refinement import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
@@ -147,7 +147,7 @@ def test_an_interrupted_refinement_goes_on(run: Path, tmp_path: Path, monkeypatc
 
 def test_training_in_rounds(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "run"
-    monkeypatch.setattr(plan, "FIRST_STEPS", 4)
+    monkeypatch.setattr(refine_plan, "FIRST_STEPS", 4)
     output = avatar("train", folder, "--out", run, "--frame-offset", 1, "--refine", 2, *QUICK)
     assert "Round 1 of 2" in output and "Round 2 of 2" in output
     assert output.count("4/4") >= 2 and "10/10" in output  # two shorter trainings, and the run's own
@@ -170,9 +170,9 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
 
     # Tracking and opening take 1 s, the round's training 10 and its refinement 20: of the 58.2 that are planned
     # of 60 seconds 27.2 are left, for steps that took 10 seconds for 10.
-    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 3.8)
-    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=2.5))
-    monkeypatch.setattr(plan, "LEAST_STEPS", 5)
+    monkeypatch.setattr(refine_plan, "estimated_seconds", lambda *_: 3.8)
+    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=2.5))
+    monkeypatch.setattr(refine_plan, "LEAST_STEPS", 5)
     ticks = iter((0.0, 0.0, 1.0, 1.0, 11.0, 31.0, 57.0))
     for module in (train, train_refined):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
@@ -198,8 +198,8 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
     for module in (train, train_refined):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(train, "tracked_source", tracked)
-    monkeypatch.setattr(plan, "estimated_seconds", lambda *_: 10.0)
-    monkeypatch.setattr(plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.05))
+    monkeypatch.setattr(refine_plan, "estimated_seconds", lambda *_: 10.0)
+    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.05))
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
     monkeypatch.setattr(train_refined, "train_round", lambda plan, *_: (0, plan))

@@ -18,7 +18,7 @@ from avatar.files.opening import MissingFile, read_bytes, read_json, read_text, 
 from avatar.files.third_party import sha256_of
 from avatar.head.assets import find_model_file, find_uv_obj, load_head_assets
 from avatar.losses.lpips import load_lpips
-from avatar.pipeline.plan import Plan
+from avatar.pipeline.refine_plan import Plan
 from avatar.report.page import read_results
 from avatar.sweep.state import read_job, read_sweep
 from data_prep.formats.metrical_tracker import read_tracking

@@ -11,10 +11,10 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.config import load_config
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.gaussians.head_rotation import LIMIT, VALUES, head_rotation_input, learned_turning
 from avatar.render import Renderer
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.types import Camera
 
 SMALL = ["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2"]
@@ -125,7 +125,7 @@ def test_an_avatar_is_drawn_with_its_own_blur() -> None:
 
 def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """On torch's meta device, where nothing can be read back, what is told is computed beside the camera."""
-    import avatar.gaussians.avatar
+    import avatar.gaussians.base_model
 
     R = rotations(turns(), a_mean())
     avatar_there = small_avatar()
@@ -137,7 +137,7 @@ def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.Mon
         told.append(head_rotation_input(turning, rotation))
         return told[-1]
 
-    monkeypatch.setattr(avatar.gaussians.avatar, "head_rotation_input", recorded)
+    monkeypatch.setattr(avatar.gaussians.base_model, "head_rotation_input", recorded)
     avatar_there.to("meta")
     condition = avatar_there.condition(random_params(), R[3])
     assert condition.is_meta and told[0].is_cpu

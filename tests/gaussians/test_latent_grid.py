@@ -12,7 +12,7 @@ from avatar.gaussians.latent_grid import latent_grid, uv_charts
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 
 RASTER = 32
 

@@ -9,12 +9,12 @@ from heads import EXPRESSIONS, grid_head, random_params, rest_params
 from torch import Tensor
 
 from avatar.config import load_config
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel, matrix_from_6d
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 
 SMALL = ["model.uv_size=24", "model.mlp_width=16", "model.mlp_layers=2", "model.skull_binding=true"]
 

@@ -11,7 +11,7 @@ from interpreter import DEVICE, error, the_cpus_way
 
 from avatar.config import load_config
 from avatar.head.model import HeadModel
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 
 HEAD = HeadModel(grid_head(rows=13, columns=11), 0.5 * torch.randn(20, generator=torch.Generator().manual_seed(2)))
 

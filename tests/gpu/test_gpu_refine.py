@@ -15,7 +15,7 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.data.subject import Subject
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement import refine as refine_module
 from avatar.pose_refinement.motion import head_params, quaternion, rotation
 from avatar.pose_refinement.parallel import read_later

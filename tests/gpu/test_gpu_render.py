@@ -10,9 +10,9 @@ from heads import grid_head, random_params
 from interpreter import DEVICE, error, the_cpus_way
 
 from avatar.config import load_config
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.render import Renderer
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.splat.scenes import head_camera
 from avatar.types import Gaussians
 

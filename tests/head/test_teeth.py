@@ -15,7 +15,7 @@ from avatar.head.assets import HeadAssets
 from avatar.head.features import mouth_rim
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.head.teeth import GRID, ROWS, with_teeth
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.types import IDENTITY_6D, HeadParams
 
 COUNT = GRID[0] * GRID[1]  # vertices of a row

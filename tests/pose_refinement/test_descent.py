@@ -10,7 +10,7 @@ import torch
 from drawn_clip import BACKGROUND, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
 
 from avatar.data.recording import Recording
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.descent import Problem, curvature, descend
 from avatar.pose_refinement.frame_fitter import HUBER_DELTA, FrameFitter, targets
 from avatar.pose_refinement.motion import HeadPose, moved_tracks

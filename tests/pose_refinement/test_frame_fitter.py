@@ -12,7 +12,7 @@ import torch
 from drawn_clip import BACKGROUND, EXPRESSIONS, SIZE, Clip, drawn_clip, patterned_avatar, wrongly_tracked
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.losses.metrics import psnr
 from avatar.pose_refinement import frame_fitter as fitter_module
 from avatar.pose_refinement.frame_fitter import (

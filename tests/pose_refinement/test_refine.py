@@ -15,7 +15,7 @@ from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, scr
 
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement import refine as refine_module
 from avatar.pose_refinement.motion import EXPRESSION, values_of
 from avatar.pose_refinement.record import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary

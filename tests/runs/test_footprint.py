@@ -11,7 +11,7 @@ from small_runs import small_config
 
 from avatar.errors import UserError
 from avatar.runs.memory_estimate import count_gaussians, drawing_needs, training_needs
-from avatar.runs.models import make_avatar
+from avatar.runs.model_registry import make_avatar
 
 MIB = 2**20
 PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")

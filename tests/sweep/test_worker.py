@@ -21,7 +21,7 @@ from avatar.sweep.engines import EngineOptions, LocalProcesses, make_engine
 from avatar.sweep.output import BoundedLog, end_of, old_of
 from avatar.sweep.spec import Job, Resources, Spec
 from avatar.sweep.state import State, beat, progress_mark, read_state, write_state
-from avatar.sweep.table import Progress
+from avatar.sweep.status import Progress
 from avatar.sweep.worker import OUTPUT_FILE, Worker
 
 JOB = Job("j", "s", "v", 0, {"folder": "/f"}, (), ())

@@ -10,8 +10,8 @@ from heads import grid_head, rest_params
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
-from avatar.gaussians.avatar import Avatar
-from avatar.runs.models import make_avatar
+from avatar.gaussians.base_model import Avatar
+from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
 from avatar.train import init_colours as colours_module
 from avatar.train.init_colours import colour_from_frames, sample, seen_colours

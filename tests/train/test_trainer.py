@@ -11,7 +11,7 @@ import torch
 from small_runs import new_avatar, open_small, small_config, train_small
 
 from avatar.errors import UserError
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim

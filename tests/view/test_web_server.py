@@ -21,7 +21,7 @@ from waiting import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Origin
 
-from avatar.view import complaints, web_server
+from avatar.view import rate_limited_log, web_server
 from avatar.view.server import LARGEST, Viewer
 from avatar.view.stage import Stage
 
@@ -30,7 +30,7 @@ from avatar.view.stage import Stage
 def said(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """What the viewer says of its clients."""
     lines: list[str] = []
-    monkeypatch.setattr(complaints.Complaints.__init__, "__defaults__", (lines.append, time.monotonic))
+    monkeypatch.setattr(rate_limited_log.Complaints.__init__, "__defaults__", (lines.append, time.monotonic))
     yield lines
 
 
@@ -272,16 +272,16 @@ def test_a_viser_that_listens_in_another_way_is_not_used(monkeypatch: pytest.Mon
         socket.create_server(("127.0.0.1", 0)) as listening,
         pytest.raises(Exception, match="does not work with viser"),
     ):
-        web_server.WebServer(listening, None, None, complaints.Complaints(), "x")  # type: ignore[arg-type]
+        web_server.WebServer(listening, None, None, rate_limited_log.Complaints(), "x")  # type: ignore[arg-type]
 
 
 def test_complaints_are_counted() -> None:
     now, lines = [0.0], []
-    counted = complaints.Complaints(lines.append, lambda: now[0])
+    counted = rate_limited_log.Complaints(lines.append, lambda: now[0])
     for _ in range(500):
         counted.add("a silent client")
     assert lines == ["Viewer: a silent client"]
-    now[0] = complaints.SILENCE
+    now[0] = rate_limited_log.SILENCE
     counted.add("a silent client")
     counted.add("a silent client")
     for number in range(200):
@@ -289,4 +289,4 @@ def test_complaints_are_counted() -> None:
     counted.close()
     counted.close()
     assert lines[1] == "Viewer: a silent client (501 times)" and lines.count("Viewer: a silent client (502 times)") == 1
-    assert len(lines) <= complaints.MAX_KINDS + 5
+    assert len(lines) <= rate_limited_log.MAX_KINDS + 5

@@ -14,9 +14,9 @@ from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import make_room
 from avatar.demo.render import Renderer
-from data_prep.track import matte as mattes
-from data_prep.track import matting
-from data_prep.track.matting import band_radius, closed_form, within_limits
+from data_prep.track import closed_form_matting
+from data_prep.track import matting as mattes
+from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
 
 NOISE, TRUST = 3e-3, 1e-3
 
@@ -91,7 +91,7 @@ def test_no_band_and_one_that_is_none_leave_the_guess(monkeypatch: pytest.Monkey
     border[1:-1, 1:-1] = False
     np.testing.assert_array_equal(closed_form(image, guess, border), guess)
     assert (closed_form(image, guess, np.ones((64, 64), bool)) != guess).any()
-    monkeypatch.setattr(matting, "_MOST_UNKNOWN", 1000)
+    monkeypatch.setattr(closed_form_matting, "_MOST_UNKNOWN", 1000)
     np.testing.assert_array_equal(closed_form(image, guess, np.ones((64, 64), bool)), guess)
 
 

@@ -12,8 +12,8 @@ from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, make_room
 from avatar.demo.render import Renderer
-from data_prep.track import matting
-from data_prep.track.matte import sharpened
+from data_prep.track import closed_form_matting
+from data_prep.track.matting import sharpened
 from data_prep.track.plate import learn_plate, shown
 
 SIZE, NOISE = 160, 1.5
@@ -111,7 +111,7 @@ def test_too_few_pictures_or_nothing_behind() -> None:
 
 
 def test_large_pictures_are_learned_at_the_size_at_which_they_are_matted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matting, "LARGEST", SIZE // 2)
+    monkeypatch.setattr(closed_form_matting, "LARGEST", SIZE // 2)
     pairs = [(image, matte) for image, matte, _ in clip()]
     plate = learn_plate(pairs)
     assert plate is not None and plate.colours.shape == (SIZE // 2, SIZE // 2, 3)

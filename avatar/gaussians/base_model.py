@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.memory import Need
-from avatar.config import LearningRates, ModelConfig, TrainerConfig
+from avatar.config import OPACITY_RATE, LearningRates, ModelConfig, TrainerConfig
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size
@@ -26,9 +26,6 @@ from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
 SH_DEGREE = 3  # of the view-dependent colour
-OPACITY_RATE = 0.05  # of logits: of opacities and of skull shares
-NETWORK_RATE = 1e-4  # of the deformation network
-HYPER_RATE = 1e-4  # of the HyperGaussian heads, and of learned places on the mesh (metres)
 
 Groups = dict[str, tuple[Sequence[Tensor], float]]  # parameters and their learning rate, by what they are
 
@@ -37,7 +34,7 @@ class Avatar(nn.Module):
     """One person's avatar: Gaussians that are bound to the UV map of a head model.
 
     A model is a subclass. It gives `forward`, makes its parameters in `make_parameters`, and gives of the other methods
-    those in which it differs. `avatar.runs.models` lists the models by name.
+    those in which it differs. `avatar.runs.model_registry` lists the models by name.
 
     With `config.teeth`, `mesh`, which Gaussians are bound to, goes on after the vertices and triangles of `head`; else it
     is `head`. `to(device)` moves all that drawing needs. `head` and `mesh` stay on the CPU; cameras and head parameters may

@@ -10,7 +10,7 @@ from avatar.baselines.monogaussianavatar import MonoGaussianAvatar
 from avatar.baselines.ndgs import NdgsAvatar
 from avatar.baselines.splattingavatar import SplattingAvatar
 from avatar.config import ModelConfig
-from avatar.gaussians.avatar import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.model import FlashAvatar, HyperGaussianAvatar
 

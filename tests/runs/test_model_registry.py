@@ -10,7 +10,7 @@ from heads import grid_head, random_params
 from small_runs import small_config
 
 from avatar.config import LearningRates, ModelConfig
-from avatar.runs.models import MODELS, make_avatar
+from avatar.runs.model_registry import MODELS, make_avatar
 
 
 def test_the_models_are_those_of_the_configuration() -> None:
