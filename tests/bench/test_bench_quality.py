@@ -13,7 +13,7 @@ from avatar.bench import Request, quality
 from avatar.bench.clock import Time
 from avatar.bench.quality import Curve, Point, measure, pareto
 from avatar.bench.quality_report import run, table
-from avatar.bench.train import TrainState
+from avatar.bench.train import Learner
 from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.losses.lpips import save_lpips
@@ -90,8 +90,8 @@ def test_a_run_is_timed_with_its_own_perceptual_term_and_not_with_this_machines(
     timed: list[str] = []
     time_steps = quality.time_steps
 
-    def noted(learners: Sequence[TrainState], repeats: int) -> list[tuple[Time, Time]]:
-        timed.extend(learner.objective.perceptual.name for learner in learners)
+    def noted(learners: Sequence[Learner], repeats: int) -> list[tuple[Time, Time]]:
+        timed.extend(learner.state.objective.perceptual.name for learner in learners)
         return time_steps(learners, repeats)
 
     monkeypatch.setattr(quality, "time_steps", noted)

@@ -12,7 +12,6 @@ from small_runs import new_avatar, open_small, small_config
 
 from avatar.head.model import HeadModel
 from avatar.head.teeth import GRID, ROWS
-from avatar.pose_refinement.frame_fitter import FrameFitter
 from avatar.runs.avatar_file import read_portrait, write_portrait
 from avatar.runs.memory_estimate import count_gaussians
 from avatar.runs.trained import TrainedAvatar, load_avatar
@@ -53,9 +52,8 @@ def test_they_are_seen_and_move_with_the_head(trained: TrainedAvatar) -> None:
         hidden = whole._replace(opacities=torch.where(of_teeth, 0.0, whole.opacities))
         pictures = [trained.avatar.draw(g, camera, trained.background).image for g in (whole, hidden)]
     assert float((pictures[0] - pictures[1]).abs().max()) > 0.05
-    fitter = FrameFitter(trained.avatar, trained.background, trained.avatar.head.neutral_vertices().mean(dim=0))
     jaw = params.jaw.clone().requires_grad_()
-    vertices = fitter.vertices(replace(params, jaw=jaw))
+    vertices = trained.avatar.mesh.vertices(replace(params, jaw=jaw))
     upper, lower = vertices[trained.assets.num_vertices :].split(COUNT)
     (by_jaw,) = torch.autograd.grad(lower.square().sum(), jaw, retain_graph=True)
     assert float(by_jaw.abs().max()) > 1e-3
