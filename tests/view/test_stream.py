@@ -142,6 +142,7 @@ def test_a_stream_goes_on_when_files_have_run_out(receiver: Receiver, monkeypatc
         sender.sendall(b'{"expression": [1]}\n')
         until(lambda: receiver.counts.received == 1)
     monkeypatch.undo()
+    assert len(failed) == 3 and receiver.counts.malformed == 0
 
 
 def test_what_nobody_foresaw_is_counted(receiver: Receiver, monkeypatch: pytest.MonkeyPatch) -> None:
