@@ -105,7 +105,7 @@ class Rehearsal:
         self.avatar = avatar.to(device)
         self.config, self.trainer = config, config.trainer
         with patch("torch.optim.adam._device_dtype_check_for_fused"):  # it knows no meta device
-            self.corrections = make_pose_corrections(self.avatar, 2, config.trainer)
+            self.corrections = make_pose_corrections(self.avatar, (0, 1), config.trainer)
             self.optimizer = make_optimizer(self.avatar, config.trainer, self.corrections)
         self.guard = Guard(self.optimizer, device)
         self.background = torch.ones(3, device=device)

@@ -123,11 +123,11 @@ def make_learner(
         frames = list(loader.frames(chosen))
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
-    corrections = make_pose_corrections(avatar, len(train), config.trainer)
+    corrections = make_pose_corrections(avatar, train, config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     state = TrainState(avatar, optimizer, objective, corrections)
     judge = Guard(optimizer, device).judge if is_gpu else None
-    steps = StepRunner(state, rows={index: row for row, index in enumerate(train)}, say=say)
+    steps = StepRunner(state, say=say)
     steps.pose(frames)
     return Learner(config, state, cycle(frames), steps, judge)
 

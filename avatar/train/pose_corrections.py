@@ -13,7 +13,7 @@ corrections' mean over the training frames is subtracted: a pose that all frames
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -30,19 +30,20 @@ TURN_UNIT, SHIFT_UNIT = 0.5 * math.pi / 180, 1e-3  # radians, metres: a tracker'
 PREFIX = "pose_corrections."  # in a checkpoint
 
 
-def make_pose_corrections(avatar: Avatar, frames: int, config: TrainerConfig) -> PoseCorrections | None:
-    """For a training on so many frames, where the avatar is; None at `pose_rate` 0."""
+def make_pose_corrections(avatar: Avatar, frames: Sequence[int], config: TrainerConfig) -> PoseCorrections | None:
+    """For a training on these frames, where the avatar is; None at `pose_rate` 0."""
     if config.pose_rate == 0:
         return None
     return PoseCorrections(frames, avatar.head.neutral_vertices().mean(dim=0)).to(avatar.device)
 
 
 class PoseCorrections(nn.Module):
-    """One correction for each of `frames` training frames, zero at the start; `centre` of the head, metres."""
+    """One correction for each of the training frames `frames`, zero at the start; `centre` of the head, metres."""
 
-    def __init__(self, frames: int, centre: Float[Tensor, "3"]) -> None:
+    def __init__(self, frames: Sequence[int], centre: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.moves = nn.Parameter(torch.zeros(frames, 5))  # w and the two parts of s, in units
+        self.rows = {frame: row for row, frame in enumerate(frames)}  # of `moves`
+        self.moves = nn.Parameter(torch.zeros(len(frames), 5))  # w and the two parts of s, in units
         self._centre = centre
 
     def jacobian(self, R: Float[Tensor, "3 3"]) -> Float[Tensor, "5 12"]:
@@ -53,7 +54,7 @@ class PoseCorrections(nn.Module):
         return torch.cat((turned, shifted))
 
     def forward(self, camera: Camera, row: Int[Tensor, "1"], jacobian: Float[Tensor, "5 12"]) -> Camera:
-        """The camera of training frame number `row`, corrected; differentiable in its correction."""
+        """The camera of the frame in this row, corrected; differentiable in its correction."""
         own = self.moves.index_select(0, row)[0] - self.moves.detach().mean(dim=0)
         given = torch.cat((camera.R_cam_world.flatten(), camera.t_cam_world))
         R, t = torch.addmv(given, jacobian.T, own.to(given.dtype)).split((9, 3))

@@ -37,19 +37,15 @@ class Kind(NamedTuple):
 
 
 class StepRunner:
-    """Makes the steps of one training.
-
-    rows  of the pose corrections, by the frame's index; None: frame 0 is the only one
-    """
+    """Makes the steps of one training."""
 
     def __init__(
         self,
         state: TrainState,
         noise: ConditionNoise | None = None,
-        rows: Mapping[int, int] | None = None,
         say: Callable[[str], object] = print,
     ) -> None:
-        self._state, self._noise, self._rows, self._say = state, noise, rows or {0: 0}, say
+        self._state, self._noise, self._say = state, noise, say
         avatar = state.avatar
         self._device = avatar.device
         self._meshes = PosedMeshes(avatar)
@@ -73,11 +69,12 @@ class StepRunner:
         replay = None if kind is None or judge is None else self._ready(kind, step, inputs, judge)
         if replay is not None:
             self.replayed += 1
-            return replay(inputs.tensors())
-        outputs = train_step(state, step, inputs, judge)
+            outputs = replay(inputs.tensors())
+        else:
+            outputs = train_step(state, step, inputs, judge)
+            if kind is not None and judge is not None:
+                self._launched[kind] += 1
         state.avatar.after_step(state.optimizer, step + 1, config)
-        if kind is not None and judge is not None:
-            self._launched[kind] += 1
         return outputs
 
     def inputs(self, step: int, frame: Frame) -> StepInputs:
@@ -86,7 +83,7 @@ class StepRunner:
         noise = None if self._noise is None else to_device(self._noise.of(step), self._device)
         corrections, row, jacobian = self._state.pose_corrections, None, None
         if corrections is not None:
-            row = torch.full((1,), self._rows[frame.index], device=self._device)
+            row = torch.full((1,), corrections.rows[frame.index], device=self._device)
             if frame.index not in self._jacobians:
                 self._jacobians[frame.index] = to_device(corrections.jacobian(camera.R_cam_world), self._device)
             jacobian = self._jacobians[frame.index]

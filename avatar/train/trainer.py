@@ -63,7 +63,7 @@ def train(
         avatar.learn_head_rotation(recording.tracks["R"][list(recording.split.train)])
     neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
     avatar.to(device)
-    corrections = make_pose_corrections(avatar, len(recording.split.train), trainer)
+    corrections = make_pose_corrections(avatar, recording.split.train, trainer)
     optimizer = make_optimizer(avatar, trainer, corrections)
     background = torch.tensor(config.data.background).to(device)
     state = TrainState(avatar, optimizer, Objective(trainer, background, perceptual), corrections)
@@ -97,8 +97,7 @@ def train(
         interruption() as interrupted,
     ):
         progress = AsyncStepMonitor(log, optimizer, device) if is_gpu else SyncStepMonitor(log)
-        rows = {index: row for row, index in enumerate(recording.split.train)}
-        steps = StepRunner(state, make_noise(recording, trainer), rows, log.say)
+        steps = StepRunner(state, make_noise(recording, trainer), log.say)
         order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
         try:
             for frame in loader.frames(order):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
-from small_runs import small_config
+from small_runs import open_small, small_config
 
 from avatar.losses.photometric import dssim
-from avatar.train.cost_estimate import kinds_of_steps
+from avatar.train.cost_estimate import kinds_of_steps, measure_cost
 from avatar.train.objective import PerceptualTerm, Weighted
 
 
@@ -24,3 +25,11 @@ def test_steps_are_counted_by_what_their_loss_takes(
     begin = round(start * iterations)
     found = {term.at(step, begin): count for count, step in kinds_of_steps(trainer, every)}
     assert found == Counter(term.at(step, begin) for step in range(iterations))
+
+
+def test_any_frame_shows_what_training_takes(tracked_folder: Path) -> None:
+    """Where the first frames are held out, the first training frame is not frame 0."""
+    config = small_config()
+    _, subject, assets = open_small(tracked_folder, config)
+    cost = measure_cost(subject.frame(5), assets, subject.identity, len(subject), config)
+    assert cost.step_seconds > 0 and cost.iterations == config.trainer.iterations

@@ -39,19 +39,18 @@ def corrected(avatar: Avatar, clip: Clip) -> tuple[PoseCorrections, Clip]:
     """Corrections after so many steps of an avatar that stands still, and the clip with these poses."""
     config = small_config(f"data.size={SIZE}", f"trainer.iterations={STEPS}", "trainer.pose_rate=0.02")
     train = clip.split.train
-    corrections = make_pose_corrections(avatar, len(train), config.trainer)
+    corrections = make_pose_corrections(avatar, train, config.trainer)
     assert corrections is not None
     objective = Objective(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     for group in optimizer.param_groups[:-1]:
         group["full_lr"] = 0.0
-    rows = {index: row for row, index in enumerate(train)}
-    steps = StepRunner(TrainState(avatar, optimizer, objective, corrections), rows=rows)
+    steps = StepRunner(TrainState(avatar, optimizer, objective, corrections))
     for step in range(STEPS):
         index = train[step % len(train)]
         steps.make(step, replace(clip.pictures[index], camera=clip.recording.camera(index)), None)
     tracks = {name: value.clone() for name, value in clip.recording.tracks.items()}
-    for index, row in rows.items():
+    for index, row in corrections.rows.items():
         given = clip.recording.camera(index)
         camera = corrections(given, torch.tensor([row]), corrections.jacobian(given.R_cam_world))
         tracks["R"][index], tracks["t"][index] = camera.R_cam_world.detach(), camera.t_cam_world.detach()
@@ -69,7 +68,7 @@ def test_disturbed_poses_of_training_frames_come_back(avatar: Avatar) -> None:
 
 def test_a_correction_turns_the_head_about_its_centre_and_has_no_common_part() -> None:
     centre = torch.tensor([0.01, -0.02, 0.03])
-    corrections = PoseCorrections(3, centre)
+    corrections = PoseCorrections(range(3), centre)
     R, t = torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.01, 0.0, 0.8])
     camera = Camera(R, t, 90.0, 90.0, 16.0, 16.0, 32, 32)
 
@@ -110,7 +109,7 @@ def test_a_checkpoint_without_them_or_of_other_frames_is_refused(tracked_folder:
     train_small(tracked_folder, tmp_path / "run", ["trainer.pose_rate=0"])
     tensors = newest_checkpoint(tmp_path / "run").tensors
     assert not [name for name in tensors if "pose_corrections" in name]
-    corrections = PoseCorrections(4, torch.zeros(3))
+    corrections = PoseCorrections(range(4), torch.zeros(3))
     for damaged in (tensors, {f"{PREFIX}moves": torch.zeros(5, 5)}):
         with pytest.raises(UserError, match="pose corrections of 4 training frames"):
             corrections.load(damaged)
