@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu, to_device
-from avatar.compute.workers import single_threaded_workers
+from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.splat import CannotDraw
@@ -25,7 +24,6 @@ from avatar.splat.cpu import thread_count
 from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
-AHEAD_PER_WORKER = 2  # frames begun before the first of them is asked for
 AHEAD_ON_GPU = 3  # frames whose copies are on their way
 
 
@@ -73,19 +71,7 @@ class Renderer:
         if workers == 1 or on_gpu(self.background):
             yield from (self.render(*frame) for frame in frames)
             return
-        source = iter(frames)
-        pending: deque[Future[Rendering]] = deque()
-        with single_threaded_workers(workers) as pool:
-            try:
-                while True:
-                    while len(pending) < AHEAD_PER_WORKER * workers and (frame := next(source, None)) is not None:
-                        pending.append(pool.submit(self.render, *frame))
-                    if not pending:
-                        return
-                    yield pending.popleft().result()
-            finally:
-                for future in pending:
-                    future.cancel()
+        yield from in_order(lambda frame: self.render(*frame), frames, workers)
 
     def _stream_from_gpu(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         pending: deque[tuple[tuple[HeadParams, Camera], Rendering, torch.cuda.Event]] = deque()

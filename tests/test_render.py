@@ -8,11 +8,11 @@ import pytest
 import torch
 from heads import EXPRESSIONS, grid_head, random_params
 
-from avatar.compute.workers import single_threaded_workers
+from avatar.compute.workers import AHEAD, single_threaded_workers
 from avatar.config import load_config
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
-from avatar.render import AHEAD_PER_WORKER, Renderer
+from avatar.render import Renderer
 from avatar.runs.model_registry import make_avatar
 from avatar.types import Camera, HeadParams
 
@@ -120,7 +120,7 @@ def test_a_stream_takes_few_frames_ahead_and_stops_when_it_is_dropped(monkeypatc
     for _ in range(3):
         next(stream)
     stream.close()
-    assert taken <= 3 + 2 * AHEAD_PER_WORKER
+    assert taken <= 3 + 2 * AHEAD
     assert threading.active_count() == threads
 
 

@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+AHEAD = 2  # pieces of work of each thread that are begun before the first of them is asked for
+
+
+def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+    """function(item) for every item, by `workers` threads, a few of them ahead of the one that is asked for.
+
+    `items` may be endless. The results do not depend on the number of threads. An exception is raised when its turn comes.
+    """
+    source = iter(items)
+    pending: deque[Future[Result]] = deque()
+    with single_threaded_workers(workers) as pool:
+        try:
+            while True:
+                while len(pending) < AHEAD * workers and (item := next(source, None)) is not None:
+                    pending.append(pool.submit(function, item))
+                if not pending:
+                    return
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 @contextmanager

@@ -88,13 +88,6 @@ def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, 
     return psnr(picture.clamp(0.0, 1.0), target.picture, target.mask)
 
 
-class Measure(NamedTuple):
-    """Of one frame at one tracking."""
-
-    misfit: float
-    psnr: float  # of the head alone, dB
-
-
 class Fit(NamedTuple):
     """Of one frame at one tracking."""
 
@@ -107,7 +100,7 @@ class Fit(NamedTuple):
 class FrameFitter:
     """An avatar that is not trained any more, over a background; all where the avatar is. Any number of threads may use it.
 
-    On a GPU nothing is read back: what the methods give is there, but for what `measure` gives.
+    On a GPU nothing is read back.
     """
 
     avatar: Avatar
@@ -119,12 +112,8 @@ class FrameFitter:
         with torch.no_grad():
             return self._draw(values, given, target)
 
-    def measure(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Measure:
-        """Without a gradient."""
-        return Measure(*self.figures(values, given, target).tolist())
-
     def figures(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, 2]:
-        """What `measure` gives, where the avatar is, float64."""
+        """Misfit, and PSNR of the head alone in dB, where the avatar is, float64; without a gradient."""
         picture = self.picture(values, given, target)
         return torch.stack((misfit(picture, target).double(), head_psnr(picture, target)))
 

@@ -7,13 +7,12 @@ interruption loses a few seconds. What is found does not depend on the number of
 from __future__ import annotations
 
 import hashlib
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,11 +27,11 @@ from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement.descent import Descent, Problem, curvature, descend
-from avatar.pose_refinement.frame_fitter import FrameFitter, Measure, Target, coarse_levels, head_psnr, targets
+from avatar.pose_refinement.descent import Problem, curvature, descend
+from avatar.pose_refinement.frame_fitter import FrameFitter, Target, coarse_levels, head_psnr, targets
 from avatar.pose_refinement.motion import HeadPose, moved_tracks
-from avatar.pose_refinement.parallel import in_order, read_later
-from avatar.pose_refinement.parameterization import PoseParameterization, find_parameterization
+from avatar.pose_refinement.parallel import each_in_order
+from avatar.pose_refinement.parameterization import find_parameterization
 from avatar.pose_refinement.progress import read_progress, write_progress
 from avatar.pose_refinement.smoothing import smoothed
 from avatar.splat import CannotDraw
@@ -41,7 +40,6 @@ COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
-UNSEEN = Measure(float("nan"), float("nan"))  # a frame that shows no head
 PROGRESS_FORMAT = 3  # grows with every change of what refinement finds
 
 
@@ -60,8 +58,7 @@ class Refined:
 
 class _Found(NamedTuple):
     moves: Float[Tensor, " F"]
-    before: Measure
-    psnr: float  # with the moves
+    figures: tuple[float, float, float]  # misfit and PSNR before, PSNR with the moves; NaN where no head is seen
 
 
 def refine_subject(
@@ -89,7 +86,7 @@ def refine_subject(
         with tqdm(total=len(subject), initial=len(moves), desc="refine", unit="frame", dynamic_ncols=True) as bar:
             for found in work.refined(todo, factors):
                 moves.append(found.moves)
-                figures.append((*found.before, found.psnr))
+                figures.append(found.figures)
                 bar.update(1)
                 bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
                 if len(moves) % SAVE_EVERY == 0 or interrupted():
@@ -149,13 +146,11 @@ class _Work:
     def __init__(self, avatar: Avatar, subject: Subject, size: int | None, background: Tensor) -> None:
         self.subject, self.size, self.background = subject, size, background
         self.centre = avatar.head.neutral_vertices().mean(dim=0)
-        self.device, self.waits = avatar.device, not on_gpu(avatar.quats)
+        self.device, self.is_gpu = avatar.device, on_gpu(avatar.quats)
         self.fitter = FrameFitter(avatar, to_device(background, self.device), to_device(self.centre, self.device))
         self.tracks = subject.recording.tracks
-        self.parameterization: PoseParameterization = find_parameterization(
-            self.tracks, subject.split.train, self.centre
-        )
-        self.there = self.parameterization if self.waits else self.parameterization.on(self.device)
+        self.parameterization = find_parameterization(self.tracks, subject.split.train, self.centre)
+        self.there = self.parameterization.on(self.device)
         self.levels = coarse_levels(subject.image_size(size)[0])
 
     def key(self) -> str:
@@ -197,10 +192,10 @@ class _Work:
         problem = Problem(self.pose(frame), made, frame, self.there)
         return torch.stack([curvature(self.fitter, problem, level) for level in range(self.levels)])
 
-    def _of_each(self, frames: Iterable[int], function: Callable[[int], Any]) -> Iterator[Any]:
+    def _of_each(self, frames: Iterable[int], function: Callable[[int], Tensor | None]) -> Iterator[Tensor | None]:
         """function(frame) in order, on the CPU. Raises UserError for a frame that cannot be drawn."""
 
-        def named(frame: int) -> Any:
+        def named(frame: int) -> Tensor | None:
             try:
                 return function(frame)
             except CannotDraw as error:
@@ -208,51 +203,33 @@ class _Work:
                     f"frame {frame} cannot be drawn: {error}; or the avatar's training has gone wrong, train it again"
                 ) from error
 
-        return in_order(named, frames) if self.waits else read_later(named, frames)
+        return each_in_order(named, frames, on_gpu=self.is_gpu)
 
     def refined(self, frames: Sequence[int], factors: Sequence[Float[Tensor, "F F"]]) -> Iterator[_Found]:
         """In order. Raises UserError for a frame that cannot be read, or drawn."""
-        if self.waits:
-            yield from self._of_each(frames, lambda frame: self.refine(frame, factors))
-            return
-        unseen = _Found(torch.zeros(len(self.parameterization.index)), UNSEEN, UNSEEN.psnr)
-        for frame, found in zip(frames, self._of_each(frames, lambda frame: self.begin(frame, factors)), strict=True):
+        for frame, found in zip(frames, self._of_each(frames, lambda frame: self.refine(frame, factors)), strict=True):
             if found is None:
-                yield unseen
+                yield _Found(torch.zeros(len(self.parameterization.index)), (np.nan, np.nan, np.nan))
                 continue
-            *before, psnr = found[-3:].tolist()
-            if math.isnan(psnr):
+            if bool(found[-1].isnan()):
                 raise UserError(f"frame {frame} cannot be drawn: the avatar's training has gone wrong, train it again")
-            yield _Found(found[:-3].float(), Measure(*before), psnr)
+            misfit, before, after = found[-3:].tolist()
+            yield _Found(found[:-3].float(), (misfit, before, after))
 
-    def begin(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> Float[Tensor, " F+3"] | None:
-        """What `refine` gives as one vector where the avatar is, float64: moves, misfit and PSNR before, PSNR after."""
+    def refine(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> Float[Tensor, " F+3"] | None:
+        """One vector where the avatar is, float64: moves, misfit and PSNR before, PSNR after; None where no head is."""
         made = self.targets(frame, self.levels)
         if made is None:
             return None
         problem = Problem(self.pose(frame), made, frame, self.there)
-        found = self.descended(problem, factors)
+        found = descend(self.fitter, problem, factors, [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)])
         before = self.fitter.figures(self.there.given[frame], problem.given, made[0])
         return torch.cat((found.moves.double(), before, head_psnr(found.picture, made[0])[None]))
 
-    def descended(self, problem: Problem, factors: Sequence[Float[Tensor, "F F"]]) -> Descent:
-        return descend(self.fitter, problem, factors, [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)])
-
-    def refine(self, frame: int, factors: Sequence[Float[Tensor, "F F"]]) -> _Found:
-        made = self.targets(frame, self.levels)
-        if made is None:
-            return _Found(torch.zeros(len(self.parameterization.index)), UNSEEN, UNSEEN.psnr)
-        problem = Problem(self.pose(frame), made, frame, self.parameterization)
-        found = self.descended(problem, factors)
-        before = self.fitter.measure(self.parameterization.given[frame], problem.given, made[0])
-        return _Found(found.moves, before, float(head_psnr(found.picture, made[0])))
-
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, keep the given tracking of frames that then fit no better than with it, and centre the rest."""
-        parameterization, numbers = (
-            self.parameterization,
-            np.array([record.tracking for record in self.subject.manifest.frames]),
-        )
+        parameterization = self.parameterization
+        numbers = np.array([record.tracking for record in self.subject.manifest.frames])
         trained_on = torch.zeros(len(moves), dtype=torch.bool)
         trained_on[list(self.subject.split.train)] = True
         for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one
@@ -270,20 +247,12 @@ class _Work:
                 tracks[name] = torch.where(keep.reshape(-1, *[1] * (given.ndim - 1)), given, tracks[name])
         return Refined(tracks, before[:, 1], after[:, 1], kept)
 
-    def measured(self, frames: Sequence[int], values: Float[Tensor, "T P"]) -> Iterator[Measure]:
-        """In order, each frame with its row of `values`."""
-        if self.waits:
-            yield from self._of_each(frames, lambda frame: self.measure(frame, values[frame]))
-            return
+    def measured(self, frames: Sequence[int], values: Float[Tensor, "T P"]) -> Iterator[list[float]]:
+        """Misfit and PSNR in order, each frame with its row of `values`; NaN where no head is seen."""
         there = to_device(values, self.device)
+        for found in self._of_each(frames, lambda frame: self.measure(frame, there[frame])):
+            yield [np.nan, np.nan] if found is None else found.tolist()
 
-        def begin(frame: int) -> Float[Tensor, 2] | None:
-            made = self.targets(frame, 1)
-            return None if made is None else self.fitter.figures(there[frame], self.pose(frame), made[0])
-
-        for found in self._of_each(frames, begin):
-            yield UNSEEN if found is None else Measure(*found.tolist())
-
-    def measure(self, frame: int, values: Float[Tensor, " P"]) -> Measure:
+    def measure(self, frame: int, values: Float[Tensor, " P"]) -> Float[Tensor, 2] | None:
         made = self.targets(frame, 1)
-        return UNSEEN if made is None else self.fitter.measure(values, self.pose(frame), made[0])
+        return None if made is None else self.fitter.figures(values, self.pose(frame), made[0])

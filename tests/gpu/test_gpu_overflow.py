@@ -138,7 +138,7 @@ def test_refinement_names_the_frame_that_overflows(tmp_path: Path, monkeypatch: 
         work = _Work(avatar.to(DEVICE), cast(Subject, clip), SIZE, BACKGROUND)
         work.levels = 1
         with as_on_a_gpu(20_000):
-            assert all(measure.psnr > 0 for measure in work.measured([1], work.parameterization.given))
+            assert all(psnr > 0 for _, psnr in work.measured([1], work.parameterization.given))
         factor = torch.eye(len(work.parameterization.index), device=DEVICE)
         refining: dict[str, Callable[[], object]] = {
             "way down": lambda: list(work.refined([1], [factor])),

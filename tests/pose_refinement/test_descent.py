@@ -56,7 +56,7 @@ def test_where_the_picture_fits_the_curvature_is_the_misfits_own(avatar: Avatar,
     still = torch.zeros(len(made.parameterization.index))
 
     def misfit(moves: torch.Tensor) -> float:
-        return fitter.measure(made.parameterization.values(2, moves), made.given, made.targets[0]).misfit
+        return float(fitter.figures(made.parameterization.values(2, moves), made.given, made.targets[0])[0])
 
     base = misfit(still)
     for k in (2, 3, 4, 8, len(still) - 1):  # the other turns change which splat is in front of which, in jumps
@@ -117,7 +117,7 @@ def test_the_last_picture_is_that_of_the_moves_and_no_worse_than_the_first(avata
     assert torch.allclose(found.picture, fitter.picture(values, made.given, made.targets[0]), atol=1e-5)
 
     def energy(moves: torch.Tensor) -> float:
-        misfit = fitter.measure(made.parameterization.values(4, moves), made.given, made.targets[0]).misfit
+        misfit = float(fitter.figures(made.parameterization.values(4, moves), made.given, made.targets[0])[0])
         return misfit + 0.5 * float(moves @ moves)
 
     assert energy(found.moves) < 0.5 * energy(torch.zeros_like(found.moves))

@@ -130,26 +130,26 @@ def test_the_gradient_is_the_slope(fitter: FrameFitter, clip: Clip, monkeypatch:
     target = targets(clip.pictures[2], BACKGROUND, 1)[0]
     values, pose = mistracked(clip)
     found = fitter.fit(values, pose, target)
-    assert found.misfit == pytest.approx(fitter.measure(values, pose, target).misfit, rel=1e-5)
+    assert found.misfit == pytest.approx(float(fitter.figures(values, pose, target)[0]), rel=1e-5)
     # Turns out of the picture's plane also change which splat is in front of which, in jumps.
     for k, length in ((2, 1e-3), (3, 2e-4), (4, 2e-4), (5, 2e-4), (9, 1e-4), (20, 1e-3), (21, 1e-3)):
         step = torch.zeros(VALUES)
         step[k] = length
-        high, low = (fitter.measure(values + sign * step, pose, target).misfit for sign in (1, -1))
+        high, low = (float(fitter.figures(values + sign * step, pose, target)[0]) for sign in (1, -1))
         assert float(found.gradient[k]) == pytest.approx((high - low) / (2 * length), rel=0.03, abs=0.1), k
 
 
 def test_the_misfit_counts_squares_in_observations(fitter: FrameFitter, clip: Clip) -> None:
     target = targets(clip.pictures[0], BACKGROUND, 1)[0]
     values = values_of(clip.recording.tracks)[0]
-    fits = fitter.measure(values, given(clip, 0), target).misfit
+    fits = float(fitter.figures(values, given(clip, 0), target)[0])
     grey = replace_picture(target, fitter.picture(values, given(clip, 0), target) + 0.02)
     expected = 0.5 * OBSERVATIONS * (0.02 / PIXEL_SIGMA) ** 2 * target.picture[..., 0].numel() / target.area
-    assert fitter.measure(values, given(clip, 0), grey).misfit == pytest.approx(expected, rel=1e-3)
+    assert float(fitter.figures(values, given(clip, 0), grey)[0]) == pytest.approx(expected, rel=1e-3)
     assert fits < 0.1 * expected  # the clip is the avatar's own picture
     far = replace_picture(target, fitter.picture(values, given(clip, 0), target) + 0.4)
     # An outlier counts less than its square.
-    assert fitter.measure(values, given(clip, 0), far).misfit < 400 * 0.5 * expected
+    assert float(fitter.figures(values, given(clip, 0), far)[0]) < 400 * 0.5 * expected
 
 
 def replace_picture(target: fitter_module.Target, picture: torch.Tensor) -> fitter_module.Target:
