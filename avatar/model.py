@@ -9,9 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu
+from avatar.compute.gpu_functions import gpu_function
 from avatar.config import HYPER_RATE, NETWORK_RATE, OPACITY_RATE, LearningRates, ModelConfig
+from avatar.gaussians.apply_offsets import apply_offsets
 from avatar.gaussians.base_model import Avatar, Groups
-from avatar.gaussians.compose import compose_raw
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.gaussians.encoding import positional_encoding
 from avatar.gaussians.hyper import HyperHeads
@@ -50,10 +51,9 @@ class FlashAvatar(Avatar):
         vertices = self.vertices(params) if vertices is None else vertices
         values = self.deformation(self.code, self.condition(params, rotation))
         if self.is_fused and on_gpu(values) and values.dtype == torch.float32:
-            from avatar.gaussians.compose_gpu import compose_gpu  # imports Triton, which is not there on every machine
-
             packed, binding = None if self.hyper is None else self.hyper.packed, self.skull_binding(params)
-            return compose_gpu(vertices, values, packed, *self.base(), self.embedding, self.grid, binding)
+            make = gpu_function("make Gaussians")
+            return make(vertices, values, packed, *self.base(), self.embedding, self.grid, binding)
         latents = self.interpolate(values)
         return self.compose(self.points(vertices, params), self.offsets(latents))
 
@@ -76,7 +76,7 @@ class FlashAvatar(Avatar):
         return latents if self.hyper is None else self.hyper(latents)
 
     def compose(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
-        return compose_raw(points, *self.base(), offsets)
+        return apply_offsets(points, *self.base(), offsets)
 
     def parameter_groups(self, rates: LearningRates) -> Groups:
         groups = super().parameter_groups(rates)

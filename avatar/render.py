@@ -19,9 +19,8 @@ from avatar.compute.device import on_gpu, to_device
 from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
-from avatar.splat import CannotDraw
+from avatar.splat import CannotDraw, checked_drawings
 from avatar.splat.cpu import thread_count
-from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 AHEAD_ON_GPU = 3  # frames whose copies are on their way

@@ -118,14 +118,6 @@ class Gaussians(NamedTuple):
     sh: Float[Tensor, "N K 3"]  # spherical-harmonics colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16
 
 
-class Offsets(NamedTuple):
-    """What the deformation adds to the Gaussians bound to the mesh, after the tanh, in FlashAvatar's order."""
-
-    position: Float[Tensor, "N 3"]  # metres, added
-    rotation: Float[Tensor, "N 4"]  # delta quaternion is (exp(r0), r1, r2, r3)
-    scale: Float[Tensor, "N 3"]  # exp(.) multiplies the log-scale
-
-
 class Rendering(NamedTuple):
     """A splatted image. `image` holds the background already; `alpha` is 1 - transmittance."""
 

@@ -24,7 +24,7 @@ from avatar.export.web_page import write_page
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.cpu import thread_count
-from avatar.view.stage import Look, Setting, Stage
+from avatar.view.view_renderer import Look, Setting, ViewRenderer
 
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 FRAMES, SIZE, SECONDS, MIB = 20, 256, 6, 2**20
@@ -75,7 +75,7 @@ def speed(page: Any) -> tuple[float, float]:
 
 
 def quad_pixels(trained: TrainedAvatar, width: int) -> float:
-    """Pixels that a GPU shades for a picture: those of the boxes that avatar/web/webgl.js draws, inside the picture."""
+    """Pixels that a GPU shades for a picture: of the boxes that avatar/web/webgl_renderer.js draws, inside it."""
     counts = []
     for index in list(trained.recording.split.test)[:FRAMES]:
         camera = trained.recording.camera(index, width)
@@ -97,7 +97,7 @@ def quad_pixels(trained: TrainedAvatar, width: int) -> float:
 
 
 def measure_viewer(trained: TrainedAvatar) -> None:
-    stage = Stage(trained)
+    stage = ViewRenderer(trained)
     frames = list(trained.recording.split.test)[:40]
     for width in (SIZE, 2 * SIZE):
         times = []

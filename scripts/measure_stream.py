@@ -30,7 +30,7 @@ from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.sender import encode_line
 from avatar.view.server import Viewer
-from avatar.view.stage import Stage
+from avatar.view.view_renderer import ViewRenderer
 
 # Sends packets, given as JSON of hexadecimal texts, and prints when each went out, in seconds of CLOCK_MONOTONIC.
 SENDER = """
@@ -90,7 +90,7 @@ def shapes(frame: int) -> dict[str, float]:
 def measure(trained: TrainedAvatar, name: str, packets: list[bytes], rate: float) -> None:
     receiver = Arrivals(trained)
     player = Player(trained, {}, time.monotonic, receiver.newest)
-    viewer = Viewer(Stage(trained), player, trained.rest_camera().width, "127.0.0.1", 0, "measured")
+    viewer = Viewer(ViewRenderer(trained), player, trained.rest_camera().width, "127.0.0.1", 0, "measured")
     viewer.pace = record = Record()
     try:
         words = [sys.executable, "-c", SENDER, "tcp" if name == "JSON" else "udp", str(receiver.port), str(rate)]

@@ -24,7 +24,7 @@ from avatar.runs.trained import TrainedAvatar
 from avatar.view.live import Live, Pace
 from avatar.view.player import WEBCAM, Player
 from avatar.view.server import Viewer
-from avatar.view.stage import Stage
+from avatar.view.view_renderer import ViewRenderer
 from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.frame_fit import FrameFit
@@ -85,7 +85,7 @@ def measure_live(trained: TrainedAvatar, head: Path, video: Path, with_page: boo
         return webcam.newest()
 
     player = Player(trained, {}, time.monotonic, newest, WEBCAM)
-    viewer = Viewer(Stage(trained), player, trained.rest_camera().width, "127.0.0.1", 0, TOKEN)
+    viewer = Viewer(ViewRenderer(trained), player, trained.rest_camera().width, "127.0.0.1", 0, TOKEN)
     viewer.pace = record = Record()
     drawing: list[float] = []
     with page(viewer.port, with_page):

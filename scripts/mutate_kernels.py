@@ -17,7 +17,7 @@ from mutation_runner import Mutation, Task, options, run
 
 BACKENDS, BUFFERS, HOSTILE, PLACE = (
     f"tests/{name}.py::"
-    for name in ("splat/test_splat_backends", "gpu/test_gpu_buffers", "gpu/test_gpu_hostile", "gpu/test_gpu_place")
+    for name in ("splat/test_splat_backends", "gpu/test_gpu_buffers", "gpu/test_gpu_hostile", "gpu/test_gpu_fused")
 )
 LOOPS = BACKENDS + "test_image_and_alpha_are_those_of_the_definition_written_as_loops"
 REFERENCE = BACKENDS + "test_gpu_kernels_agree_with_the_reference"
@@ -37,7 +37,7 @@ SPLATTER = [
     HOSTILE + "test_the_same_bits_and_whole_bands[walls]",
     f"{REFERENCE}[thresholds-gpu]",
 ]
-PLACING = [
+FUSED = [
     PLACE + "test_gaussians_and_gradients_are_those_of_the_steps_one_by_one[grid and heads]",
     PLACE + "test_lanes_that_stand_for_no_gaussian_get_no_gradient",
     PLACE + "test_zero_quaternions_and_saturated_offsets_have_finite_gradients",
@@ -47,7 +47,7 @@ POSING = ["tests/gpu/test_gpu_pose.py", HOSTILE + "test_the_same_bits_and_whole_
 LOSSES = ["tests/gpu/test_gpu_losses.py", HOSTILE + "test_the_same_bits_and_whole_bands[compared]"]
 # Of a module; of the others SPLATTER.
 TESTS = {
-    **dict.fromkeys(("activations", "hyper", "place", "place_backward"), PLACING),
+    **dict.fromkeys(("activations", "hyper", "fused", "fused_backward"), FUSED),
     **dict.fromkeys(("huber", "reduce", "ssim"), LOSSES),
     "pose": POSING,
 }

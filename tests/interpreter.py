@@ -33,15 +33,15 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
         return
     from triton.runtime.interpreter import InterpretedFunction, interpreter_builder
 
-    from avatar.gaussians import compose_gpu
+    from avatar.gaussians import fused_gpu
     from avatar.losses import gpu as losses_gpu
     from avatar.splat import gpu_draw
 
     lanes = {"lanes": 1024, "backward_lanes": 1024, "summed": 256, "summed_lanes": 4}
     wide = gpu_draw.Tuning(tile=16, step=32, backward_step=32, **lanes)
     patch.setattr(gpu_draw, "TUNING", wide)
-    patch.setattr(compose_gpu, "LANES", 1024)
-    patch.setattr(compose_gpu, "ENTRIES", 256)
+    patch.setattr(fused_gpu, "LANES", 1024)
+    patch.setattr(fused_gpu, "ENTRIES", 256)
     patch.setattr(losses_gpu, "LANES", 8192)
     # Its search for integers that overflow takes a quarter of the time, and tells nobody unless Triton is being debugged.
     patch.setattr(interpreter_builder, "options", replace(interpreter_builder.options, sanitize_overflow=False))

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from avatar.compute.gpu_functions import GPU_FUNCTIONS
+
 ROOT = Path(__file__).resolve().parents[1]
 # None of these imports one that comes after it, inside of functions neither.
 ORDER = [
@@ -79,6 +81,20 @@ def test_imports_go_one_way() -> None:
 def test_only_what_is_on_top_uses_the_importers() -> None:
     users = {room(name) for name, used in IMPORTS.items() if any(other.startswith("data_prep") for other in used)}
     assert {user for user in users if user.startswith("avatar")} <= ON_TOP
+
+
+def test_only_the_table_leads_to_the_gpu() -> None:
+    """What imports Triton is imported by its like and through the table of GPU functions, and by nothing else."""
+    of_gpu = {name for name, used in IMPORTS.items() if any(other.startswith("avatar.kernels.") for other in used)}
+    of_gpu |= {place.rpartition(".")[0] for place in GPU_FUNCTIONS.values()}
+    leaks = {(name, other) for name, used in IMPORTS.items() for other in used & of_gpu if name not in of_gpu}
+    assert not leaks
+
+
+def test_the_functions_in_the_table_are_there() -> None:
+    for place in GPU_FUNCTIONS.values():
+        module, _, name = place.rpartition(".")
+        assert f"\ndef {name}(" in MODULES[module].read_text(encoding="utf-8"), place
 
 
 def test_importers_build_on_what_is_below_them() -> None:

@@ -26,7 +26,7 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from avatar.gaussians.compose import quaternion_product
+from avatar.gaussians.apply_offsets import quaternion_product
 from avatar.head.normals import vertex_normals
 
 MOST_CROSSINGS = 8  # of edges at once; a place that is then outside still is set on the rim of its triangle

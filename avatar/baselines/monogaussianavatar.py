@@ -16,8 +16,8 @@ from torch import Tensor
 
 from avatar.baselines.mesh_points import MeshPoints
 from avatar.config import ModelConfig, TrainerConfig
-from avatar.gaussians.embedding import knn_scales
 from avatar.gaussians.encoding import positional_encoding
+from avatar.gaussians.mesh_embedding import knn_scales
 from avatar.gaussians.uv import UVTexels
 from avatar.head.assets import HeadAssets
 from avatar.model import FlashAvatar

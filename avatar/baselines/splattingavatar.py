@@ -12,8 +12,8 @@ from torch.nn.functional import normalize
 
 from avatar.baselines.mesh_points import MeshPoints
 from avatar.config import HYPER_RATE, LearningRates, ModelConfig, TrainerConfig
+from avatar.gaussians.apply_offsets import quaternion_product
 from avatar.gaussians.base_model import Avatar, Groups
-from avatar.gaussians.compose import quaternion_product
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams
 

@@ -22,7 +22,7 @@ from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
 from avatar.pipeline import OK
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file
-from avatar.runs.avatar_file import read_portrait, write_portrait
+from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
@@ -159,11 +159,11 @@ def numbered(out: Path, number: int) -> Path:
     return out.with_name(f"{shortened(out.stem)}-{number:05d}{out.suffix}")
 
 
-def write_avatar_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
-    portrait = read_portrait(trained.source)
+def write_avatar_format(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    content = read_avatar_file(trained.source)
     head = trained.assets if arguments.with_head else None
     licence = licence_of(WHOLE) if arguments.with_head else None
-    write_portrait(out, replace(portrait, head=head), licence)
+    write_avatar_file(out, replace(content, head=head), licence)
     print(f"Avatar   {out} ({out.stat().st_size / MIB:.1f} MiB)")
     if licence:
         print(f"Licence  {licence}")
@@ -182,7 +182,7 @@ SUFFIXES = {
 WRITERS: dict[str, Callable[[TrainedAvatar, Path, Namespace], None]] = {
     "web": write_web,
     "web-avatar": write_web_file,
-    "avatar": write_avatar_file,
+    "avatar": write_avatar_format,
     "ply": write_splats,
     "glb": write_mesh,
     "video": write_clip,

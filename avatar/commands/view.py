@@ -30,7 +30,7 @@ from avatar.runs.trained import TrainedAvatar
 from avatar.view.auth import LOCAL
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
-from avatar.view.stage import Stage
+from avatar.view.view_renderer import ViewRenderer
 from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.pictures import open_source
@@ -59,7 +59,7 @@ def run_view(arguments: Namespace) -> int:
     viewer_type = viewer_class()
     motions = clips(trained, arguments.drive)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
-    stage = Stage(trained, None if run is None else truth_of(run))
+    stage = ViewRenderer(trained, None if run is None else truth_of(run))
     live = open_live(arguments, trained, token)
     try:
         newest, name = (None, "") if live is None else (live.newest, live.name)

@@ -18,8 +18,8 @@ from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import Look
 from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
+from avatar.splat import checked_drawings
 from avatar.splat.cpu import thread_count
-from avatar.splat.gpu_buffers import checked_drawings
 from avatar.types import Frame
 
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest

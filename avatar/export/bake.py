@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.gaussians.embedding import Embedding
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import painted, uv_texels
 from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.orbit import orbited

@@ -45,7 +45,7 @@ ARRAYS = (
 
 
 @dataclass(frozen=True)
-class Drawing:
+class WebArrays:
     """All that does not change from frame to frame, float32 and int32.
 
     Only the expression coefficients `kept` take part; the others were zero in all of the training video.
@@ -60,7 +60,7 @@ class Drawing:
 
 
 @torch.no_grad()
-def reduce_avatar(trained: TrainedAvatar) -> Drawing:
+def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
     """Fold what can be folded, and leave out expression directions and vertices that nothing uses.
 
     Raises UserError for an avatar that does not fold.
@@ -101,7 +101,7 @@ def reduce_avatar(trained: TrainedAvatar) -> Drawing:
         "has_rigidity": int(model.skull_logits is not None),
         "has_facing": int(model.turning is not None),
     }
-    return Drawing(
+    return WebArrays(
         sizes,
         {name: np.ascontiguousarray(arrays[name].float().numpy()) for name in ARRAYS},
         corners.numpy().astype(np.int32),

@@ -22,7 +22,7 @@ import torch
 from avatar.errors import UserError
 from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
-from avatar.export.web_arrays import ARRAYS, Drawing, reduce_avatar
+from avatar.export.web_arrays import ARRAYS, WebArrays, reduce_avatar
 from avatar.gaussians.head_rotation import LIMIT
 from avatar.motion.controls import expression_controls, joint_ranges
 from avatar.motion.orbit import orbit_limits
@@ -55,7 +55,7 @@ MAX_MOTION = 1500  # frames: a minute at 25 a second
 class WebFile:
     data: bytes  # gzip
     raw_bytes: int
-    drawing: Drawing
+    drawing: WebArrays
 
 
 def encode_avatar(trained: TrainedAvatar, precision: Precision = "small") -> WebFile:
@@ -111,7 +111,7 @@ def quantised(values: np.ndarray, kind: str, column: str) -> tuple[np.ndarray, n
     return (integers.T if column == "row" else integers), scales
 
 
-def motion_arrays(trained: TrainedAvatar, drawing: Drawing) -> dict[str, np.ndarray]:
+def motion_arrays(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, np.ndarray]:
     """The held-out frames' parameters [T, P] and head poses [T, 12], what the page plays."""
     recording = trained.recording
     chosen = list(recording.split.test)[:MAX_MOTION]
@@ -123,7 +123,7 @@ def motion_arrays(trained: TrainedAvatar, drawing: Drawing) -> dict[str, np.ndar
     return {"motion": params.astype(np.float32), "poses": poses.astype(np.float32)}
 
 
-def describe(trained: TrainedAvatar, drawing: Drawing) -> dict[str, Any]:
+def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
     """What the page says, and how far things can be moved there."""
     recording, kept = trained.recording, list(drawing.kept)
     train = list(recording.split.train)

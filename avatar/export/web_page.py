@@ -18,7 +18,7 @@ from avatar.runs.trained import TrainedAvatar
 WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
 PAGE_MODULES = (
-    *("core.js", "motion.js", "canvas.js", "webgl.js", "drive.js", "settings.js", "view.js", "steer.js"),
+    *("core.js", "motion.js", "canvas.js", "webgl_renderer.js", "drive.js", "settings.js", "view.js", "steer.js"),
     *("landmarker.js", "camera.js", "controls.js", "panel.js", "page.js"),
 )
 WORKER_MODULES = ("core.js", "worker.js")

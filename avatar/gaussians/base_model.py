@@ -14,9 +14,9 @@ from avatar.compute.device import on_gpu, to_device
 from avatar.compute.memory import Need
 from avatar.config import OPACITY_RATE, LearningRates, ModelConfig, TrainerConfig
 from avatar.gaussians.deformation import DeformationMLP
-from avatar.gaussians.embedding import Embedding, knn_scales
 from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.head_rotation import VALUES, head_rotation_input, learned_turning
+from avatar.gaussians.mesh_embedding import Embedding, knn_scales
 from avatar.gaussians.uv import UVTexels, bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.device import to_device
-from avatar.gaussians.embedding import Embedding
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.types import IDENTITY_6D
 

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.compute.device import CPU, to_device
+from avatar.compute.gpu_functions import gpu_function
 from avatar.head.assets import HeadAssets
 from avatar.tensors import check_shapes
 from avatar.types import HeadParams
@@ -153,9 +154,7 @@ class HeadModel:
             self._pose_tensors = self.pose_tensors(device)
         if self._pose_tensors is None:
             return to_device(self.vertices(params.to(CPU)), device)
-        from avatar.head.pose_gpu import pose_gpu  # imports Triton, which is not there on every machine
-
-        return pose_gpu(self._pose_tensors, params.to(device))
+        return gpu_function("pose a head")(self._pose_tensors, params.to(device))
 
     def still_vertices(
         self, expression: Float[Tensor, "N E"], jaw: Float[Tensor, "N 3 3"], rows: Int[Tensor, " R"]

@@ -1,4 +1,4 @@
-"""Activations and quaternions, as `avatar.gaussians.compose` uses them."""
+"""Activations and quaternions, as `avatar.gaussians.apply_offsets` uses them."""
 
 import triton
 import triton.language as tl

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
+from avatar.compute.gpu_functions import gpu_function
 from avatar.losses.dssim_cpu import dssim_cpu
 from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_RADIUS, SSIM_WINDOW, bounding_box, grown_box, ssim_map
@@ -57,9 +58,7 @@ def photometric_loss(
         image=(image, "H W 3"), target=(target, "H W 3"), mouth_mask=(mouth_mask, "H W"), head_mask=(head_mask, "H W")
     )
     if _by_gpu_kernels(image, target, mouth_mask):
-        from avatar.losses.gpu import huber_gpu  # imports Triton, which is not there on every machine
-
-        frame, mouth = huber_gpu(image, target, mouth_mask, delta=delta, mask_weight=mouth_weight)
+        frame, mouth = gpu_function("Huber loss")(image, target, mouth_mask, delta=delta, mask_weight=mouth_weight)
     else:
         frame = F.huber_loss(image, target, delta=delta)
         mouth = mouth_weight * masked_huber(image, target, mouth_mask, delta=delta)
@@ -97,9 +96,7 @@ def dssim(
     height, width = mask.shape
     if min(height, width) >= SSIM_WINDOW:
         if _by_gpu_kernels(image, target, mask):
-            from avatar.losses.gpu import dssim_gpu
-
-            return dssim_gpu(image, target, mask)
+            return gpu_function("D-SSIM")(image, target, mask)
         plain = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in (image, target, mask))
         if plain and not (target.requires_grad or mask.requires_grad):
             return dssim_cpu(image, target, mask)
@@ -115,7 +112,7 @@ def dssim(
 
 
 def _by_gpu_kernels(image: Tensor, target: Tensor, mask: Tensor) -> bool:
-    """Whether the kernels of `avatar.losses.gpu` take these: float32, differentiated by the image alone."""
+    """Whether a GPU's kernels take these: float32, differentiated by the image alone."""
     plain = all(tensor.dtype == torch.float32 and on_gpu(tensor) for tensor in (image, target, mask))
     return plain and not (target.requires_grad or mask.requires_grad)
 

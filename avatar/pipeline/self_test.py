@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
+from avatar.compute.gpu_functions import gpu_function
 from avatar.errors import UserError
-from avatar.gaussians.compose import compose_raw
+from avatar.gaussians.apply_offsets import apply_offsets
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, condition, touching_lists
 from avatar.gaussians.skull_binding import Skull, SkullBinding, bind_to_skull
@@ -87,13 +88,11 @@ def placed(device: torch.device) -> Fields:
     skull_binding = SkullBinding(skull, neck, skull_logits)
     sh = torch.zeros(COUNT, 1, 3, device=device)
     if on_gpu(sh):
-        from avatar.gaussians.compose_gpu import compose_gpu
-
-        base = (quats, log_scales, logits, sh)
-        found = compose_gpu(vertices, values, packed, *base, sheet, sheet.grid, skull_binding)
+        base, make = (quats, log_scales, logits, sh), gpu_function("make Gaussians")
+        found = make(vertices, values, packed, *base, sheet, sheet.grid, skull_binding)
     else:
         points = bind_to_skull((vertices[sheet.corners] * sheet.barycentric[..., None]).sum(dim=1), skull_binding)
-        found = compose_raw(points, quats, log_scales, logits, sh, condition(sheet.grid(values), packed))
+        found = apply_offsets(points, quats, log_scales, logits, sh, condition(sheet.grid(values), packed))
     cotangents = [torch.randn(field.shape, generator=generator).to(device) for field in found[:4]]
     gradients = torch.autograd.grad(found[:4], list(leaves.values()), cotangents)
     fields = dict(zip(Gaussians._fields[:4], (field.detach() for field in found), strict=False))

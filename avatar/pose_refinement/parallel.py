@@ -11,7 +11,7 @@ from torch import Tensor
 from avatar.compute.native import thread_count
 from avatar.compute.workers import in_order
 from avatar.render import AHEAD_ON_GPU
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import checked_drawings
 
 Item = TypeVar("Item")
 

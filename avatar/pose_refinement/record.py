@@ -19,7 +19,7 @@ from avatar.files.video import error_map, side_by_side
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.refine import Refined
 from avatar.render import Renderer
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import checked_drawings
 
 COLUMNS = ("frame", "name", "part", "psnr_before", "psnr_after", "turn_degrees", "shift_mm")
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest

@@ -11,7 +11,7 @@ from avatar.evaluation.draw import panel
 from avatar.evaluation.measure import Pair
 from avatar.render import Renderer
 from avatar.runs.run import Run
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import checked_drawings
 
 MAX_FRAMES = 40
 MAX_PANEL_WIDTH = 1080  # pixels of truth, render and error side by side; 40 of them stay under 5 MB

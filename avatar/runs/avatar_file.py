@@ -52,7 +52,7 @@ _RECORDING, _NEUTRAL, _HEAD = "recording.", "neutral.", "head."
 
 
 @dataclass(frozen=True)
-class Portrait:
+class AvatarFile:
     """What an avatar file holds, without the head model; enough to build the avatar once that is there."""
 
     config: Config
@@ -70,26 +70,28 @@ def write_avatar(
 ) -> None:
     """Write the avatar after `step` steps. Raises UserError when the disk refuses."""
     names = model.head.assets.names
-    write_portrait(path, Portrait(config, step, recording, neutral, perceptual, names, module_tensors(model), None))
+    write_avatar_file(
+        path, AvatarFile(config, step, recording, neutral, perceptual, names, module_tensors(model), None)
+    )
 
 
-def write_portrait(path: Path, portrait: Portrait, licence: str | None = None) -> None:
-    """Write what `read_portrait` gives back; `licence` is a sentence about the head model, where one is packed."""
-    recording = portrait.recording
-    tensors = {name: value.detach().cpu().contiguous() for name, value in portrait.parameters.items()}
+def write_avatar_file(path: Path, content: AvatarFile, licence: str | None = None) -> None:
+    """Write what `read_avatar_file` gives back; `licence` is a sentence about the head model, where one is packed."""
+    recording = content.recording
+    tensors = {name: value.detach().cpu().contiguous() for name, value in content.parameters.items()}
     tensors |= {f"{_RECORDING}{name}": recording.tracks[name].contiguous() for name in TRACK_SHAPES}
     tensors |= {
-        f"{_NEUTRAL}expression": portrait.neutral.expression.contiguous(),
-        f"{_NEUTRAL}jaw": portrait.neutral.jaw.contiguous(),
+        f"{_NEUTRAL}expression": content.neutral.expression.contiguous(),
+        f"{_NEUTRAL}jaw": content.neutral.jaw.contiguous(),
     }
-    if portrait.head is not None:
-        tensors |= {f"{_HEAD}{name}": value for name, value in head_tensors(portrait.head).items()}
+    if content.head is not None:
+        tensors |= {f"{_HEAD}{name}": value for name, value in head_tensors(content.head).items()}
     header = {
         "format": AVATAR_FORMAT,
         "program": __version__,
-        "step": portrait.step,
-        "config": portrait.config.to_dict(),
-        "perceptual": portrait.perceptual,
+        "step": content.step,
+        "config": content.config.to_dict(),
+        "perceptual": content.perceptual,
         "name": recording.name,
         "fps": recording.fps,
         "size": [recording.width, recording.height],
@@ -97,16 +99,16 @@ def write_portrait(path: Path, portrait: Portrait, licence: str | None = None) -
         "frames": list(recording.names),
         "train": list(recording.split.train),
         "test": list(recording.split.test),
-        "neutral_frame": portrait.neutral.frame,
+        "neutral_frame": content.neutral.frame,
         "data_hash": recording.data_hash,
         "head_fingerprint": recording.head_fingerprint,
-        "expression_names": portrait.names.to_dict(),
+        "expression_names": content.names.to_dict(),
         "head_licence": licence,
     }
     write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(header, allow_nan=False)}))
 
 
-def read_portrait(path: Path) -> Portrait:
+def read_avatar_file(path: Path) -> AvatarFile:
     """Read an avatar file. Raises UserError, naming the file, when it is missing, damaged or of another format."""
     header, tensors = _read(path)
     try:
@@ -140,7 +142,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise UserError(f"{path} is damaged or no avatar file ({error}); copy it again, or export it again") from None
 
 
-def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> Portrait:
+def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> AvatarFile:
     config = config_from_dict(header["config"])
     names = header["frames"]
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
@@ -171,7 +173,7 @@ def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> Portrait:
     )
     coefficients = recording.tracks["expression"].shape[1]
     head = _under(_HEAD, tensors)
-    return Portrait(
+    return AvatarFile(
         config=config,
         step=header["step"],
         recording=recording,
@@ -198,20 +200,20 @@ def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def build_avatar(portrait: Portrait, assets: HeadAssets, source: Path | str) -> Avatar:
+def build_avatar(content: AvatarFile, assets: HeadAssets, source: Path | str) -> Avatar:
     """The avatar with its parameters, ready to draw.
 
     Raises UserError for another head model than it was trained with, and, before anything large is made, for parameters
     that do not fit the configuration or the machine's memory.
     """
-    check_head(portrait.recording.head_fingerprint, assets, source)
-    config = portrait.config.model
+    check_head(content.recording.head_fingerprint, assets, source)
+    config = content.config.model
     gaussians = count_gaussians(config, assets)
     shapes = MODELS[config.name].shapes(config, assets.num_expressions, gaussians)
-    check_fit(shapes, portrait.parameters, source)
+    check_fit(shapes, content.parameters, source)
     check_memory(f"opening {source}", drawing_needs(config, assets, gaussians))
-    model = make_avatar(assets, portrait.recording.identity, config)
-    load_module(model, portrait.parameters, source)
+    model = make_avatar(assets, content.recording.identity, config)
+    load_module(model, content.parameters, source)
     return model.eval()
 
 

@@ -21,9 +21,9 @@ from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.motion.rest import RestPose
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
-from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_portrait
+from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_avatar_file
 from avatar.runs.inputs import checked_camera, checked_params
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import checked_drawings
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
 
 
@@ -127,22 +127,22 @@ def load_avatar(
     model is another one than the avatar was trained with.
     """
     path = avatar_path(Path(path))
-    portrait = read_portrait(path)
+    content = read_avatar_file(path)
     if head is not None:
         assets = load_head_assets(Path(head))
-    elif portrait.head is not None:
-        assets = portrait.head
+    elif content.head is not None:
+        assets = content.head
     else:
         assets = load_head_assets(_find_head(path, recorded_head))
-    assets = replace(assets, names=portrait.names)
+    assets = replace(assets, names=content.names)
     return TrainedAvatar(
         source=path,
-        avatar=build_avatar(portrait, assets, path),
-        config=portrait.config,
-        recording=portrait.recording,
-        neutral=portrait.neutral,
-        step=portrait.step,
-        perceptual=portrait.perceptual,
+        avatar=build_avatar(content, assets, path),
+        config=content.config,
+        recording=content.recording,
+        neutral=content.neutral,
+        step=content.step,
+        perceptual=content.perceptual,
     )
 
 

@@ -11,14 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
+from avatar.compute.gpu_functions import gpu_function
 from avatar.splat.cpu import CannotDraw, splat_cpu
+from avatar.splat.gpu_buffers import checked_drawings
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["CannotDraw", "splat"]
+__all__ = ["CannotDraw", "checked_drawings", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
@@ -74,7 +76,7 @@ def splat(
     Raises TypeError or ValueError, naming the argument, for a wrong type, shape, dtype or device; CannotDraw, a ValueError,
     for non-finite values (with count and first index), colours that overflow and scenes beyond the kernel's limits. On
     the "gpu" backend image and alpha are NaN instead wherever it draws, also where the scene needs more memory than the
-    first of its kind fixed; within `avatar.splat.gpu_buffers.checked_drawings()` it waits for the GPU, and raises.
+    first of its kind fixed; within `checked_drawings()` it waits for the GPU, and raises.
     """
     chosen = backend or _backend_for(gaussians.means)
     options = _checked_options(
@@ -98,9 +100,7 @@ def splat(
             raise CannotDraw(str(error)) from None
         return splat_reference(gaussians, camera, background, **options)
     if chosen == "gpu":
-        from avatar.splat.gpu import splat_gpu  # imports Triton, which takes a second and is not there on every machine
-
-        return splat_gpu(gaussians, camera, background, **options)
+        return gpu_function("splat")(gaussians, camera, background, **options)
     return splat_cpu(gaussians, camera, background, **options)
 
 

@@ -12,8 +12,7 @@ from avatar.config import TrainerConfig
 from avatar.data.loader import FrameLoader
 from avatar.data.split import evenly_spread
 from avatar.gaussians.base_model import Avatar
-from avatar.splat import CannotDraw
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import CannotDraw, checked_drawings
 from avatar.splat.sh import C0
 from avatar.train.step import stopped
 from avatar.types import Frame

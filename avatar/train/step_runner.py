@@ -17,6 +17,7 @@ from torch import Tensor
 
 from avatar.compute.cuda_graph import Replay
 from avatar.compute.device import on_gpu, to_device
+from avatar.compute.gpu_functions import gpu_function
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
@@ -88,9 +89,7 @@ class StepRunner:
                 self._jacobians[frame.index] = to_device(corrections.jacobian(camera.R_cam_world), self._device)
             jacobian = self._jacobians[frame.index]
         if on_gpu(vertices):
-            from avatar.splat.gpu import pose_on  # imports Triton, which is not there on every machine
-
-            R, t = pose_on(camera, self._device).float().split((9, 3))
+            R, t = gpu_function("upload a camera's pose")(camera, self._device).float().split((9, 3))
             frame = replace(frame, camera=replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t))
         return StepInputs(frame, vertices, noise, row, jacobian)
 

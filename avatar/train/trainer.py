@@ -18,8 +18,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.motion.rest import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
-from avatar.splat import CannotDraw
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import CannotDraw, checked_drawings
 from avatar.train.condition_noise import make_noise
 from avatar.train.init_colours import colour_from_frames
 from avatar.train.log import TrainingLog

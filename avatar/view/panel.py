@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from avatar.view.messages import Value, one_of, pressed, switched, within
-from avatar.view.stage import Setting
+from avatar.view.view_renderer import Setting
 
 if TYPE_CHECKING:
     from avatar.view.server import Viewer
@@ -94,7 +94,7 @@ class Panel:
                 self._button("Take this face as neutral", lambda _: calibrate())
 
     def _add_picture(self) -> None:
-        gui, viewer, stage = self._gui, self._viewer, self._viewer.stage
+        gui, viewer, stage = self._gui, self._viewer, self._viewer.renderer
         with gui.add_folder("Picture"):
             if stage.truth is not None:
                 beside = gui.add_checkbox("Truth beside", initial_value=False)
@@ -105,7 +105,7 @@ class Panel:
             self._button("Save video", viewer.save_video)
 
     def _add_face(self) -> None:
-        stage, sliders = self._viewer.stage, []
+        stage, sliders = self._viewer.renderer, []
         parts = list(dict.fromkeys(control.part for control in stage.controls))
         for part in parts:
             with self._gui.add_folder(part, expand_by_default=part == parts[0]):

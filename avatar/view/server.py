@@ -25,7 +25,7 @@ from avatar.view.messages import Door
 from avatar.view.panel import Panel, notes
 from avatar.view.player import Player
 from avatar.view.rate_limited_log import Complaints
-from avatar.view.stage import Look, Setting, Stage
+from avatar.view.view_renderer import Look, Setting, ViewRenderer
 from avatar.view.web_server import WebServer
 
 TARGET_MS = (20.0, 33.0)  # of a picture while things move: between them its size stays
@@ -43,7 +43,7 @@ class Viewer:
 
     def __init__(
         self,
-        stage: Stage,
+        stage: ViewRenderer,
         player: Player,
         width: int,
         host: str,
@@ -54,7 +54,7 @@ class Viewer:
         calibrate: Callable[[], None] | None = None,
     ) -> None:
         """Raises UserError when the address cannot be listened on. Port 0 takes a free one, then in `port`."""
-        self.stage, self.player, self._width = stage, player, width
+        self.renderer, self.player, self._width = stage, player, width
         self.setting, self._changed = Setting(), 0.0
         self._moving_width = width
         self.lock, self.wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
@@ -112,7 +112,7 @@ class Viewer:
     def _welcome(self, client: Any) -> None:
         @client.camera.on_update
         def _(camera: Any) -> None:
-            look, _ = self.stage.within(self.look_from(np.asarray(camera.position) - np.asarray(camera.look_at)))
+            look, _ = self.renderer.within(self.look_from(np.asarray(camera.position) - np.asarray(camera.look_at)))
             self.change(look=look)
 
     def _loop(self) -> None:
@@ -136,7 +136,7 @@ class Viewer:
         if key != self._last:
             self._last = key
             begin = time.perf_counter()
-            picture = self.stage.draw((shown.params, shown.camera), setting, width, shown.recorded)
+            picture = self.renderer.draw((shown.params, shown.camera), setting, width, shown.recorded)
             self.milliseconds = 1000 * (time.perf_counter() - begin)
             self.picture = picture
             for number, aspect in windows:
@@ -151,7 +151,7 @@ class Viewer:
         if now - self._told > STATUS_EVERY:
             self._told = now
             is_recorded = shown.recorded is not None
-            self._tell(self.stage.distance(self.stage.params(shown.params, setting)), setting, is_recorded)
+            self._tell(self.renderer.distance(self.renderer.params(shown.params, setting)), setting, is_recorded)
 
     def _fit(self, milliseconds: float) -> None:
         low, high = TARGET_MS
@@ -160,18 +160,18 @@ class Viewer:
 
     def _send(self, client: Any, aspect: float, picture: np.ndarray) -> None:
         try:
-            image = padded(picture, aspect, self.stage.trained.config.data.background)
+            image = padded(picture, aspect, self.renderer.trained.config.data.background)
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
         except Exception as error:  # the others get theirs
             self.complaints.add(f"a picture could not be sent ({type(error).__name__})")
 
     def _tell(self, distance: float, setting: Setting, is_recorded: bool) -> None:
         height, width = (0, 0) if self.picture is None else self.picture.shape[:2]
-        _, is_supported = self.stage.within(setting.look)
+        _, is_supported = self.renderer.within(setting.look)
         lines = [
             f"{width} x {height} pixels, {self.milliseconds:.0f} ms a picture",
             f"Distance from training: {distance:.2f}" + (" (**far**: the avatar guesses)" if distance > 1 else ""),
-            *notes(setting, self.stage.truth is not None, is_recorded),
+            *notes(setting, self.renderer.truth is not None, is_recorded),
         ]
         if not is_supported:
             lines.append("**The camera is where the training video never was: the avatar guesses.**")
@@ -184,9 +184,9 @@ class Viewer:
             shown, setting = self.player.now(), self.setting
         with self._saving(event.client) as may_save:
             if may_save:
-                picture = self.stage.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
+                picture = self.renderer.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
                 data = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
-                event.client.send_file_download(f"{self.stage.trained.name}.png", data, save_immediately=True)
+                event.client.send_file_download(f"{self.renderer.trained.name}.png", data, save_immediately=True)
 
     def save_video(self, event: Any) -> None:
         """The whole motion as it is seen now."""
@@ -200,13 +200,13 @@ class Viewer:
             for frame, recorded in zip(clip.frames, clip.recorded or (None,) * len(clip), strict=True):
                 if self._stop.is_set():
                     raise UserError("the viewer has ended")
-                yield self.stage.draw(frame, setting, self._width, recorded)
+                yield self.renderer.draw(frame, setting, self._width, recorded)
 
         with self._saving(event.client) as may_save, tempfile.TemporaryDirectory() as folder:
             if may_save:
                 path = Path(folder) / "video.mp4"
                 write_video(path, frames(), clip.fps)
-                name = f"{self.stage.trained.name}-{clip.name}.mp4"
+                name = f"{self.renderer.trained.name}-{clip.name}.mp4"
                 event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
 
     @contextmanager

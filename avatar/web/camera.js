@@ -2,7 +2,7 @@
 import { AvatarError } from "./core.js";
 import { calmFace, mirrored } from "./drive.js";
 import { loadLandmarker } from "./landmarker.js";
-import { hasRealGpu } from "./webgl.js";
+import { hasRealGpu } from "./webgl_renderer.js";
 
 const CALM_SECONDS = 4, FEWEST = 20; // faces that the neutral one is made of
 const LOST_AFTER = 500; // milliseconds without a face that are spoken of

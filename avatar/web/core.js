@@ -127,7 +127,7 @@ function scaled(values, { scales, by }, name) {
   return out;
 }
 
-/** How the head is turned before a camera, as the network is told: avatar/gaussians/facing.py. */
+/** How the head is turned before a camera, as the network is told: avatar/gaussians/head_rotation.py. */
 function facing(told, rotation) {
   if (told === null) return [0, 0, 0];
   const turn = (axis) => rotation.reduce((sum, value, k) => sum + told.turning[9 * axis + k] * value, 0);

@@ -5,7 +5,7 @@ import { AvatarError } from "./core.js";
 import { FaceDriver } from "./drive.js";
 import { idle, mix, multiply, orbit, recorded, rotation } from "./motion.js";
 import { Settings } from "./settings.js";
-import { WebglRenderer, hasRealGpu } from "./webgl.js";
+import { WebglRenderer, hasRealGpu } from "./webgl_renderer.js";
 
 const BLEND_SECONDS = 0.4; // from one motion to another
 const MARGIN = 10; // degrees by which the camera may leave what the training video shows

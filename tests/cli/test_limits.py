@@ -14,7 +14,7 @@ from tracked_folder import write_tracked_folder
 from avatar.compute import memory
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
-from avatar.runs.avatar_file import read_portrait, write_portrait
+from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 
 QUICK = [*SMALL, "trainer.iterations=4"]
 
@@ -100,10 +100,10 @@ def test_a_foreign_avatar_file_that_lies_about_its_size_is_refused(tracked_folde
     """Its configuration asks for terabytes, its parameters are small: what does not fit together is not built."""
     run = tmp_path / "run"
     avatar("train", tracked_folder, "--frame-offset", 1, "--out", run, *QUICK)
-    portrait = read_portrait(run / "avatar.safetensors")
-    huge = replace(portrait.config.model, mlp_width=65536, mlp_layers=1000, uv_size=1024, latent_dim=4096)
+    content = read_avatar_file(run / "avatar.safetensors")
+    huge = replace(content.config.model, mlp_width=65536, mlp_layers=1000, uv_size=1024, latent_dim=4096)
     file = tmp_path / "foreign.safetensors"
-    write_portrait(file, replace(portrait, config=replace(portrait.config, model=huge)))
+    write_avatar_file(file, replace(content, config=replace(content.config, model=huge)))
     head = tracked_folder / "head_model"
     output = avatar("reenact", file, "--head", head, "--driver", tracked_folder, "--frame-offset", 1, status=1)
     assert "it belongs to another model" in output and "this model needs" in output

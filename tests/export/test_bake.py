@@ -12,7 +12,7 @@ import torch
 from lively import lively_avatar
 
 from avatar.export.bake import _sampled, bake_texture
-from avatar.gaussians.embedding import Embedding
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import uv_texels
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.sh import C0

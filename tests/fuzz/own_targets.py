@@ -16,7 +16,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.errors import refuse
 from avatar.head.assets import load_head_assets
-from avatar.runs.avatar_file import AVATAR_FILE, read_portrait, write_portrait
+from avatar.runs.avatar_file import AVATAR_FILE, read_avatar_file, write_avatar_file
 from avatar.runs.trained import load_avatar
 from avatar.sweep.spec import read_spec
 from data_prep.formats import avatar_track
@@ -47,7 +47,7 @@ def make_own_targets(place: Path) -> dict[str, Target]:
 
     file = lively_run(original, place / "lively") / AVATAR_FILE
     packed = place / "packed.safetensors"
-    write_portrait(packed, replace(read_portrait(file), head=head), "a licence")
+    write_avatar_file(packed, replace(read_avatar_file(file), head=head), "a licence")
 
     tracks, landmarks = (tracked / avatar_track.TRACKS_FILE).read_bytes(), place / "landmarks.npz"
     rng = np.random.default_rng(0)

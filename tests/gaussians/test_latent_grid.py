@@ -7,8 +7,8 @@ import torch
 from heads import grid_head, random_params
 from small_runs import small_config
 
-from avatar.gaussians.embedding import Embedding
 from avatar.gaussians.latent_grid import latent_grid, uv_charts
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel

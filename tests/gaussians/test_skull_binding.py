@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avatar.config import load_config
 from avatar.gaussians.base_model import Avatar
-from avatar.gaussians.embedding import Embedding
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel, matrix_from_6d

@@ -12,7 +12,7 @@ from small_runs import new_avatar, open_small, small_config
 
 from avatar.head.model import HeadModel
 from avatar.head.teeth import GRID, ROWS
-from avatar.runs.avatar_file import read_portrait, write_portrait
+from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.memory_estimate import count_gaussians
 from avatar.runs.trained import TrainedAvatar, load_avatar
 
@@ -63,10 +63,10 @@ def test_they_are_seen_and_move_with_the_head(trained: TrainedAvatar) -> None:
 
 def test_a_packed_head_model_is_the_one_that_was_given(trained: TrainedAvatar, tmp_path: Path) -> None:
     packed = tmp_path / "packed.safetensors"
-    portrait = read_portrait(trained.source)
-    write_portrait(packed, replace(portrait, head=trained.assets))
+    content = read_avatar_file(trained.source)
+    write_avatar_file(packed, replace(content, head=trained.assets))
     again = load_avatar(packed)
-    assert again.assets.fingerprint == trained.assets.fingerprint == portrait.recording.head_fingerprint
+    assert again.assets.fingerprint == trained.assets.fingerprint == content.recording.head_fingerprint
     assert again.assets.num_vertices == trained.assets.num_vertices
     params = again.rest_params()
     assert torch.equal(again.avatar.vertices(params), trained.avatar.vertices(params))

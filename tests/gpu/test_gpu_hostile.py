@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 import torch
+from gpu.test_gpu_fused import Scene as Placing
 from gpu.test_gpu_losses import images
-from gpu.test_gpu_place import Scene as Placing
 from gpu.test_gpu_pose import HEAD
 from heads import random_params
 from interpreter import Hostile, hostile_interpreter

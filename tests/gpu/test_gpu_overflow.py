@@ -33,7 +33,7 @@ from avatar.train.objective import choose_perceptual
 from avatar.train.prune import coverage
 from avatar.train.trainer import train
 from avatar.types import Frame
-from avatar.view.stage import Look, Setting, Stage
+from avatar.view.view_renderer import Look, Setting, ViewRenderer
 
 OVERFLOWS = r"drawing needs \d+ pairs of a tile and a splat, the GPU's buffers hold 3; a lower --size or model.uv_size"
 
@@ -57,7 +57,7 @@ DRAWN: dict[str, Callable[[TrainedAvatar], object]] = {
     "an evaluated frame": lambda trained: draw(
         trained.renderer, frame_of(trained), [EvaluationLook((1.0, 1.0, 1.0), True, "round")]
     ),
-    "a viewed frame": lambda trained: Stage(trained).draw(
+    "a viewed frame": lambda trained: ViewRenderer(trained).draw(
         (trained.rest_params(), trained.rest_camera(32)), Setting(), 32
     ),
     "a frame that prunes": lambda trained: coverage(trained.avatar, frame_of(trained), 7),
@@ -91,7 +91,7 @@ def test_a_drawing_beyond_the_buffers_is_refused_with_a_sentence(what: str, trai
 def test_a_viewed_frame_fits_whatever_was_drawn_before(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("HEADROOM", 1), ("PER_SPLAT", 0), ("PER_TILE", 0)):
         monkeypatch.setattr(gpu_buffers, name, value)
-    stage, frame = Stage(trained), (trained.rest_params(), trained.rest_camera(32))
+    stage, frame = ViewRenderer(trained), (trained.rest_params(), trained.rest_camera(32))
     settings = [Setting(Look(zoom=zoom)) for zoom in (0.5, 4.0)]
     expected = [stage.draw(frame, setting, 64) for setting in settings]
     with as_on_a_gpu():

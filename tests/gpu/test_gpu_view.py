@@ -14,7 +14,7 @@ from lively import lively_avatar
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.stage import Setting, Stage
+from avatar.view.view_renderer import Setting, ViewRenderer
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +28,10 @@ def test_pictures_are_those_of_the_cpu(trained: TrainedAvatar) -> None:
     settings = (Setting(), Setting(overlay="mesh"), Setting(overlay="error"))
     truth = torch.full((32, 32, 3), 0.4)
     with the_cpus_way():
-        stage = Stage(trained, lambda *_: truth)
+        stage = ViewRenderer(trained, lambda *_: truth)
         expected = [stage.draw(frame, setting, 32, 5) for setting in settings]
     there = replace(trained, avatar=deepcopy(trained.avatar).to(DEVICE))
-    stage = Stage(there, lambda *_: truth)
+    stage = ViewRenderer(there, lambda *_: truth)
     for setting, wanted in zip(settings, expected, strict=True):
         found = stage.draw(frame, setting, 32, 5)
         assert found.shape == wanted.shape
@@ -42,6 +42,6 @@ def test_pictures_are_those_of_the_cpu(trained: TrainedAvatar) -> None:
 def test_a_picture_reads_nothing_back_before_it_is_there(
     trained: TrainedAvatar,
 ) -> None:
-    stage = Stage(replace(trained, avatar=deepcopy(trained.avatar).to("meta")))
+    stage = ViewRenderer(replace(trained, avatar=deepcopy(trained.avatar).to("meta")))
     drawn = stage.rendered(trained.recording.params(5), trained.recording.camera(5, 48))
     assert drawn.image.is_meta and drawn.image.shape == (48, 48, 3)

@@ -9,7 +9,7 @@ from heads import grid_head
 from torch import Tensor
 
 from avatar.config import load_config
-from avatar.gaussians.embedding import knn_scales
+from avatar.gaussians.mesh_embedding import knn_scales
 from avatar.gaussians.uv import bound_texels, painted, uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.features import mouth_rim

@@ -21,7 +21,7 @@ from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.motion.expression_space import fit_expressions
 from avatar.motion.rest import find_mean
-from avatar.runs.avatar_file import read_portrait, write_portrait
+from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.trained import TrainedAvatar
 
 
@@ -100,8 +100,8 @@ def test_motion_statistics_are_of_the_training_frames(trained: TrainedAvatar) ->
 
 def test_a_file_with_its_head_needs_nothing_else(run: Path, trained: TrainedAvatar, tmp_path: Path) -> None:
     packed = tmp_path / "packed.safetensors"
-    portrait = read_portrait(run / "avatar.safetensors")
-    write_portrait(packed, portrait.__class__(**{**portrait.__dict__, "head": trained.assets}), "a licence")
+    content = read_avatar_file(run / "avatar.safetensors")
+    write_avatar_file(packed, content.__class__(**{**content.__dict__, "head": trained.assets}), "a licence")
     alone = avatar.load(packed)
     assert alone.assets.fingerprint == trained.assets.fingerprint
     assert torch.equal(alone.render(alone.rest_params()).image, trained.render(trained.rest_params()).image)

@@ -24,7 +24,7 @@ from avatar.errors import UserError
 from avatar.export.ply import encode_ply
 from avatar.export.web_file import encode_avatar
 from avatar.files.names import MAX_NAME_BYTES, safe_name, shortened
-from avatar.runs.avatar_file import AVATAR_FILE, read_portrait, write_portrait
+from avatar.runs.avatar_file import AVATAR_FILE, read_avatar_file, write_avatar_file
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
 from avatar.runs.trained import load_avatar
 
@@ -100,7 +100,7 @@ def test_no_command_takes_an_avatar_that_is_not_finite(words: str, run: Path, he
 
 def test_a_packed_head_and_a_checkpoint_that_are_not_finite_are_refused(run: Path, head: Path, tmp_path: Path) -> None:
     packed = tmp_path / "packed.safetensors"
-    write_portrait(packed, replace(read_portrait(run / AVATAR_FILE), head=load_avatar(run, head).assets))
+    write_avatar_file(packed, replace(read_avatar_file(run / AVATAR_FILE), head=load_avatar(run, head).assets))
     with safe_open(packed, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
         metadata = file.metadata()
@@ -163,7 +163,7 @@ def test_every_place_that_is_derived_from_an_avatars_name_is_here(
     kind: str, run: Path, head: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = changed(run, tmp_path / "a.safetensors", lambda header, _: header.update(name=HOSTILE_NAMES[kind]))
-    name = read_portrait(file).recording.name
+    name = read_avatar_file(file).recording.name
     assert is_name(name)  # of pictures and videos that the viewer saves, too
     monkeypatch.setattr(export, "open_trained", lambda *_: Namespace(name=name, source=file))
     monkeypatch.chdir(tmp_path)

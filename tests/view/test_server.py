@@ -22,12 +22,12 @@ from avatar.commands.view import address, checked_url
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.server import LARGEST, Viewer, padded
-from avatar.view.stage import Look, Setting
+from avatar.view.view_renderer import Look, Setting
 
 
 def shows(viewer: Viewer, setting: Setting) -> bool:
     shown = viewer.player.now()
-    expected = viewer.stage.draw((shown.params, shown.camera), setting, WIDTH)
+    expected = viewer.renderer.draw((shown.params, shown.camera), setting, WIDTH)
     return viewer.picture is not None and np.array_equal(viewer.picture, expected)
 
 
@@ -37,7 +37,7 @@ def page_of(viewer: Viewer) -> str:
 
 def test_what_is_set_is_drawn(viewer: Viewer) -> None:
     until(lambda: shows(viewer, Setting()))
-    setting = Setting(Look(3.0), {0: viewer.stage.controls[0].high}, {"jaw": 0.2}, "mesh")
+    setting = Setting(Look(3.0), {0: viewer.renderer.controls[0].high}, {"jaw": 0.2}, "mesh")
     viewer.change(**vars(setting))
     until(lambda: shows(viewer, setting))
     viewer.player.choose("train")
@@ -98,7 +98,7 @@ def test_what_is_sent_is_bounded_for_every_window(aspect: float) -> None:
 
 
 def test_the_panel_has_no_empty_folder(viewer: Viewer) -> None:
-    parts = {control.part for control in viewer.stage.controls}
+    parts = {control.part for control in viewer.renderer.controls}
     assert len(parts) > 1
     with Page(f"http://127.0.0.1:{viewer.port}/{TOKEN}/") as page:
         page.until(lambda: "Reset face" in page.controls)

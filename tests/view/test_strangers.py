@@ -24,7 +24,7 @@ from avatar.runs.trained import TrainedAvatar
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.server import Viewer
-from avatar.view.stage import Stage
+from avatar.view.view_renderer import ViewRenderer
 
 FRAME = b'{"expression": [0.5]}\n'
 
@@ -138,7 +138,7 @@ def test_another_user_of_this_machine_gets_nothing(command: Started) -> None:
 def open_stream(shown_avatar: TrainedAvatar) -> Iterator[tuple[Viewer, Receiver]]:
     receiver = Receiver(shown_avatar, 0)
     player = Player(shown_avatar, {}, time.monotonic, receiver.newest)
-    viewer = Viewer(Stage(shown_avatar), player, WIDTH, "127.0.0.1", 0, TOKEN, None, receiver.status)
+    viewer = Viewer(ViewRenderer(shown_avatar), player, WIDTH, "127.0.0.1", 0, TOKEN, None, receiver.status)
     yield viewer, receiver
     viewer.close()
     receiver.close()

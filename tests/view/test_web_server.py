@@ -23,7 +23,7 @@ from websockets.typing import Origin
 
 from avatar.view import rate_limited_log, web_server
 from avatar.view.server import LARGEST, Viewer
-from avatar.view.stage import Stage
+from avatar.view.view_renderer import ViewRenderer
 
 
 @pytest.fixture(autouse=True)
@@ -164,7 +164,7 @@ def test_a_picture_that_cannot_be_drawn_does_not_end_drawing(
     with Page(address(viewer)) as page:
         page.next_picture()
         with monkeypatch.context() as broken:
-            broken.setattr(Stage, "draw", lambda *_: 1 / 0)
+            broken.setattr(ViewRenderer, "draw", lambda *_: 1 / 0)
             page.set("jaw open", 0.2)
             until(lambda: any("ZeroDivisionError" in line for line in said))
         assert still_drawn(viewer, page)

@@ -2,7 +2,7 @@
 #include <cstdint>
 
 // From raw offsets and per-Gaussian parameters to what is splatted, and back, without Python: the formulas are those of
-// avatar/gaussians/compose.py.
+// avatar/gaussians/apply_offsets.py.
 namespace avatar::compose {
 
 // Of N Gaussians; arrays as in compose.py, `raw` [N, 10] before the tanh.

@@ -155,7 +155,7 @@ void Portrait::skin() {
     if (sizes_.has_rigidity) hold(own[kNeckJoint]);
 }
 
-// Brings the points to the skull by their shares, as avatar/gaussians/rigidity.py. `turn` is the neck's.
+// Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py. `turn` is the neck's.
 void Portrait::hold(const Rotation& turn) {
     bool carried[kJoints] = {};
     for (int joint = kNeckJoint; joint < kJoints; ++joint)

@@ -76,7 +76,7 @@ public:
     std::int32_t* cells() { return cells_.data(); }        // [G * 4] nodes around each Gaussian
     float* parameters() { return parameters_.data(); }     // of the next frame
     std::int32_t parents[kJoints] = {-1, 0, 1, 1, 1};
-    float facing[kFacing] = {}; // of the next frame: avatar/gaussians/facing.py
+    float facing[kFacing] = {}; // of the next frame: avatar/gaussians/head_rotation.py
     double blur = 0.3;          // pixels^2 added to a splat's variances
 
     // False when an index lies outside of what it points into.

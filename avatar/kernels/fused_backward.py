@@ -1,9 +1,10 @@
-"""The gradients of `place`: of the parameters in one launch, and of the network's values at the nodes in another."""
+"""The gradients of `fused_gaussians`: of the parameters in one launch, of the values at the nodes in another."""
 
 import triton
 import triton.language as tl
 
 from avatar.kernels.activations import normalized_backward, product, sigmoid, tanh, tanh_slope
+from avatar.kernels.fused import turned
 from avatar.kernels.hyper import (
     CONSTANTS,
     DIMENSION,
@@ -17,7 +18,6 @@ from avatar.kernels.hyper import (
     solve3_lower,
     solve4_lower,
 )
-from avatar.kernels.place import turned
 from avatar.kernels.rows import load3, load4, load10, store3, store4, store10
 
 
@@ -125,7 +125,7 @@ def heads_backward(
 
 
 @triton.jit(do_not_specialize=["count", "latents"])
-def place_backward(
+def fused_gaussians_backward(
     nodes,
     cells,
     weights,
@@ -148,18 +148,18 @@ def place_backward(
     out_quats,
     out_log_scales,
     out_logits,
-    out_rigidity_logits,
+    out_skull_logits,
     HAS_GRID: tl.constexpr,
     HAS_HYPER: tl.constexpr,
     HAS_SKULL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Write the gradients `out_...` of what `place` takes from those of what it gives.
+    """Write the gradients `out_...` of what `fused_gaussians` takes from those of what it gives.
 
-    raw float32 [N, 10] and, with HAS_SKULL, away [N, 3]: what `place` saved;  out_values [N, latents]: of each Gaussian's
-    own latent (without HAS_HYPER: of its offsets, [N, 10]), before `gather_nodes` brings them to the nodes. The gradient
-    of the means is that of the mesh's points, with HAS_SKULL of those and the skull's by their shares. In `out_packed`,
-    lanes that stand for no Gaussian are written too, with zeros.
+    raw float32 [N, 10] and, with HAS_SKULL, away [N, 3]: what `fused_gaussians` saved;  out_values [N, latents]: of each
+    Gaussian's own latent (without HAS_HYPER: of its offsets, [N, 10]), before `gather_nodes` brings them to the nodes.
+    The gradient of the means is that of the mesh's points, with HAS_SKULL of those and the skull's by their shares. In
+    `out_packed`, lanes that stand for no Gaussian are written too, with zeros.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -172,7 +172,7 @@ def place_backward(
         a_x, a_y, a_z = load3(away, i, here)
         share = sigmoid(tl.load(skull_logits + i, mask=here, other=0.0))
         by_share = by0 * a_x + by1 * a_y + by2 * a_z
-        tl.store(out_rigidity_logits + i, by_share * share * (1.0 - share), mask=here)
+        tl.store(out_skull_logits + i, by_share * share * (1.0 - share), mask=here)
     bw, bx, by, bz, inverse, is_long, tw, tx, ty, tz, turned_inverse, turned_is_long = turned(
         quats, i, t3, t4, t5, t6, here
     )

@@ -1,4 +1,4 @@
-"""Composing of Gaussians on the CPU by the compiled kernel, as an autograd function."""
+"""Offsets applied to the Gaussians on the CPU by the compiled kernel, as an autograd function."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from avatar.types import Gaussians
 _COMPOSED = Gaussians._fields[:4]  # all but sh
 
 
-def compose_cpu(
+def apply_offsets_cpu(
     points: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
     log_scales: Float[Tensor, "N 3"],
     opacity_logits: Float[Tensor, " N"],
     raw: Float[Tensor, "N 10"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Means, quats, scales and opacities of `avatar.gaussians.compose.compose_raw` for float32 tensors on the CPU.
+    """Means, quats, scales and opacities of `apply_offsets` for float32 tensors on the CPU.
 
     No Gaussian's result depends on another's: the bits are the same for any number of threads.
     """
-    return _Compose.apply(points, quats, log_scales, opacity_logits, raw)  # pyright: ignore
+    return _ApplyOffsets.apply(points, quats, log_scales, opacity_logits, raw)  # pyright: ignore
 
 
 class _Gradients(NamedTuple):
@@ -37,7 +37,7 @@ class _Gradients(NamedTuple):
     raw: Tensor
 
 
-class _Compose(torch.autograd.Function):
+class _ApplyOffsets(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *parameters: Tensor) -> tuple[Tensor, ...]:
         points, quats, log_scales, opacity_logits, raw = (tensor.detach().contiguous() for tensor in parameters)

@@ -11,10 +11,10 @@ from heads import grid_head, random_params
 from interpreter import DEVICE, error, the_cpus_way
 from torch import Tensor
 
-from avatar.gaussians.compose import compose_raw
-from avatar.gaussians.embedding import Embedding
+from avatar.gaussians.apply_offsets import apply_offsets
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import latent_grid
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.skull_binding import Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel
@@ -73,10 +73,10 @@ class Scene:
                 values = torch.func.functional_call(self.heads, {"packed": packed}, (values,))
             skull_binding = None if logits is None else SkullBinding(self.skull, neck, logits)
             points = bind_to_skull(self.embedding.points(vertices), skull_binding)
-            return compose_raw(points, *base, self.sh, values)
+            return apply_offsets(points, *base, self.sh, values)
 
     def found(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
-        from avatar.gaussians.compose_gpu import compose_gpu
+        from avatar.gaussians.fused_gpu import fused_gaussians_gpu
 
         self.embedding.move(DEVICE)
         if self.grid is not None:
@@ -84,7 +84,7 @@ class Scene:
         *base, neck, logits = rest
         skull = Skull(self.skull.at_rest.to(DEVICE), self.skull.arms.to(DEVICE))
         skull_binding = None if logits is None else SkullBinding(skull, neck, logits)
-        return compose_gpu(
+        return fused_gaussians_gpu(
             vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, skull_binding
         )
 

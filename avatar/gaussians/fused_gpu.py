@@ -13,8 +13,8 @@ from avatar.compute.device import to_device
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
 from avatar.gaussians.skull_binding import SkullBinding
 from avatar.head.model import matrix_from_6d
-from avatar.kernels.place import place
-from avatar.kernels.place_backward import gather_nodes, place_backward
+from avatar.kernels.fused import fused_gaussians
+from avatar.kernels.fused_backward import fused_gaussians_backward, gather_nodes
 from avatar.kernels.start import start
 from avatar.tensors import check_shapes
 from avatar.types import Gaussians
@@ -33,7 +33,7 @@ class Mesh(Protocol):
     def touching(self, num_vertices: int) -> Touching: ...
 
 
-def compose_gpu(
+def fused_gaussians_gpu(
     vertices: Float[Tensor, "V 3"],
     values: Float[Tensor, "M n"],
     packed: Float[Tensor, "blocks rows 16"] | None,
@@ -45,9 +45,9 @@ def compose_gpu(
     grid: Interpolation | None,
     skull_binding: SkullBinding | None = None,
 ) -> Gaussians:
-    """`compose_raw` of the embedding's points and of the network's `values`, in one launch. Float32 tensors on one GPU.
+    """`apply_offsets` of the embedding's points and of the network's `values`, in one launch. Float32 tensors on one GPU.
 
-    hold  what brings the points to the skull (`bind_to_skull`), if anything does
+    skull_binding  what brings the points to the skull (`bind_to_skull`), if anything does
     The values are brought from the grid's nodes to the Gaussians if there is a grid, and through the HyperGaussians
     `packed` if there are any.
 
@@ -70,12 +70,12 @@ def compose_gpu(
         check_shapes(quats=(quats, "N 4"), at_rest=(skull.at_rest, "N 3"), arms=(skull.arms, "N 3"))
         check_shapes(quats=(quats, "N 4"), neck=(neck, "6"), skull_logits=(logits, "N"))
     given = (vertices, neck, logits, values, packed, quats, log_scales, opacity_logits)
-    placed: Any = _Place.apply(*given, embedding, grid, skull)
+    placed: Any = _Fused.apply(*given, embedding, grid, skull)
     means, turned, scales, opacities = placed
     return Gaussians(means, turned, scales, opacities, sh)
 
 
-class _Place(torch.autograd.Function):
+class _Fused(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *given, embedding, grid, skull = arguments
@@ -88,7 +88,7 @@ class _Place(torch.autograd.Function):
         placed = [torch.empty_like(t) for t in (log_scales, quats, log_scales, opacity_logits)]
         cells, weights = (values, values) if grid is None else grid.corners
         start(
-            place,
+            fused_gaussians,
             -(-N // LANES),
             vertices,
             embedding.corners,
@@ -133,7 +133,7 @@ class _Place(torch.autograd.Function):
         gradients = [torch.empty_like(t) for t in like]
         cells, weights = (values, values) if grid is None else grid.corners
         start(
-            place_backward,
+            fused_gaussians_backward,
             -(-N // LANES),
             values,
             cells,

@@ -1,7 +1,7 @@
 """From the mesh and the network's values to Gaussians, in one launch, one lane for each Gaussian.
 
-What `Embedding.points`, `held`, `Interpolation`, `HyperHeads` and `compose_raw` do one after the other; they are the
-definition.
+What `Embedding.points`, `bind_to_skull`, `Interpolation`, `HyperHeads` and `apply_offsets` do one after the other; they
+are the definition.
 """
 
 import triton
@@ -81,7 +81,7 @@ def turned(quats, i, r0, r1, r2, r3, mask):
 
 
 @triton.jit(do_not_specialize=["count", "latents"])
-def place(
+def fused_gaussians(
     vertices,
     corners,
     barycentric,

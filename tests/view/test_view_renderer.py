@@ -16,7 +16,7 @@ from avatar.runs.clips import own_clip
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.live import Live
 from avatar.view.player import NEUTRAL, STREAM, Player
-from avatar.view.stage import MARGIN, Look, Setting, Stage, to_bytes
+from avatar.view.view_renderer import MARGIN, Look, Setting, ViewRenderer, to_bytes
 
 WIDTH = 64
 
@@ -27,11 +27,11 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 
 @pytest.fixture(scope="module")
-def stage(trained: TrainedAvatar) -> Stage:
-    return Stage(trained, lambda index, width: torch.full((width, width, 3), index / 100))
+def stage(trained: TrainedAvatar) -> ViewRenderer:
+    return ViewRenderer(trained, lambda index, width: torch.full((width, width, 3), index / 100))
 
 
-def test_a_frame_is_drawn_as_the_program_draws_it(stage: Stage, trained: TrainedAvatar) -> None:
+def test_a_frame_is_drawn_as_the_program_draws_it(stage: ViewRenderer, trained: TrainedAvatar) -> None:
     params, camera = trained.recording.params(5), trained.recording.camera(5, 48)
     look = Look(stage.limits.yaw[1], stage.limits.pitch[0], 1.5)
     drawn = stage.draw((params, camera), Setting(look), WIDTH, 5)
@@ -40,7 +40,7 @@ def test_a_frame_is_drawn_as_the_program_draws_it(stage: Stage, trained: Trained
     assert not np.array_equal(drawn, stage.draw((params, camera), Setting(), WIDTH))
 
 
-def test_controls_add_and_joints_replace(stage: Stage, trained: TrainedAvatar) -> None:
+def test_controls_add_and_joints_replace(stage: ViewRenderer, trained: TrainedAvatar) -> None:
     frame = trained.recording.params(9)
     moved = stage.params(frame, Setting(expressions={0: 0.5, 1: -0.25}, joints={"jaw": 0.2, "left_lid": 0.7}))
     expected = frame.expression + 0.5 * stage.controls[0].direction - 0.25 * stage.controls[1].direction
@@ -51,13 +51,13 @@ def test_controls_add_and_joints_replace(stage: Stage, trained: TrainedAvatar) -
     assert stage.params(frame, Setting(joints={"jaw": 0.0})).jaw.equal(frame.jaw)
 
 
-def test_the_camera_stays_where_the_avatar_is_known(stage: Stage) -> None:
+def test_the_camera_stays_where_the_avatar_is_known(stage: ViewRenderer) -> None:
     kept, is_supported = stage.within(Look(500.0, -500.0, 100.0))
     assert kept == Look(stage.limits.yaw[1] + MARGIN, stage.limits.pitch[0] - MARGIN, 4.0) and not is_supported
     assert stage.within(Look()) == (Look(), True)
 
 
-def test_overlays(stage: Stage, trained: TrainedAvatar) -> None:
+def test_overlays(stage: ViewRenderer, trained: TrainedAvatar) -> None:
     frame = trained.recording.params(5), trained.recording.camera(5, WIDTH)
     plain = stage.draw(frame, Setting(), WIDTH, 5)
     mesh = stage.draw(frame, Setting(overlay="mesh"), WIDTH, 5)
@@ -73,12 +73,12 @@ def test_overlays(stage: Stage, trained: TrainedAvatar) -> None:
     )
 
 
-def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, stage: Stage) -> None:
+def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, stage: ViewRenderer) -> None:
     assert stage.overlays == ("none", "mesh", "error")
-    assert Stage(trained).overlays == ("none", "mesh")
+    assert ViewRenderer(trained).overlays == ("none", "mesh")
 
 
-def test_the_distance_is_that_of_the_motion_statistics(stage: Stage, trained: TrainedAvatar) -> None:
+def test_the_distance_is_that_of_the_motion_statistics(stage: ViewRenderer, trained: TrainedAvatar) -> None:
     rest = trained.rest_params()
     far = replace(rest, expression=rest.expression + 20)
     own = trained.statistics.expressions.distances([trained.recording.params(3)])

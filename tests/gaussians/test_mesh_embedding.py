@@ -6,7 +6,7 @@ import torch
 from heads import grid_head, random_params
 
 from avatar.errors import UserError
-from avatar.gaussians.embedding import Embedding, knn_scales
+from avatar.gaussians.mesh_embedding import Embedding, knn_scales
 from avatar.gaussians.uv import detailed_faces, painted, uv_texels
 from avatar.head.model import HeadModel
 

@@ -17,7 +17,7 @@ from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.controls import ExpressionControl, expression_controls, joint_ranges, posed
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.runs.trained import TrainedAvatar
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat import checked_drawings
 from avatar.types import Camera, HeadParams, Rendering
 
 Overlay = Literal["none", "mesh", "error"]
@@ -49,7 +49,7 @@ class Setting:
     with_truth: bool = False
 
 
-class Stage:
+class ViewRenderer:
     """An avatar with its controls, their ranges and the pictures that it was trained on, if they are there."""
 
     def __init__(
