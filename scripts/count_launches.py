@@ -116,7 +116,7 @@ class Rehearsal:
         box = slice(size // 8, size), slice(size // 4, 3 * size // 4)
         self.frame = Frame(0, "rehearsed", self.camera, self.params, *planes, head_box=box)
         self.steps = StepRunner(self.state(PerceptualTerm("none")))
-        self.steps.pose([self.frame])
+        self.steps.vertices(self.frame)
         self.lpips = Lpips("squeeze").on(device)
 
     def step(self, perceptual: PerceptualTerm, late: bool) -> Counter[str]:

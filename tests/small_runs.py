@@ -13,7 +13,6 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
-from avatar.pipeline.open import split_sizes
 from avatar.runs.checkpoint import Checkpoint
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import start_run
@@ -37,7 +36,7 @@ def small_config(*overrides: str) -> Config:
 
 def open_small(folder: Path, config: Config) -> tuple[Source, Subject, HeadAssets]:
     source = Source(folder, folder / "head_model", frame_offset=1)
-    subject, assets = open_subject(source, split_sizes(config), lambda _: None)
+    subject, assets = open_subject(source, config.data.test_frames, lambda _: None)
     return source, subject, assets
 
 

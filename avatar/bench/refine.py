@@ -30,7 +30,6 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
-from avatar.pipeline.open import split_sizes
 from avatar.pipeline.refine_plan import WITH_REFINEMENT, round_steps
 from avatar.pose_refinement.motion import EXPRESSION, values_of
 from avatar.pose_refinement.refine import refine_subject
@@ -91,7 +90,7 @@ def run(request: Request) -> None:
 
 def measure(source: Source, config: Config, out: Path) -> list[Row]:
     """Train and refine; what is written on the way lies in a temporary folder."""
-    subject, assets = open_subject(source, split_sizes(config), print)
+    subject, assets = open_subject(source, config.data.test_frames, print)
     network, note = find_lpips("squeeze")
     print(f"LPIPS: {note}")
     rows: list[Row] = []

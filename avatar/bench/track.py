@@ -33,7 +33,6 @@ from avatar.errors import UserError
 from avatar.evaluation.lpips_networks import find_lpips
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
-from avatar.pipeline.open import split_sizes
 from avatar.pipeline.refine_plan import WITH_REFINEMENT
 from avatar.pipeline.track import bar
 from avatar.train.order import planned_steps
@@ -126,7 +125,7 @@ def film(seed: int, scale: Scale, config: Config, folder: Path) -> Filmed:
     """A demo person, written to `folder`."""
     make_subject(folder, scale.frames, scale.filmed, seed)
     head = folder / "head_model"
-    truth, assets = open_subject(Source(folder, head, frame_offset=1), split_sizes(config))
+    truth, assets = open_subject(Source(folder, head, frame_offset=1), config.data.test_frames)
     frames = (truth.pixels(index) for index in range(len(truth)))
     shown = in_room(((pixels.image, pixels.alpha) for pixels in frames), scale.filmed, seed)
     return Filmed(truth, assets, head, shown)
@@ -136,7 +135,7 @@ def as_filmed(folder: Path, request: Request, config: Config) -> Filmed:
     """A tracked folder. Raises UserError where its frames have an odd size, which a video's cannot be."""
     head = find_head(folder, request.head)
     source = Source(folder, head, request.tracking, request.frame_offset)
-    truth, assets = open_subject(source, split_sizes(config))
+    truth, assets = open_subject(source, config.data.test_frames)
     if truth.width % 2 or truth.height % 2:
         raise UserError(f"{folder} has frames of {truth.width}x{truth.height} pixels; a video's are even both ways")
     return Filmed(truth, assets, head, (truth.pixels(index).image for index in range(len(truth))))
@@ -152,7 +151,7 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
     # The whole picture: it is then the true one's, pixel for pixel.
     info = track(video, tracked, filmed.head, filmed.assets, Choices(crop="none"), progress=bar)
     seconds = time.perf_counter() - begin
-    own, _ = open_subject(Source(tracked, filmed.head), split_sizes(config), assets=filmed.assets)
+    own, _ = open_subject(Source(tracked, filmed.head), config.data.test_frames, assets=filmed.assets)
     return compare(filmed, info, seconds, own, config, tracked, scratch)
 
 

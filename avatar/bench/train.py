@@ -23,7 +23,6 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.model import FlashAvatar
-from avatar.pipeline.open import split_sizes
 from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
@@ -77,7 +76,7 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
     """Time both recipes in turns on the same frames. Raises UserError as `avatar train` does."""
     folder, overrides = request.inputs[0], [*(QUICK if request.quick else ()), *request.overrides]
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
-    subject, assets = open_subject(source, split_sizes(load_config(overrides)), say)
+    subject, assets = open_subject(source, load_config(overrides).data.test_frames, say)
     learners = {}
     for recipe, own in RECIPES.items():
         config = load_config([*own, *overrides])
@@ -128,7 +127,8 @@ def make_learner(
     state = TrainState(avatar, optimizer, objective, corrections)
     judge = Guard(optimizer, device).judge if is_gpu else None
     steps = StepRunner(state, say=say)
-    steps.pose(frames)
+    for frame in frames:
+        steps.vertices(frame)
     return Learner(config, state, cycle(frames), steps, judge)
 
 

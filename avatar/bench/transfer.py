@@ -38,7 +38,6 @@ from avatar.head.model import HeadModel
 from avatar.losses.metrics import psnr
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
-from avatar.pipeline.open import split_sizes
 from avatar.pipeline.refine_plan import WITH_REFINEMENT
 from avatar.render import Renderer
 from avatar.types import Camera, HeadParams
@@ -114,7 +113,7 @@ def measure(
         make_subject(target_folder, scale.target_frames, scale.size, TARGET_SEED, neutral_bias=NEUTRAL_BIAS)
         make_subject(driver_folder, scale.driver_frames, scale.size, DRIVER_SEED, neutral_bias=NEUTRAL_BIAS)
         target, assets = open_subject(
-            Source(target_folder, target_folder / "head_model", frame_offset=1), split_sizes(config)
+            Source(target_folder, target_folder / "head_model", frame_offset=1), config.data.test_frames
         )
         driver, _ = open_subject(Source(driver_folder, target_folder / "head_model", frame_offset=1), assets=assets)
         driver_head = HeadModel(assets, driver.identity)

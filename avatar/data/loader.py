@@ -12,38 +12,24 @@ from avatar.data.subject import FramePixels, Subject
 from avatar.types import Frame
 
 CACHE_BYTES = 2**30  # for decoded frames; what does not fit is decoded again
-WORKERS = 1  # threads that decode frames ahead of the training step
 BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
-FRAMES_AHEAD = 3  # of every worker
+FRAMES_AHEAD = 3  # decoded ahead of the training step, in one thread
 
 
 class FrameLoader:
-    """Decoded frames of a subject. Keeps the most recently used ones as uint8, at most `cache_bytes` of them.
+    """Decoded frames of a subject. Keeps the most recently used ones as uint8, at most CACHE_BYTES of them.
 
-    Use it as a context manager, or call `close`; the frames do not depend on the cache or on the number of workers. With a
-    `frame_cache` they are on its GPU, and what it holds is decoded once.
+    Use it as a context manager, or call `close`; the frames do not depend on the cache. With a `frame_cache` they are on
+    its GPU, and what it holds is decoded once.
     """
 
-    def __init__(
-        self,
-        subject: Subject,
-        size: int | None = None,
-        cache_bytes: int = CACHE_BYTES,
-        workers: int = WORKERS,
-        frame_cache: GpuFrameCache | None = None,
-    ) -> None:
-        if workers < 1:
-            raise ValueError(f"workers must be at least 1, got {workers}")
-        if cache_bytes < 0:
-            raise ValueError(f"cache_bytes must not be negative, got {cache_bytes}")
+    def __init__(self, subject: Subject, size: int | None = None, frame_cache: GpuFrameCache | None = None) -> None:
         self.subject = subject
         self.size = size
-        self.cache_bytes = cache_bytes
         self.cached_bytes = 0
         self._frame_cache = frame_cache
         self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
-        self._ahead = workers * FRAMES_AHEAD
-        self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="frames")
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
         self._closed = False
 
     def __enter__(self) -> FrameLoader:
@@ -55,15 +41,11 @@ class FrameLoader:
         self.close()
 
     def close(self) -> None:
-        """Stop the background threads and forget the cache; running decodes finish first."""
+        """Stop the background thread and forget the cache; a running decode finishes first."""
         self._closed = True
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._cache.clear()
         self.cached_bytes = 0
-
-    def frame(self, index: int) -> Frame:
-        """One frame, decoded now if the cache does not hold it."""
-        return next(self.frames((index,)))
 
     def frames(self, indices: Iterable[int]) -> Generator[Frame, None, None]:
         """The frames of `indices`, which may be endless, in that order; a few of them are decoded ahead.
@@ -77,7 +59,7 @@ class FrameLoader:
         pending: dict[int, Future[FramePixels]] = {}
         try:
             while True:
-                while len(queue) < self._ahead:
+                while len(queue) < FRAMES_AHEAD:
                     index = next(order, None)
                     if index is None:
                         break
@@ -118,10 +100,10 @@ class FrameLoader:
         return pixels
 
     def _remember(self, index: int, pixels: FramePixels) -> None:
-        if pixels.nbytes > self.cache_bytes:
+        if pixels.nbytes > CACHE_BYTES:
             return
         self._cache[index] = pixels
         self.cached_bytes += pixels.nbytes
-        while self.cached_bytes > self.cache_bytes:
+        while self.cached_bytes > CACHE_BYTES:
             _, oldest = self._cache.popitem(last=False)
             self.cached_bytes -= oldest.nbytes

@@ -18,34 +18,23 @@ class Split(NamedTuple):
     test: tuple[int, ...]
 
 
-class SplitSizes(NamedTuple):
-    """What the user asks for; None means the rule of `split_frames`."""
-
-    train: int | None = None
-    test: int | None = None
-
-
-DEFAULT_SIZES = SplitSizes()
-
-
 def check_divided(split: Split) -> None:
     """Raises UserError, as `split_frames` does, for a subject of a single frame, which is enough to drive an avatar."""
     if not split.test:
         split_frames(len(split.train))
 
 
-def split_frames(count: int, sizes: SplitSizes = DEFAULT_SIZES) -> Split:
-    """The last frames test, those right before them train.
+def split_frames(count: int, test_frames: int | None = None) -> Split:
+    """The last frames test, as many as `test_frames` says if it is given; those right before them train.
 
     With 2,500 frames or more: the last 500 test, up to 2,000 before them train (FlashAvatar, HyperGaussians). Shorter
     clips: the first 80% train, the rest test. Raises UserError when either part would be empty.
     """
     if count < 2:
         raise UserError(f"the subject has {count} usable frame(s); at least 2 are needed, one to train and one to test")
-    wanted_train, wanted_test = sizes
     is_long = count >= TEST_FRAMES + TRAIN_FRAMES
-    if wanted_test is not None:
-        test = wanted_test
+    if test_frames is not None:
+        test = test_frames
     elif is_long:
         test = TEST_FRAMES
     else:
@@ -53,12 +42,7 @@ def split_frames(count: int, sizes: SplitSizes = DEFAULT_SIZES) -> Split:
     if not 1 <= test < count:
         raise UserError(f"{test} test frames cannot be held out of {count}: choose from 1 to {count - 1}")
     available = count - test
-    rule = min(available, TRAIN_FRAMES) if is_long else available
-    train = rule if wanted_train is None else wanted_train
-    if not 1 <= train <= available:
-        raise UserError(
-            f"{train} training frames cannot be taken from {count} with {test} held out: choose from 1 to {available}"
-        )
+    train = min(available, TRAIN_FRAMES) if is_long else available
     return Split(tuple(range(available - train, available)), tuple(range(available, count)))
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import painted, uv_texels
-from avatar.head.rasterize import rasterize_mesh
+from avatar.head.rasterize import rasterize_mesh, sample_image
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.sh import C0
@@ -40,7 +40,9 @@ def bake_texture(trained: TrainedAvatar, params: HeadParams, size: int) -> UInt8
             camera = orbited(front, yaw, pitch)
             rendering = trained.render(params, camera)
             own = rendering.image - (1 - rendering.alpha[..., None]) * trained.background
-            found = _sampled(torch.cat((own, rendering.alpha[..., None]), dim=2), camera.project(points))
+            found = sample_image(
+                torch.cat((own, rendering.alpha[..., None]), dim=2), camera.project(points), "bilinear"
+            )
             weight = ASIDE ** max(abs(yaw), abs(pitch)) * (found[:, 3] > SOLID)
             weight = weight * _seen(trained, vertices, points, normals, camera)
             colours += weight[:, None] * found[:, :3] / found[:, 3:].clamp(min=SOLID)
@@ -74,14 +76,6 @@ def _seen(
     facing = (torch.nn.functional.normalize(eye - points, dim=1) * normals).sum(dim=1)
     visible = inside & (nearest > 0) & (depth < nearest + BEHIND) & (facing > 0.05)
     return visible * facing.clamp(min=0) ** SHARPNESS
-
-
-def _sampled(picture: Float[Tensor, "H W C"], places: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
-    """The picture between its pixels."""
-    height, width = picture.shape[:2]
-    grid = torch.stack((2 * places[:, 0] / width - 1, 2 * places[:, 1] / height - 1), dim=1)[None, :, None]
-    found = torch.nn.functional.grid_sample(picture.permute(2, 0, 1)[None], grid, align_corners=False)
-    return found[0, :, :, 0].T
 
 
 def _normals(vertices: Float[Tensor, "V 3"], faces: Tensor) -> Float[Tensor, "F 3"]:

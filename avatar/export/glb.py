@@ -16,7 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from avatar.export.bake import bake_texture
-from avatar.motion.controls import expression_controls, joint_ranges, posed
+from avatar.motion.controls import JOINT_FIELD, expression_controls, joint_ranges, posed
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
 
@@ -88,7 +88,6 @@ def shapes(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tensor
         moved[name] = replace(params, expression=params.expression + far * control.direction)
     for joint, (low, high) in joint_ranges(trained.recording.motion(train)).items():
         turned = posed(rest, None, {joint: max(low, high, key=abs)})
-        part = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "nod": "neck", "turn": "neck"}
-        field = part.get(joint, "eyes")
+        field = JOINT_FIELD.get(joint, "eyes")
         moved[joint.replace("_", " ")] = replace(params, **{field: getattr(turned, field)})
     return {name: head.vertices(pose) for name, pose in moved.items()}

@@ -17,7 +17,6 @@ from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
 
 CameraPath = Literal["recorded", "still", "turntable", "orbit"]
-PATHS: tuple[CameraPath, ...] = ("recorded", "still", "turntable", "orbit")
 PERIOD = 6.0  # seconds of one round
 
 

@@ -54,7 +54,6 @@ MAX_MOTION = 1500  # frames: a minute at 25 a second
 @dataclass(frozen=True)
 class WebFile:
     data: bytes  # gzip
-    raw_bytes: int
     drawing: WebArrays
 
 
@@ -94,7 +93,7 @@ def encode_avatar(trained: TrainedAvatar, precision: Precision = "small") -> Web
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     raw = b"".join((FORMAT.encode(), len(text).to_bytes(4, "little"), text, *blocks))
-    return WebFile(gzip.compress(raw, 9, mtime=0), len(raw), drawing)
+    return WebFile(gzip.compress(raw, 9, mtime=0), drawing)
 
 
 def quantised(values: np.ndarray, kind: str, column: str) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
@@ -11,11 +12,6 @@ from pathlib import Path
 
 from avatar.errors import UserError
 from avatar.files.opening import read_json
-
-try:
-    import fcntl
-except ImportError:  # not on Windows: there the file itself cannot be deleted while it is open, and that is the lock
-    fcntl = None
 
 LOCK_FILE = ".lock"
 
@@ -52,23 +48,15 @@ def locked(folder: Path, otherwise: str = "choose another --out") -> Iterator[No
 def _acquire(path: Path) -> int:
     """Raises BlockingIOError where another process holds it."""
     while True:
-        if fcntl is None:
-            with suppress(OSError):
-                path.unlink()
-            try:
-                file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
-            except FileExistsError:
-                raise BlockingIOError from None
-        else:
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)  # a link may name any file
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                os.close(file)
-                raise
-            if not _is_same(file, path):  # its holder deleted it between our opening and locking it
-                os.close(file)
-                continue
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)  # a link may name any file
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            raise
+        if not _is_same(file, path):  # its holder deleted it between our opening and locking it
+            os.close(file)
+            continue
         os.truncate(file, 0)
         os.write(file, json.dumps({"process": os.getpid(), "machine": platform.node()}, allow_nan=False).encode())
         return file

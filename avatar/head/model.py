@@ -35,6 +35,13 @@ def matrix_from_6d(rotation: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
     return torch.stack((first, second, torch.linalg.cross(first, second)), dim=-2)
 
 
+def nearest_rotation(matrices: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
+    """The rotation nearest to each matrix, by singular value decomposition: of a mean of rotations, their chordal mean."""
+    U, _, Vh = torch.linalg.svd(matrices)
+    U = torch.cat((U[..., :2], U[..., 2:] * torch.det(U @ Vh)[..., None, None]), dim=-1)
+    return U @ Vh
+
+
 class PoseTensors(NamedTuple):
     """What posing one identity takes, float32 and contiguous, for the kernels of `avatar.kernels.pose`."""
 

@@ -19,6 +19,7 @@ from avatar.types import HeadParams
 COMPONENTS = 12  # of head models whose coefficients have no names
 EDGE = 1.0  # percent of the training frames beyond either end of a range
 LEAST_RANGE = 0.02  # radians, or share of a closed lid: what has moved less, training has not shown
+JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "nod": "neck", "turn": "neck"}  # else eyes
 PARTS = (
     ("Mouth", r"mouth|lip|smile|tongue|pucker|funnel|frown"),
     ("Jaw", r"jaw|chin"),

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from avatar.data.subject import Subject
-from avatar.head.model import matrix_from_6d
+from avatar.head.model import matrix_from_6d, nearest_rotation
 from avatar.types import Camera, HeadParams
 
 Whose = Literal["driver", "target"]
@@ -56,7 +56,9 @@ def smoothed(drive: Drive, sigma: float) -> Drive:
         return drive
     expression = _filtered(torch.stack([p.expression for p in drive.params]), sigma)
     jaw, neck = (
-        _filtered_rotations(matrix_from_6d(torch.stack([getattr(p, joint) for p in drive.params])), sigma)[:, :2]
+        nearest_rotation(_filtered(matrix_from_6d(torch.stack([getattr(p, joint) for p in drive.params])), sigma))[
+            :, :2
+        ]
         for joint in ("jaw", "neck")
     )
     params = [
@@ -65,7 +67,7 @@ def smoothed(drive: Drive, sigma: float) -> Drive:
     ]
     cameras = drive.cameras
     if cameras is not None:
-        rotations = _filtered_rotations(torch.stack([c.R_cam_world for c in cameras]), sigma)
+        rotations = nearest_rotation(_filtered(torch.stack([c.R_cam_world for c in cameras]), sigma))
         shifts = _filtered(torch.stack([c.t_cam_world for c in cameras]), sigma)
         cameras = [replace(c, R_cam_world=R, t_cam_world=t) for c, R, t in zip(cameras, rotations, shifts, strict=True)]
     return replace(drive, params=params, cameras=cameras)
@@ -74,13 +76,6 @@ def smoothed(drive: Drive, sigma: float) -> Drive:
 def _filtered(values: Float[Tensor, "T ..."], sigma: float) -> Float[Tensor, "T ..."]:
     filtered = gaussian_filter1d(values.double().numpy(), sigma, axis=0, mode="nearest", truncate=SMOOTHING_REACH)
     return torch.from_numpy(np.ascontiguousarray(filtered)).to(values)
-
-
-def _filtered_rotations(rotations: Float[Tensor, "T 3 3"], sigma: float) -> Float[Tensor, "T 3 3"]:
-    """The rotations nearest to the mean matrices (chordal means)."""
-    U, _, Vh = torch.linalg.svd(_filtered(rotations, sigma))
-    U = torch.cat((U[..., :2], U[..., 2:] * torch.det(U @ Vh)[..., None, None]), dim=-1)
-    return U @ Vh
 
 
 def choose_cameras(drive: Drive, own: Camera, whose: Whose, intrinsics: Whose) -> list[Camera]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.head.lips import lip_gap, lip_pairs
-from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.head.model import HeadModel, matrix_from_6d, nearest_rotation
 from avatar.types import HeadParams
 
 CALM_SHARE = 0.2  # of the frames with closed lips, those whose face is nearest to the generic neutral
@@ -51,7 +51,7 @@ def find_neutral(motion: Sequence[HeadParams], head: HeadModel) -> RestPose:
     distances, neighbours = torch.cdist(features, features).topk(k, dim=1, largest=False)
     densest = int(distances.mean(dim=1).argmin())
     chosen = calm[neighbours[densest]]
-    return RestPose(expression[chosen].mean(dim=0), _mean_rotation(jaw[chosen]), int(calm[densest]))
+    return RestPose(expression[chosen].mean(dim=0), nearest_rotation(jaw[chosen].mean(dim=0)), int(calm[densest]))
 
 
 def closed_frames(gap: Float[Tensor, " N"]) -> Int[Tensor, " M"]:
@@ -112,7 +112,7 @@ def _departures(
 def find_mean(motion: Sequence[HeadParams]) -> RestPose:
     """The mean over all frames."""
     expression, jaw = stacked(motion)
-    return RestPose(expression.mean(dim=0), _mean_rotation(jaw), None)
+    return RestPose(expression.mean(dim=0), nearest_rotation(jaw.mean(dim=0)), None)
 
 
 def stacked(motion: Sequence[HeadParams]) -> tuple[Float[Tensor, "N E"], Float[Tensor, "N 3 3"]]:
@@ -121,10 +121,3 @@ def stacked(motion: Sequence[HeadParams]) -> tuple[Float[Tensor, "N E"], Float[T
         torch.stack([params.expression for params in motion]),
         matrix_from_6d(torch.stack([params.jaw for params in motion])),
     )
-
-
-def _mean_rotation(rotations: Float[Tensor, "N 3 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation nearest to the mean matrix (chordal mean, by singular value decomposition)."""
-    U, _, Vh = torch.linalg.svd(rotations.mean(dim=0))
-    U = torch.cat((U[:, :2], U[:, 2:] * torch.det(U @ Vh)), dim=1)
-    return U @ Vh

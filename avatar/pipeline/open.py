@@ -8,9 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from avatar.config import Config
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.motion.drive import Drive
@@ -37,10 +35,6 @@ def source_of(arguments: Namespace) -> Source:
     )
 
 
-def split_sizes(config: Config) -> SplitSizes:
-    return SplitSizes(test=config.data.test_frames)
-
-
 def open_run(
     path: Path, head: Path | None = None, folder: Path | None = None, say: Callable[[str], None] = print
 ) -> Run:
@@ -48,7 +42,7 @@ def open_run(
     info = read_run_info(path)
     source = moved_source(path, info, head, folder)
     trained = load_avatar(path, head, recorded_head=source.head)
-    subject, _ = open_subject(source, split_sizes(trained.config), say, trained.assets)
+    subject, _ = open_subject(source, trained.config.data.test_frames, say, trained.assets)
     check_data(path, info, subject)
     return Run(path, trained, subject)
 

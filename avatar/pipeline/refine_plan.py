@@ -17,7 +17,6 @@ from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import read_json
-from avatar.pipeline.open import split_sizes
 from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.train.cost_estimate import measure_cost
@@ -152,7 +151,7 @@ def steps_in_time(
     Raises UserError where they allow too few.
     """
     config = load_config([*WITH_REFINEMENT, *overrides])
-    subject, assets = open_subject(source, split_sizes(config), print)
+    subject, assets = open_subject(source, config.data.test_frames, print)
     frames = len(subject.split.train)
     asked = within_passes(config.trainer, frames).iterations
     if minutes is None:

@@ -19,7 +19,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.open import check_data, moved_source, split_sizes
+from avatar.pipeline.open import check_data, moved_source
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.memory_estimate import training_needs
@@ -40,7 +40,7 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
     with locked(run):
         refuse_trained(run)
         chosen = choose_device(device or config.device, print)
-        subject, assets = open_subject(source, split_sizes(config))
+        subject, assets = open_subject(source, config.data.test_frames)
         check_divided(subject.split)
         config = on_subject(config, subject)
         size = subject.image_size(config.data.size)
@@ -63,7 +63,7 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, 
     with locked(run):
         info, checkpoint = read_run_info(run), newest_checkpoint(run)
         source = moved_source(run, info, head, folder)
-        subject, assets = open_subject(source, split_sizes(info.config))
+        subject, assets = open_subject(source, info.config.data.test_frames)
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
         return go_on(run, info, checkpoint, subject, assets, device)

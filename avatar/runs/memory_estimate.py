@@ -9,7 +9,7 @@ import math
 
 from avatar.compute.memory import Need
 from avatar.config import Config, ModelConfig
-from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES, FRAMES_AHEAD, WORKERS
+from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES, FRAMES_AHEAD
 from avatar.errors import UserError
 from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.uv import bound_texels
@@ -57,7 +57,7 @@ def training_needs(
     gaussians = count_gaussians(model, assets)
     shapes = MODELS[model.name].shapes(model, assets.num_expressions, gaussians)
     cached = min(CACHE_BYTES, frames * pixels * BYTES_PER_PIXEL)
-    ahead = WORKERS * FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
+    ahead = FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
     lasting = [
         Need("the cache of decoded frames", cached, "--size"),
         Need("a frame and its losses", ahead + pixels * PIXEL_BYTES.get(perceptual, PIXEL_BYTES["dssim"]), "--size"),

@@ -9,7 +9,7 @@ from torch import Tensor
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
-from avatar.head.rasterize import rasterize_mesh
+from avatar.head.rasterize import rasterize_mesh, sample_image
 from avatar.splat.sh import C0
 from avatar.types import Frame
 
@@ -48,20 +48,8 @@ def seen_colours(avatar: Avatar, frame: Frame) -> tuple[Float[Tensor, "N 3"], Fl
 
     raster = rasterize_mesh(camera.project(vertices).numpy(), avatar.mesh.faces.numpy(), camera.height, camera.width)
     surface = torch.from_numpy(raster.depth).where(torch.from_numpy(raster.face_id) >= 0, torch.inf)
-    nearest = sample(surface[..., None], screen, "nearest")[:, 0]  # 0 outside the image: nothing is seen there
+    nearest = sample_image(surface[..., None], screen, "nearest")[:, 0]  # 0 outside the image: nothing is seen there
     in_front = (screen[:, 2] > 0) & (screen[:, 2] <= nearest + DEPTH_TOLERANCE)
     matte = (frame.alpha * frame.head_mask)[..., None]
-    pixels = sample(torch.cat((frame.image, matte), dim=-1), screen, "bilinear")
+    pixels = sample_image(torch.cat((frame.image, matte), dim=-1), screen, "bilinear")
     return pixels[:, :3], facing.square() * pixels[:, 3] * in_front
-
-
-def sample(image: Float[Tensor, "H W C"], screen: Float[Tensor, "N 3"], mode: str) -> Float[Tensor, "N C"]:
-    """The image's values at points (x pixel, y pixel, depth); zero outside the image."""
-    height, width = image.shape[:2]
-    grid = screen[:, :2] * torch.tensor([2 / width, 2 / height]) - 1
-    # A point in the camera's plane is not in the image.
-    grid = grid.nan_to_num(nan=-9.0, posinf=9.0, neginf=-9.0).clamp(-9, 9)
-    picked = torch.nn.functional.grid_sample(
-        image.permute(2, 0, 1)[None], grid[None, :, None], mode=mode, padding_mode="zeros", align_corners=False
-    )
-    return picked[0, :, :, 0].T

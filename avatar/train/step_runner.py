@@ -8,11 +8,12 @@ takes part (LPIPS, whose crop has another size each time; a step that is repeate
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.cuda_graph import Replay
@@ -21,11 +22,11 @@ from avatar.compute.gpu_functions import gpu_function
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
-from avatar.train.posed_mesh_cache import PosedMeshes
 from avatar.train.step import Judge, StepInputs, StepOutputs, TrainState, train_step
 from avatar.types import Frame
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
+MESH_BYTES = 2**28  # of posed meshes, 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again
 KEPT = 2  # kinds that are ready at a time; each has memory of its own
 
 
@@ -49,17 +50,23 @@ class StepRunner:
         self._state, self._noise, self._say = state, noise, say
         avatar = state.avatar
         self._device = avatar.device
-        self._meshes = PosedMeshes(avatar)
+        self._meshes: dict[int, Tensor] = {}  # of the frames: they do not change while the avatar does
+        self._mesh_bytes = MESH_BYTES
         self._jacobians: dict[int, Tensor] = {}  # of the frames' cameras in their corrections
         self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
         self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
         self.replayed = 0  # steps so far
 
-    def pose(self, frames: Iterable[Frame]) -> None:
-        """Have their meshes ready, as long as there is room."""
-        for frame in frames:
-            self._meshes.vertices(frame)
+    def vertices(self, frame: Frame) -> Float[Tensor, "V 3"]:
+        """The frame's posed mesh, metres; kept from its first use on while there is room."""
+        mesh = self._meshes.get(frame.index)
+        if mesh is None:
+            mesh = self._state.avatar.vertices(frame.params)
+            if mesh.nbytes <= self._mesh_bytes:
+                self._mesh_bytes -= mesh.nbytes
+                self._meshes[frame.index] = mesh
+        return mesh
 
     def make(self, step: int, frame: Frame, judge: Judge | None) -> StepOutputs:
         """Step number `step` (from 0) on one frame. See `train_step` for `judge` and what is raised. What a replayed step
@@ -80,7 +87,7 @@ class StepRunner:
 
     def inputs(self, step: int, frame: Frame) -> StepInputs:
         """What step `step` takes of a frame, where the avatar is."""
-        vertices, camera = self._meshes.vertices(frame), frame.camera
+        vertices, camera = self.vertices(frame), frame.camera
         noise = None if self._noise is None else to_device(self._noise.of(step), self._device)
         corrections, row, jacobian = self._state.pose_corrections, None, None
         if corrections is not None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
-from avatar.motion.controls import ExpressionControl, expression_controls, joint_ranges, posed
+from avatar.motion.controls import JOINT_FIELD, ExpressionControl, expression_controls, joint_ranges, posed
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat import checked_drawings
@@ -25,7 +25,6 @@ OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "error")
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 MARGIN = 10.0  # degrees by which the camera may leave what the training video shows
 ZOOM = (0.5, 4.0)
-JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "nod": "neck", "turn": "neck"}  # else eyes
 LINES = (30, 200, 120)  # RGB of the mesh
 
 

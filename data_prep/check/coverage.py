@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.data.split import Split, SplitSizes, check_divided
+from avatar.data.split import Split, check_divided
 from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
@@ -35,10 +35,10 @@ class Coverage:
     far_expression: tuple[int, ...]
 
 
-def measure_coverage(clip: Clip, usable: list[int], sizes: SplitSizes) -> Coverage | Finding:
+def measure_coverage(clip: Clip, usable: list[int], test_frames: int | None) -> Coverage | Finding:
     """`usable` are image numbers. A Finding where they cannot be split."""
     try:
-        split, _ = divide(clip.source.division, usable, sizes)
+        split, _ = divide(clip.source.division, usable, test_frames)
         check_divided(split)
     except UserError as error:
         return from_sentence("too-few-frames", str(error))

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from avatar.data.source import DEFAULT_LEFT_OUT
-from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.check.check_files import check_files, lost_frames
@@ -65,7 +64,7 @@ def check_tracked_folder(
     fps: float | None = None,
     max_left_out: float = DEFAULT_LEFT_OUT,
     ignore_misfit: bool = False,
-    split: SplitSizes = DEFAULT_SIZES,
+    test_frames: int | None = None,
     progress: Progress = silent,
 ) -> Check:
     """Check a tracked folder as `prepare` would read it, with the options of a `Source`.
@@ -106,7 +105,7 @@ def check_tracked_folder(
     usable = [image for image, _ in clip.tracked() if image not in lost]
     coverage = None
     if clip.offset is not None:
-        measured = measure_coverage(clip, usable, split)
+        measured = measure_coverage(clip, usable, test_frames)
         if isinstance(measured, Finding):
             findings.append(measured)
         else:

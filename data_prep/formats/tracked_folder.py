@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avatar.data.refinement import Refinement
-from avatar.data.split import DEFAULT_SIZES, Split, SplitSizes, split_frames
+from avatar.data.split import Split, split_frames
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_files import FrameFiles
@@ -43,19 +43,23 @@ class TrackedFolder:
             )
 
 
-def divide(division: Mapping[int, str | None], numbers: Sequence[int], sizes: SplitSizes) -> tuple[Split, list[str]]:
-    """Positions in `numbers` by the folder's own division, where it has one and no sizes are asked for, else by the rule
-    of `split_frames`; and notes on it. A single frame is all there is to drive with, and not divided (`check_divided`).
-    Raises UserError where there are too few frames."""
-    if len(numbers) == 1 and sizes == DEFAULT_SIZES:
+def divide(
+    division: Mapping[int, str | None], numbers: Sequence[int], test_frames: int | None
+) -> tuple[Split, list[str]]:
+    """Positions in `numbers` by the folder's own division, where it has one and no number of test frames is asked for, else
+    by the rule of `split_frames`; and notes on it. A single frame is all there is to drive with, and not divided
+    (`check_divided`). Raises UserError where there are too few frames."""
+    if len(numbers) == 1 and test_frames is None:
         return Split((0,), ()), ["there is a single frame: it can drive an avatar, and none can be trained on it"]
     parts = [division.get(number) for number in numbers]
     listed = Split(*(tuple(i for i, part in enumerate(parts) if part == name) for name in ("train", "test")))
-    if not any(parts) or sizes != DEFAULT_SIZES:
-        return split_frames(len(numbers), sizes), []
+    if not any(parts) or test_frames is not None:
+        return split_frames(len(numbers), test_frames), []
     if not listed.train or not listed.test:
         lacking = "test" if listed.train else "training"
-        return split_frames(len(numbers), sizes), [f"the folder names no {lacking} frames: its last ones are tested"]
+        return split_frames(len(numbers), test_frames), [
+            f"the folder names no {lacking} frames: its last ones are tested"
+        ]
     left = len(parts) - len(listed.train) - len(listed.test)
     unused = f" ({left} of validation are not used)" if left else ""
     return listed, [f"the folder's own division into training and test frames is kept{unused}"]

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.places import named_path
@@ -45,7 +44,7 @@ def recorded_head(folder: Path) -> Path | None:
 
 def open_subject(
     source: Source,
-    sizes: SplitSizes | None = None,
+    test_frames: int | None = None,
     say: Callable[[str], object] = print,
     assets: HeadAssets | None = None,
 ) -> tuple[Subject, HeadAssets]:
@@ -58,4 +57,4 @@ def open_subject(
         assets = load_head_assets(source.head)
         for note in assets.notes:
             say(f"note: {note}")
-    return Subject.open(prepare(source, assets, split=sizes, say=say)), assets
+    return Subject.open(prepare(source, assets, test_frames=test_frames, say=say)), assets

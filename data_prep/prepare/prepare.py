@@ -12,7 +12,6 @@ import torch
 
 from avatar.data.manifest import GIVEN, MASKS, FrameRecord, Manifest
 from avatar.data.source import DEFAULT_FPS, MAX_FPS, Source
-from avatar.data.split import DEFAULT_SIZES, SplitSizes
 from avatar.errors import UserError, refuse
 from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
@@ -41,7 +40,7 @@ def prepare(
     head: HeadAssets,
     *,
     out: Path | str | None = None,
-    split: SplitSizes | None = None,
+    test_frames: int | None = None,
     say: Callable[[str], object] = print,
 ) -> Path:
     """Prepare a tracked folder and return the prepared subject's folder; nothing is done when it is up to date.
@@ -50,7 +49,7 @@ def prepare(
     receives one sentence per finding. Raises UserError with the file or frame and what to do when the folder cannot be
     used.
     """
-    folder, split = Path(source.folder).resolve(), split or DEFAULT_SIZES
+    folder = Path(source.folder).resolve()
     if source.fps is not None and not 0 < source.fps <= MAX_FPS:  # a NaN is refused too
         raise UserError(f"--fps must be above 0 and at most {MAX_FPS:g}, not {source.fps:g}")
     if not 0 <= source.max_left_out <= 1:
@@ -61,7 +60,7 @@ def prepare(
     options = {
         "offset": source.frame_offset,
         "format": tracked.format,
-        "split": list(split),
+        "test_frames": test_frames,
         "fps": source.fps,
         "max_left_out": source.max_left_out,
         "ignore_misfit": source.ignore_misfit,
@@ -105,7 +104,7 @@ def prepare(
     evidence = f"{evidence}: {judgement.evidence}"
     say(evidence)
     has_lips = len(region_faces(model, "lips")) > 0
-    frames_split, split_notes = divide(tracked.division, [number for _, number in pairing.pairs], split)
+    frames_split, split_notes = divide(tracked.division, [number for _, number in pairing.pairs], test_frames)
     ignored = [f"{judgement.problem}: taken regardless, as --ignore-misfit says"] if judgement.problem else []
     parts = still_parts([tracks.frames[n] for _, n in pairing.pairs], head)
     still = [part.sentence for part in parts if not part.is_absent]

@@ -36,7 +36,6 @@ from avatar.evaluation.measure import to_8_bit
 from avatar.files.atomic import write_atomically
 from avatar.head.assets import HeadAssets
 from avatar.losses.metrics import psnr, ssim
-from avatar.pipeline.open import split_sizes
 from avatar.render import Renderer
 from avatar.runs.checkpoint import (
     Checkpoint,
@@ -137,7 +136,7 @@ def main(words: Sequence[str]) -> int:
     rows = {row["name"]: [*row["overrides"], *overrides] for row in systems(given.systems)}
     source = Source(folders[0], find_head(folders[0], given.head), frame_offset=given.frame_offset)
     configs = {name: load_config(words) for name, words in rows.items()}
-    subject, assets = open_subject(source, split_sizes(next(iter(configs.values()))))
+    subject, assets = open_subject(source, next(iter(configs.values())).data.test_frames)
     place = given.out / "convergence" / subject.name
     learners = [Learner(n, place / re.sub(r"\W+", "_", n), subject, assets, c) for n, c in configs.items()]
     frames = held_out(subject, learners[0].config, given.frames)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from small_runs import open_small, small_config
 
+from avatar.data import loader as loader_module
 from avatar.data.gpu_frame_cache import GpuFrameCache, box_of, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
@@ -53,12 +54,13 @@ def test_what_fits_is_decoded_once_and_kept_in_one_place(subject: Subject, monke
     one = bytes_of(subject)
     monkeypatch.setattr(Subject, "pixels", counted)
     frame_cache = GpuFrameCache(subject, CPU, 2 * one)
-    with FrameLoader(subject, cache_bytes=0, workers=1, frame_cache=frame_cache) as loader:
+    with monkeypatch.context() as patch, FrameLoader(subject, frame_cache=frame_cache) as loader:
+        patch.setattr(loader_module, "CACHE_BYTES", 0)
         for _ in range(3):
             list(loader.frames([0, 1, 2]))
     assert sorted(decoded) == [0, 1, 2, 2, 2]
     assert [index in frame_cache for index in (0, 1, 2)] == [True, True, False]
-    with FrameLoader(subject, cache_bytes=10 * one, frame_cache=GpuFrameCache(subject, CPU, one)) as loader:
+    with FrameLoader(subject, frame_cache=GpuFrameCache(subject, CPU, one)) as loader:
         list(loader.frames([0, 1]))
         assert loader.cached_bytes == one
 

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
@@ -21,11 +20,13 @@ PIXELS = 1e-3  # of the projected vertices; the parameters are float32
 
 
 def import_folder(
-    folder: Path, tracked: Path, out: Path, split: SplitSizes | None = None, **options: Any
+    folder: Path, tracked: Path, out: Path, test_frames: int | None = None, **options: Any
 ) -> tuple[Subject, list[str]]:
     said: list[str] = []
     head = load_head_assets(tracked / "head_model")
-    prepared = prepare(Source(folder, tracked / "head_model", **options), head, out=out, split=split, say=said.append)
+    prepared = prepare(
+        Source(folder, tracked / "head_model", **options), head, out=out, test_frames=test_frames, say=said.append
+    )
     return Subject.open(prepared), said
 
 

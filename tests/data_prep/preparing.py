@@ -9,19 +9,18 @@ import numpy as np
 import torch
 
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from data_prep.prepare.prepare import prepare
 
 
 def prepare_folder(
-    folder: Path, out: Path, split: SplitSizes | None = None, **options: Any
+    folder: Path, out: Path, test_frames: int | None = None, **options: Any
 ) -> tuple[Subject, list[str]]:
     said: list[str] = []
     head_path = folder / "head_model"
     source = Source(folder, head_path, **options)
-    prepared = prepare(source, load_head_assets(head_path), out=out, split=split, say=said.append)
+    prepared = prepare(source, load_head_assets(head_path), out=out, test_frames=test_frames, say=said.append)
     return Subject.open(prepared), said
 
 

@@ -13,7 +13,6 @@ from folder_damage import FRAMES
 from tracked_folder import write_head_model, write_tracked_folder
 
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.prepare.prepare import prepare
@@ -39,9 +38,9 @@ def test_bad_folder(name: str, good_folder: Path, tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} <= {"subject"}, "a refused folder leaves nothing behind"
 
 
-def prepare_with(folder: Path, out: Path, split: SplitSizes | None = None, **options: Any) -> Path:
+def prepare_with(folder: Path, out: Path, test_frames: int | None = None, **options: Any) -> Path:
     head = folder / "head_model"
-    return prepare(Source(folder, head, **options), load_head_assets(head), out=out, split=split, say=str)
+    return prepare(Source(folder, head, **options), load_head_assets(head), out=out, test_frames=test_frames, say=str)
 
 
 OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
@@ -53,14 +52,10 @@ OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "offset far off": ({"frame_offset": 12}, r"11 of 24 images have no partner under offset 12"),
     "too many test frames": (
-        {"split": SplitSizes(test=24)},
+        {"test_frames": 24},
         r"24 test frames cannot be held out of 24: choose from 1 to 23",
     ),
-    "no test frames": ({"split": SplitSizes(test=0)}, r"0 test frames cannot be held out of 24"),
-    "too many training frames": (
-        {"split": SplitSizes(train=30)},
-        r"30 training frames cannot be taken from 24 with 5 held out",
-    ),
+    "no test frames": ({"test_frames": 0}, r"0 test frames cannot be held out of 24"),
     "frame rate of zero": ({"fps": 0.0}, r"--fps must be above 0 and at most 1000, not 0"),
     "frame rate that is none": ({"fps": float("nan")}, r"--fps must be above 0 and at most 1000, not nan"),
 }

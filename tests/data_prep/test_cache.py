@@ -16,7 +16,6 @@ from tracked_folder import write_tracked_folder
 
 from avatar.data.manifest import read_manifest
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
@@ -30,9 +29,9 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     head_path = folder / "head_model"
     head = load_head_assets(head_path)
 
-    def run(split: SplitSizes | None = None) -> tuple[Path, str, bool]:
+    def run(test_frames: int | None = None) -> tuple[Path, str, bool]:
         said: list[str] = []
-        prepared = prepare(Source(folder, head_path), head, split=split, say=said.append)
+        prepared = prepare(Source(folder, head_path), head, test_frames=test_frames, say=said.append)
         assert prepared.is_relative_to(tmp_path / "cache" / "subjects")
         return prepared, read_manifest(prepared).data_hash, said == [f"using the prepared subject {prepared}"]
 
@@ -49,7 +48,7 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     _, changed_hash, reused = run()
     assert not reused and changed_hash != first_hash
 
-    other, _, reused = run(split=SplitSizes(test=2))
+    other, _, reused = run(test_frames=2)
     assert not reused and other != first and len(read_manifest(other).test) == 2
 
     assert sorted(p.name for p in (tmp_path / "cache" / "subjects").iterdir()) == sorted([first.name, other.name])

@@ -14,7 +14,6 @@ import torch
 from exports import write_imavatar, write_insta, write_vhap
 from importing import FRAMES, SIZE, assert_same_pictures, import_folder
 
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 
@@ -112,7 +111,7 @@ def test_insta_with_its_tracking_elsewhere(tracked: Path, original: Subject, tmp
 
 def test_sizes_that_are_asked_for_override_the_division(tracked: Path, tmp_path: Path) -> None:
     folder = write_vhap(tracked, tmp_path / "vhap")
-    subject, _ = import_folder(folder, tracked, tmp_path / "out", split=SplitSizes(test=3))
+    subject, _ = import_folder(folder, tracked, tmp_path / "out", test_frames=3)
     assert subject.split == (tuple(range(21)), tuple(range(21, 24)))
 
 

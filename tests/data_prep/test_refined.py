@@ -14,7 +14,6 @@ from tracked_folder import write_tracked_folder
 
 from avatar.data.refinement import Refinement, Round
 from avatar.data.source import Source
-from avatar.data.split import SplitSizes
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from data_prep.check.folder import check_tracked_folder
@@ -27,8 +26,8 @@ from data_prep.prepare.open import find_head, open_subject
 FRAMES = 20
 
 
-def opened(folder: Path, head: Path | None = None, sizes: SplitSizes | None = None) -> Subject:
-    return open_subject(Source(folder, head or find_head(folder)), sizes, lambda _: None)[0]
+def opened(folder: Path, head: Path | None = None, test_frames: int | None = None) -> Subject:
+    return open_subject(Source(folder, head or find_head(folder)), test_frames, lambda _: None)[0]
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +155,7 @@ def test_a_second_round_keeps_what_the_tracker_left(written: Path, subject: Subj
 
 
 def test_another_division_shows_which_frames_had_been_trained_on(written: Path) -> None:
-    again = opened(written, sizes=SplitSizes(None, 10))
+    again = opened(written, test_frames=10)
     numbers = [again.manifest.frames[index].tracking for index in again.split.test]
     assert again.manifest.refinement is not None
     assert again.manifest.refinement.trained_on(numbers) == numbers[:6]

@@ -11,7 +11,7 @@ import pytest
 import torch
 from lively import lively_avatar
 
-from avatar.export.bake import _sampled, bake_texture
+from avatar.export.bake import bake_texture
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import uv_texels
 from avatar.runs.trained import TrainedAvatar
@@ -69,10 +69,3 @@ def test_a_texture_has_the_colours_of_the_side_from_which_it_is_seen(trained: Tr
     found = np.median(baked(one)[texels.row.numpy()[in_front], texels.column.numpy()[in_front]], axis=0)
     assert abs(float(seen[0]) - 255 * 0.7) > 40
     assert np.abs(found - seen.numpy()).max() < 12
-
-
-def test_pictures_are_sampled_where_their_pixels_have_their_centres() -> None:
-    columns, rows = torch.meshgrid(torch.arange(12.0), torch.arange(8.0), indexing="xy")
-    picture = torch.stack((columns, rows), dim=2)
-    places = torch.tensor([[0.5, 0.5, 1.0], [2.5, 6.5, 1.0], [11.25, 4.0, 1.0]])
-    torch.testing.assert_close(_sampled(picture, places), places[:, :2] - 0.5, rtol=0, atol=1e-4)

@@ -55,7 +55,13 @@ def test_so_does_a_step_on_average_with_lpips_in_every_tenth(counts: dict[str, C
 
 def test_every_kernel_of_a_step_is_ours_once_or_twice(counts: dict[str, Counter[str]]) -> None:
     own = {name: count for name, count in counts["step with D-SSIM"].items() if name.startswith("our ")}
-    assert own.keys() >= {"our project", "our composite", "our composite_backward", "our project_backward", "our place"}
+    assert own.keys() >= {
+        "our project",
+        "our composite",
+        "our composite_backward",
+        "our project_backward",
+        "our fused_gaussians",
+    }
     assert max(own.values()) <= 2
 
 

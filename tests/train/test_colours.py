@@ -14,7 +14,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
 from avatar.train import init_colours as colours_module
-from avatar.train.init_colours import colour_from_frames, sample, seen_colours
+from avatar.train.init_colours import colour_from_frames, seen_colours
 from avatar.types import Camera, Frame
 
 
@@ -60,15 +60,6 @@ def test_first_colours_are_those_of_training_frames(tracked_folder: Path) -> Non
         assert colour_from_frames(avatar, one, 24) > 0
         found.append(avatar.sh_dc)
     assert torch.equal(*found)
-
-
-def test_nothing_is_sampled_outside_the_image_or_in_the_cameras_plane() -> None:
-    image = torch.arange(12.0).reshape(3, 4, 1) + 1
-    points = torch.tensor(
-        [[0.5, 0.5, 1], [3.5, 2.5, 1], [2.0, 0.5, 1], [-5, 1, 1], [1, 99, 1], [torch.inf, torch.nan, 0]]
-    )
-    expected = torch.tensor([1.0, 12.0, 2.5, 0.0, 0.0, 0.0])
-    torch.testing.assert_close(sample(image, points, "bilinear")[:, 0], expected, rtol=0, atol=1e-5)
 
 
 def two_sheets(apart: float) -> tuple[Avatar, Frame]:

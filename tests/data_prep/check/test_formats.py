@@ -17,7 +17,7 @@ from folder_damage import FRAMES
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
-from avatar.data.split import DEFAULT_SIZES, split_frames
+from avatar.data.split import split_frames
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import Check, check_tracked_folder
 
@@ -93,7 +93,7 @@ def test_a_good_export_has_no_finding(format: str, exported: dict[str, Path], tr
     assert min(fit.overlap for fit in check.clip.fits.values()) > 0.9
     assert check.coverage is not None
     own_division = {"VHAP": 6, "INSTA": 6}  # one listing for all frames has none
-    usual = len(split_frames(FRAMES, DEFAULT_SIZES).test)
+    usual = len(split_frames(FRAMES).test)
     assert len(check.coverage.split.test) == own_division.get(format, usual)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from some_tracks import track
 
-from avatar.data.split import SplitSizes
 from data_prep.check.check_tracking import _camera
 from data_prep.check.coverage import Coverage, measure_coverage
 from data_prep.check.motion import head_angles, suddenness
@@ -27,7 +26,7 @@ def clip(yaws: list[float], expressions: np.ndarray) -> dict[int, FrameTrack]:
 
 def covered(tracks: dict[int, FrameTrack]) -> Coverage:
     read: Any = SimpleNamespace(source=SimpleNamespace(division={}), tracked=lambda: iter(tracks.items()))
-    found = measure_coverage(read, list(tracks), SplitSizes(test=TEST))
+    found = measure_coverage(read, list(tracks), TEST)
     assert isinstance(found, Coverage) and len(found.split.train) == TRAIN
     return found
 
