@@ -8,7 +8,7 @@ import torch
 from heads import EXPRESSIONS, grid_head, random_params, rest_params
 
 from avatar.head.assets import load_head_assets
-from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.head.model import HeadModel, matrix_from_6d, nearest_rotation
 from avatar.types import IDENTITY_6D
 
 
@@ -109,3 +109,12 @@ def test_the_development_head_model_loads_with_its_regions(shared_dir) -> None:
     assert (
         load_head_assets(shared_dir / "subjects" / "head_model" / "generic_model.pkl").fingerprint == assets.fingerprint
     )
+
+
+def test_the_rotation_nearest_to_a_mean_of_rotations_is_one() -> None:
+    """Also of half turns about all three axes, whose mean is nearer to a reflection; by itself and among others."""
+    signs = [[1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]
+    mean = torch.stack([torch.diag(torch.tensor(each)) for each in signs]).mean(dim=0)
+    for found in (nearest_rotation(mean), nearest_rotation(torch.stack((torch.eye(3), mean)))[1]):
+        torch.testing.assert_close(found @ found.T, torch.eye(3))
+        assert float(torch.det(found)) == pytest.approx(1.0)

@@ -10,7 +10,7 @@ from heads import BROWS, OPEN, SMILE, grid_head, mouth_head, random_params, rest
 from avatar.errors import UserError
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion import rest as rest_module
-from avatar.motion.rest import LIPS_OPEN, chosen_frame, closed_frames, find_mean, find_neutral, frame_rest, lips_apart
+from avatar.motion.rest import LIPS_OPEN, chosen_frame, closed_frames, find_neutral, frame_rest, lips_apart
 from avatar.types import HeadParams
 
 HEAD = HeadModel(mouth_head(), torch.zeros(0))
@@ -49,14 +49,6 @@ def test_without_lips_it_is_the_pose_that_a_calm_face_comes_back_to_most() -> No
     calm = [*motion[170:180], *(frame(brows=0.2, wobble=0.0001) for _ in range(30)), *motion[180:200] * 8]
     neutral = find_neutral(calm, blind)
     assert neutral.frame is not None and 10 <= neutral.frame < 40
-
-
-def test_the_mean_of_turns_is_a_turn() -> None:
-    """Also of half turns about all three axes, whose mean is nearer to a reflection."""
-    jaws = [torch.diag(torch.tensor(signs)) for signs in ([1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0])]
-    mean = find_mean([replace(frame(), jaw=jaw[:2].reshape(6)) for jaw in jaws]).jaw
-    torch.testing.assert_close(mean @ mean.T, torch.eye(3))
-    assert float(torch.det(mean)) == pytest.approx(1.0)
 
 
 def test_a_fifth_of_the_frames_counts_as_calm() -> None:
