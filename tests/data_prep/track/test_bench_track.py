@@ -116,7 +116,7 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.slow
 def test_a_tiny_run_of_a_folder(tracking_models: None, tmp_path: Path) -> None:
-    folder = make_subject(tmp_path / "someone", 20, 192, seed=2, progress=False)
+    folder = make_subject(tmp_path / "someone", 20, 192, seed=2)
     out = tmp_path / "out"
     assert main(["bench", "track", str(folder), "--quick", "--out", str(out)]) == 0
     (subject,) = json.loads((out / "bench_track_someone.json").read_text())["subjects"]
