@@ -12,10 +12,15 @@ class MissingPackage(UserError):
     """A package of one of the extras is not installed."""
 
 
+def install(extra: str) -> str:
+    """How to get an extra; the program is on no package index."""
+    return f"pip install '.[{extra}]' in the program's checkout"
+
+
 def check_installed(what: str, extra: str, *packages: str) -> None:
     """Raise MissingPackage where one of an extra's packages is not installed; `what` needs them."""
     if missing := [name for name in packages if find_spec(name) is None]:
-        raise MissingPackage(f"{what} needs {' and '.join(missing)}: pip install 'hyperavatar[{extra}]'")
+        raise MissingPackage(f"{what} needs {' and '.join(missing)}: {install(extra)}")
 
 
 def refuse(message: str) -> NoReturn:

@@ -27,7 +27,7 @@ class FlashAvatar(Avatar):
     """FlashAvatar: a network gives each Gaussian its offsets from a point on the posed head."""
 
     heads: ClassVar[type[Any] | None] = None  # made of the numbers of Gaussians and latent values; None: no latents
-    is_fused = has_stages = True
+    is_fused = True
     unknown_to_browsers = None
     code: Tensor  # positional code of the places where the network is evaluated
 

@@ -49,7 +49,7 @@ def drawn(from_: Int[Tensor, " P"], count: int, generator: torch.Generator) -> I
 
 
 class MonoGaussianAvatar(FlashAvatar):
-    is_fused = has_stages = False
+    is_fused = False
     unknown_to_browsers = "points that have left their texel"
     count: Tensor  # of the points that are alive, which are the first ones
 

@@ -82,7 +82,7 @@ def substitute(triangle: Float[Tensor, "T N"], right: Float[Tensor, "n N"]) -> F
 
 class NdgsAvatar(FlashAvatar):
     heads = NdGaussians
-    is_fused = has_stages = False
+    is_fused = False
     unknown_to_browsers = "its opacities"
 
     def compose(self, points: Float[Tensor, "N 3"], offsets: Slice) -> Gaussians:

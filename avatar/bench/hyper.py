@@ -52,12 +52,11 @@ def measure(
     count: int = HEAD_SPLATS,
     repeats: int = 21,
     ways: Mapping[str, Way] | None = None,
-    say: Callable[[str], None] = print,
 ) -> list[Row]:
     """Verify and time every way; those of the same parameters take turns. UserError for a wrong one."""
     rows: list[Row] = []
     for n in latent_sizes:
-        say(f"{n} latent dimensions")
+        print(f"{n} latent dimensions")
         few = min(count, COVARIANCE_FLOATS // (4 + n) ** 2)
         rows += compare(ways or WAYS, by_substitution, random_heads(count, n), repeats, TOLERANCE)
         covariance = {"covariance": Way(by_covariance, covariance_leaves)}

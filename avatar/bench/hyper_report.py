@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
+
+import numpy as np
 
 from avatar.bench import Request
 from avatar.bench.hyper import LATENT_SIZES, QUICK_LATENT_SIZES, Row, measure
-from avatar.bench.results import new_figure, write_report
+from avatar.bench.results import Line, Panel, write_report
 
 
 def run(request: Request) -> None:
     """Measure, print and write; `quick` takes too few Gaussians to say anything."""
     rows = measure(QUICK_LATENT_SIZES, count=300, repeats=3) if request.quick else measure(LATENT_SIZES)
     content = {"rows": [asdict(row) for row in rows]}
-    write_report(
-        request.out, "bench_hyper", [*table(rows), "", *comparisons(rows)], content, lambda path: write_plot(rows, path)
-    )
+    write_report(request.out, "bench_hyper", [*table(rows), "", *comparisons(rows)], content, panels(rows))
 
 
 def table(rows: Sequence[Row]) -> list[str]:
@@ -57,29 +56,21 @@ def comparisons(rows: Sequence[Row]) -> Iterator[str]:
 
 def straight_line(values: dict[int, float]) -> tuple[float, float, float]:
     """Slope and start of the line with the least squares of relative deviations, and the largest of these."""
-    import numpy as np
-
     x, y = np.array(list(values)), np.array(list(values.values()))
     slope, start = np.polyfit(x, y, 1, w=1 / y)
     return float(slope), float(start), float(np.abs((start + slope * x) / y - 1).max())
 
 
-def write_plot(rows: Sequence[Row], path: Path) -> None:
+def panels(rows: Sequence[Row]) -> list[Panel]:
     """Time of one Gaussian over the number of latent dimensions."""
-    figure = new_figure(7, 4.5)
-    axes = figure.subplots()
+    lines = []
     for way in dict.fromkeys(row.way for row in rows):
-        points = [(row.latent_size, each(row)) for row in rows if row.way == way]
-        axes.plot(*zip(*points, strict=True), marker="o", ms=4, label=way)
-    floors = [(row.latent_size, 1e6 * row.floor / row.gaussians) for row in rows if row.way == "fused" and row.floor]
-    axes.plot(*zip(*floors, strict=True), "k--", label="copying the same bytes")
-    axes.set(xscale="log", yscale="log", xlabel="latent dimensions n", ylabel="forward + backward, ns per Gaussian")
-    shown = sorted({row.latent_size for row in rows})
-    axes.set_xticks(shown, [str(n) for n in shown])
-    axes.set_xticks([], minor=True)
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=90)
+        own = [row for row in rows if row.way == way]
+        lines.append(Line(way, [row.latent_size for row in own], [each(row) for row in own]))
+    floors = {row.latent_size: 1e6 * row.floor / row.gaussians for row in rows if row.way == "fused" and row.floor}
+    lines.append(Line("copying the same bytes", list(floors), list(floors.values()), "k--"))
+    sizes = sorted({row.latent_size for row in rows})
+    return [Panel("latent dimensions n", "forward + backward, ns per Gaussian", lines, ticks=sizes)]
 
 
 def total(row: Row) -> float:

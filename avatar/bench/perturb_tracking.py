@@ -24,15 +24,15 @@ JITTER_SHARE = 0.2  # of the error, white from frame to frame
 DRIFT_SECONDS = 0.8  # over which the rest changes
 
 
-def disturbed(recording: Recording, head: HeadModel, seed: int, scale: float = 1.0) -> Recording:
-    """The recording with errors `scale` times those of real trackers; the same for the same seed. The neck keeps still."""
+def disturbed(recording: Recording, head: HeadModel, seed: int) -> Recording:
+    """The recording with errors such as those of real trackers; the same for the same seed. The neck keeps still."""
     given = values_of(recording.tracks)
     size = torch.zeros(given.shape[1], dtype=torch.float64)
     for part in ("jaw", "eyes", "eyelids", "expression"):
         size[PARTS[part]] = COEFFICIENT_SHARE * given[:, PARTS[part]].double().std(dim=0, unbiased=False)
     size[TURN] = math.radians(TURN_DEGREES) / math.sqrt(3.0)
     size[SHIFT] = 1e-3 * SHIFT_MM / math.sqrt(3.0)
-    errors = scale * size * tracking_noise(np.random.default_rng(seed), len(given), given.shape[1], recording.fps)
+    errors = size * tracking_noise(np.random.default_rng(seed), len(given), given.shape[1], recording.fps)
     centre = head.neutral_vertices().mean(dim=0)
     tracks = moved_tracks(recording.tracks, given + errors.to(given), size > 0, centre)
     return replace(recording, tracks=tracks)

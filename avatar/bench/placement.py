@@ -13,9 +13,6 @@ from avatar.data.recording import Recording
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.track.faces.embedding import iris_embedding
-from data_prep.track.faces.landmarks import Landmarks
-
-OUTER_CORNERS, IRISES = (33, 263), (468, 473)  # landmarks
 
 
 @dataclass(frozen=True)
@@ -23,8 +20,7 @@ class Placement:
     """How far the face's vertices are from the true ones in the picture; per cent of the distance between the irises."""
 
     all: float  # mean over vertices and frames
-    constant: float  # of each vertex's mean over the frames
-    moving: float  # what remains without that
+    moving: float  # without what is the same in all frames
 
 
 def placement(assets: HeadAssets, own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Placement:
@@ -41,14 +37,6 @@ def placement(assets: HeadAssets, own: Recording, truth: Recording, pairs: Seque
     return in_parts(100.0 * np.stack(residuals) / np.percentile(distances, 90))
 
 
-def corners_distance(landmarks: Landmarks) -> float:
-    """Between the outer corners of the eyes, which the interocular distance of 300-W is, in distances of the irises."""
-    points = landmarks.points[landmarks.detected, :, :2]
-    corners, irises = (np.linalg.norm(points[:, a] - points[:, b], axis=-1) for a, b in (OUTER_CORNERS, IRISES))
-    return float(np.percentile(corners, 90) / np.percentile(irises, 90))
-
-
 def in_parts(residuals: Float[np.ndarray, "T V 2"]) -> Placement:
-    constant = residuals.mean(0)
-    lengths = (np.linalg.norm(part, axis=-1).mean() for part in (residuals, constant, residuals - constant))
+    lengths = (np.linalg.norm(part, axis=-1).mean() for part in (residuals, residuals - residuals.mean(0)))
     return Placement(*map(float, lengths))

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from avatar.bench.clock import Time, paired_medians
-from avatar.bench.train import Learner, make_learner, per_step, run_steps, steps_at_once
+from avatar.bench import Request
+from avatar.bench.clock import Time
+from avatar.bench.figures import head_figures
+from avatar.bench.results import Line, Panel, write_report
+from avatar.bench.train import Learner, make_learner, time_steps
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.evaluation.lpips_networks import find_lpips
-from avatar.evaluation.measure import lpips_in_mask, to_8_bit
-from avatar.losses.lpips_network import Lpips
-from avatar.losses.metrics import psnr, ssim
 from avatar.pipeline.open import open_run
-from avatar.render import Renderer
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run
 from avatar.train.objective import perceptual_start
 from avatar.types import Frame
+
+FRAMES, FULL_FRAMES, QUICK_FRAMES = 50, 10_000, 2
+REPEATS, QUICK_REPEATS = 11, 1
+NEAR = 0.3  # dB below a run's own last figure
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Point:
     minutes: float  # of training up to there
     psnr: float  # dB
     ssim: float
+    lpips: float  # of the last checkpoint where there are weights, else NaN
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,6 @@ class Curve:
     late: Time  # and after
     frames: int  # held out, evenly spread over the test split
     points: list[Point]
-    lpips: float | None = None  # of the last point; None where there are no weights
 
     @property
     def last(self) -> Point:
@@ -62,6 +64,15 @@ class Curve:
     def minutes_to(self, psnr: float) -> float | None:
         """Training time of the first checkpoint that has so many dB; None when none has."""
         return next((point.minutes for point in self.points if point.psnr >= psnr), None)
+
+
+def run(request: Request) -> None:
+    """Measure, print and write. The first run is the yardstick. `full` takes every held-out frame."""
+    frames = QUICK_FRAMES if request.quick else FULL_FRAMES if request.full else FRAMES
+    repeats = QUICK_REPEATS if request.quick else REPEATS
+    curves = measure(request.inputs, request.head, frames=frames, repeats=repeats)
+    content = {"curves": [asdict(curve) for curve in curves]}
+    write_report(request.out, "bench_quality", table(curves), content, panels(curves))
 
 
 def measure(
@@ -80,29 +91,17 @@ def measure(
     for run, learner, (early, late) in zip(runs, learners, times, strict=True):
         points = []
         files = list_checkpoints(run.path / "checkpoints")
-        held_out = held_out_frames(run, frames)
+        held_out = [(frame.params, frame.camera, frame) for frame in held_out_frames(run, frames)]
         for file in tqdm(files, desc=run.path.name, unit="checkpoint", disable=None):
             checkpoint = load_checkpoint(file)
             load_module(run.avatar, checkpoint.tensors, run.path)
             minutes = minutes_of(learner, checkpoint.step, early, late)
-            points.append(Point(checkpoint.step, minutes, *figures(run, held_out)))
+            # LPIPS takes long: of the last checkpoint alone.
+            found = head_figures(run.avatar, run.trained.background, held_out, network if file == files[-1] else None)
+            points.append(Point(checkpoint.step, minutes, found.psnr, found.ssim, found.lpips))
         iterations = run.config.trainer.iterations
-        lpips = None if network is None else mean_lpips(run, held_out, network)
-        curves.append(Curve(str(run.path), len(run.avatar), iterations, early, late, len(held_out), points, lpips))
+        curves.append(Curve(str(run.path), len(run.avatar), iterations, early, late, len(held_out), points))
     return curves
-
-
-def time_steps(learners: Sequence[Learner], repeats: int) -> list[tuple[Time, Time]]:
-    """Milliseconds of an early and a late step of each, taken in turns."""
-    steps: dict[tuple[int, bool], Callable[[], object]] = {}
-    for index, learner in enumerate(learners):
-        for late in (False, True):
-            steps[index, late] = lambda learner=learner, late=late: run_steps(learner, late)
-    times = paired_medians(steps, repeats, warm_up=2)
-    return [
-        (times[index, False], per_step(times[index, True], steps_at_once(learner)))
-        for index, learner in enumerate(learners)
-    ]
 
 
 def minutes_of(learner: Learner, step: int, early: Time, late: Time) -> float:
@@ -120,32 +119,55 @@ def held_out_frames(run: Run, count: int) -> list[Frame]:
         return list(loader.frames(chosen))
 
 
-@torch.no_grad()
-def pictures(run: Run, frames: Sequence[Frame]) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Render and truth [H, W, 3] of 8 bits each, as values, and the head mask [H, W], for every frame."""
-    background = torch.tensor(run.config.data.background)
-    renderings = Renderer(run.avatar, background).stream((frame.params, frame.camera) for frame in frames)
-    for frame, rendering in zip(frames, renderings, strict=True):
-        render, truth = (to_8_bit(p).double() / 255 for p in (rendering.image, frame.composite(background)))
-        yield render, truth, frame.head_mask.double()
-
-
-def figures(run: Run, frames: Sequence[Frame]) -> tuple[float, float]:
-    """PSNR and SSIM over the head mask, means over the frames."""
-    values = [(float(psnr(*shown)), float(ssim(*shown))) for shown in pictures(run, frames)]
-    mean_psnr, mean_ssim = np.mean(values, axis=0).tolist()
-    return mean_psnr, mean_ssim
-
-
-@torch.no_grad()
-def mean_lpips(run: Run, frames: Sequence[Frame], network: Lpips) -> float:
-    """LPIPS of the head, mean over the frames."""
-    shown = pictures(run, frames)
-    return float(np.mean([lpips_in_mask(network, (render, truth), mask) for render, truth, mask in shown]))
-
-
 def pareto(curves: Sequence[Curve]) -> list[Curve]:
     """The runs whose last checkpoint no other run reaches in less time, quickest first."""
     ordered = sorted(curves, key=lambda curve: curve.last.minutes)
     best = [-np.inf, *np.maximum.accumulate([curve.last.psnr for curve in ordered])]
     return [curve for curve, (before, after) in zip(ordered, pairwise(best), strict=True) if after > before]
+
+
+def table(curves: Sequence[Curve]) -> list[str]:
+    """The last and the best checkpoint of each run, and how soon each has what the first run ends with."""
+    yardstick, front = curves[0], pareto(curves)
+    goals = [f"to {point.psnr:.2f} dB" for point in (yardstick.last, yardstick.best)]
+    lines = [
+        f"{'run':>16} {'steps':>6} {'ms/step':>15} {'minutes':>8} {'PSNR':>6} {'SSIM':>7} {'LPIPS':>6} {'best PSNR':>16} "
+        f"{goals[0]:>11} {goals[1]:>11} {f'within {NEAR} dB':>13}"
+    ]
+    for curve in curves:
+        last, best = curve.last, curve.best
+        lpips = "-" if math.isnan(last.lpips) else f"{last.lpips:.4f}"
+        finest = f"{best.psnr:.2f} ({best.minutes:.2f})"
+        lines.append(
+            f"{Path(curve.run).name:>16} {last.step:6} {f'{curve.early.median:.1f}, {curve.late.median:.1f}':>15} "
+            f"{last.minutes:8.2f} {last.psnr:6.2f} {last.ssim:7.4f} {lpips:>6} {finest:>16} "
+            f"{minutes(curve.minutes_to(yardstick.last.psnr)):>11} {minutes(curve.minutes_to(yardstick.best.psnr)):>11} "
+            f"{minutes(curve.minutes_to(last.psnr - NEAR)):>13}"
+        )
+    lines += [
+        "",
+        f"{curves[0].frames} held-out frames, head mask alone, driven by the tracker's tracking. ms/step: before and after "
+        "the perceptual term takes part.",
+        f"Minutes of training at that rate, at the checkpoints that were kept: to the last and to the best PSNR of "
+        f"{Path(yardstick.run).name}, and within {NEAR} dB of the run's own last.",
+        f"No other run is as good in less time: {', '.join(Path(curve.run).name for curve in front)}",
+    ]
+    return lines
+
+
+def minutes(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def panels(curves: Sequence[Curve]) -> list[Panel]:
+    """PSNR and SSIM against training time; the last checkpoints that are best for their time are joined."""
+    found = []
+    for name, unit in (("psnr", "PSNR, dB"), ("ssim", "SSIM")):
+        lines = [
+            Line(Path(curve.run).name, [p.minutes for p in curve.points], [getattr(p, name) for p in curve.points])
+            for curve in curves
+        ]
+        best = [curve.last for curve in pareto(curves)]
+        lines.append(Line("best for their time", [p.minutes for p in best], [getattr(p, name) for p in best], "ks:"))
+        found.append(Panel("minutes of training", f"{unit}, held-out frames, head mask", lines, log_y=False))
+    return found

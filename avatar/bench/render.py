@@ -1,7 +1,7 @@
 """How long a trained avatar's frame takes, step by step and as a whole, and that the fast path draws the same picture.
 
-Steps are timed with one thread, so that they add up to the frame that a stream's worker draws; latency (one frame, all
-threads) and the stream (several frames at a time) are timed as they are used. The frames are the run's held-out ones.
+Steps are timed inside of frames that one thread draws, as a stream's workers do; latency (one frame, all threads) and the
+stream (several frames at a time) are timed as they are used. The frames are the run's held-out ones.
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import limited_to
-from avatar.bench.render_plot import write_plot
 from avatar.bench.results import write_report
 from avatar.bench.splat_gpu import settle
+from avatar.bench.stages import Stopwatch
 from avatar.compute.device import on_gpu, to_device
 from avatar.errors import UserError
 from avatar.model import FlashAvatar
@@ -31,11 +31,11 @@ from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams, Rendering
 
-STEPS = ("skinning", "embedding", "network", "heads", "compose", "splat")
 SIZES, QUICK_SIZES = (256, 512), (32,)
 GAUSSIANS_TOLERANCE = 1e-4  # of a field's norm: float32 through a network of some layers
 IMAGE_TOLERANCE = 1e-5  # mean over the pixels; single pixels may differ by 1/255 where a splat is at a cut-off
 
+STEPS = {"embedding": "points", "heads": "offsets", "compose": "compose"}  # methods of the avatar
 Input = tuple[HeadParams, Camera]
 
 
@@ -64,9 +64,7 @@ def run(request: Request) -> None:
     trained.avatar.to(torch.device(request.device))
     rows = measure(trained, QUICK_SIZES if request.quick else SIZES, repeats=3 if request.quick else 31)
     content = {"avatar": describe(trained), "rows": [asdict(row) for row in rows]}
-    write_report(
-        request.out, "bench_render", table(rows, describe(trained)), content, lambda path: write_plot(rows, path)
-    )
+    write_report(request.out, "bench_render", table(rows, describe(trained)), content)
 
 
 def describe(trained: TrainedAvatar) -> dict[str, Any]:
@@ -84,40 +82,22 @@ def describe(trained: TrainedAvatar) -> dict[str, Any]:
 
 def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> list[Row]:
     """Compare, then time, where the avatar is. Raises UserError when the renderer draws another picture: its time would
-    say nothing; and for an avatar whose steps are others. On a GPU the steps are one launch or two, and
-    not timed apart."""
-    if not trained.avatar.has_stages:
-        raise UserError(
-            f"the steps of a frame of model={trained.config.model.name} are not timed; choose another avatar"
-        )
+    say nothing."""
     renderer = Renderer(trained.avatar, torch.tensor(trained.config.data.background))
-    device, is_gpu = renderer.background.device, on_gpu(renderer.background)
+    device = renderer.background.device
     rows = []
     for size in sizes:
         frames = inputs(trained, size, count=repeats)
         error = compare(trained, renderer, frames[:5])
         with torch.no_grad():
+            render = next_of([partial(settled, device, renderer.render, *frame) for frame in frames])
+            unfolded = next_of([partial(settled, device, draw_unfolded, trained, *frame) for frame in frames])
             with limited_to(threads=1):
-                alone = {} if is_gpu else {name: next_of(calls) for name, calls in steps(renderer, frames).items()}
-                alone["frame"] = next_of([partial(settled, device, renderer.render, *frame) for frame in frames])
-                times = paired_medians(alone, repeats, warm_up=3)
-            together = {
-                "renderer": next_of([partial(settled, device, renderer.render, *frame) for frame in frames]),
-                "avatar": next_of([partial(settled, device, draw_unfolded, trained, *frame) for frame in frames]),
-            }
-            latency = paired_medians(together, repeats, warm_up=3)
+                steps = {} if on_gpu(renderer.background) else time_steps(renderer, frames)
+                (frame,) = paired_medians({"frame": render}, repeats, warm_up=3).values()
+            latency = paired_medians({"renderer": render, "avatar": unfolded}, repeats, warm_up=3)
         rates = [stream_rate(renderer, frames) for _ in range(3)]
-        rows.append(
-            Row(
-                size,
-                error,
-                {name: times[name] for name in STEPS if name in times},
-                times["frame"],
-                latency["renderer"],
-                latency["avatar"],
-                statistics.median(rates),
-            )
-        )
+        rows.append(Row(size, error, steps, frame, latency["renderer"], latency["avatar"], statistics.median(rates)))
     return rows
 
 
@@ -145,25 +125,20 @@ def compare(trained: TrainedAvatar, renderer: Renderer, frames: Sequence[Input])
     return Error(gaussians, mean, largest)
 
 
-def steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, list[Callable[[], object]]]:
-    """For each step one call per frame, on what the steps before it gave."""
-    calls: dict[str, list[Callable[[], object]]] = {name: [] for name in STEPS}
-    avatar = cast(FlashAvatar, renderer.avatar)
-
-    def latents(params: HeadParams, camera: Camera) -> Tensor:
-        return avatar.interpolate(avatar.deformation(avatar.code, avatar.condition(params, camera.R_cam_world)))
-
-    for params, camera in frames:
-        vertices, z = avatar.vertices(params), latents(params, camera)
-        points, offsets = avatar.points(vertices, params), avatar.offsets(z)
-        gaussians = avatar.compose(points, offsets)
-        calls["skinning"].append(partial(avatar.vertices, params))
-        calls["embedding"].append(partial(avatar.points, vertices, params))
-        calls["network"].append(partial(latents, params, camera))
-        calls["heads"].append(partial(avatar.offsets, z))
-        calls["compose"].append(partial(avatar.compose, points, offsets))
-        calls["splat"].append(partial(renderer.draw, gaussians, camera, renderer.background))
-    return calls
+def time_steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, Time]:
+    """What each step takes of a frame on a CPU; a GPU makes one launch or two of all of them."""
+    avatar, stopwatch = renderer.avatar, Stopwatch()
+    watched = [(avatar, "vertices", "skinning"), (avatar, "draw", "splat")]
+    if isinstance(avatar, FlashAvatar):
+        watched += [(avatar.deformation, "forward", "network"), (avatar, "interpolate", "network")]
+        watched += [(avatar, name, step) for step, name in STEPS.items()]
+    with ExitStack() as stack:
+        for owner, name, step in watched:
+            stack.enter_context(stopwatch.watching(owner, name, step))
+        for frame in (*frames[:2], *frames):
+            stopwatch.lap()
+            renderer.render(*frame)
+    return stopwatch.times()
 
 
 def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
@@ -179,7 +154,7 @@ def settled(device: torch.device, function: Callable[..., object], *arguments: o
 
 def next_of(calls: Sequence[Callable[[], object]]) -> Callable[[], object]:
     """A function that makes one call after the other, round and round."""
-    turn: Iterator[Callable[[], object]] = itertools.cycle(calls)
+    turn = itertools.cycle(calls)
     return lambda: next(turn)()
 
 

@@ -43,10 +43,6 @@ class Variant:
     t_min: float = T_MIN
 
     @property
-    def cutoffs(self) -> dict[str, float]:
-        return {"alpha_min": self.alpha_min, "t_min": self.t_min}
-
-    @property
     def has_usual_cutoffs(self) -> bool:
         return (self.alpha_min, self.t_min) == (ALPHA_MIN, T_MIN)
 
@@ -87,6 +83,11 @@ class Row:
     accuracy: Accuracy | None  # None: the reference itself
     timing: Timing
 
+    @property
+    def total(self) -> float:
+        """Milliseconds of both passes."""
+        return self.timing.forward.median + self.timing.backward.median
+
 
 class Truth(NamedTuple):
     """The reference's image of one scene, and its gradients for a cotangent that is zero at ambiguous pixels."""
@@ -95,9 +96,6 @@ class Truth(NamedTuple):
     clear: Tensor  # bool [H, W], not ambiguous
     cotangent: Tensor  # [H, W, 3]
     gradients: tuple[Tensor, ...]
-
-
-Draw = Callable[..., Rendering]
 
 
 def all_variants(
@@ -136,8 +134,6 @@ def measure(
     *,
     repeats: int,
     validation_size: int,
-    say: Callable[[str], None] = print,
-    function: Draw = splat,
 ) -> list[Row]:
     """Validate every variant at up to `validation_size` pixels, then time all of them.
 
@@ -148,12 +144,10 @@ def measure(
     for count, size in dict.fromkeys((v.count, v.size) for v in variants):
         group = [v for v in variants if (v.count, v.size) == (count, size)]
         gaussians, checked_size = head_shell(count), min(size, validation_size)
-        say(f"{count:,} splats at {size}x{size}: comparing with the reference at {checked_size}x{checked_size}")
+        print(f"{count:,} splats at {size}x{size}: comparing with the reference at {checked_size}x{checked_size}")
         truth = reference_of(gaussians, checked_size)
-        accuracies = [
-            None if v.backend == "reference" else validate(v, gaussians, checked_size, truth, function) for v in group
-        ]
-        timings = time_in_turns(group, gaussians, size, repeats, function)
+        accuracies = [None if v.backend == "reference" else validate(v, gaussians, checked_size, truth) for v in group]
+        timings = time_in_turns(group, gaussians, size, repeats)
         rows += [Row(*row) for row in zip(group, accuracies, timings, strict=True)]
     return rows
 
@@ -175,19 +169,19 @@ def reference_of(gaussians: Gaussians, size: int, *, alpha_min: float = ALPHA_MI
     return Truth(Rendering(*(t.detach() for t in rendering)), clear, cotangent, gradients)
 
 
-def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, function: Draw = splat) -> Accuracy:
+def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth) -> Accuracy:
     """The variant's errors at `size` pixels; UserError if they are above the tolerances, unless it is somebody else's.
 
     Where the variant has its own cut-offs, its errors against a reference with the same ones decide, at OWN_SIZE or less.
     """
-    accuracy = accuracy_of(variant, gaussians, size, truth, function)
+    accuracy = accuracy_of(variant, gaussians, size, truth)
     found = accuracy
     if variant.backend == "gsplat":
         return accuracy
     if not variant.has_usual_cutoffs:
         size = min(size, OWN_SIZE)
-        own = reference_of(gaussians, size, **variant.cutoffs)
-        found = accuracy_of(variant, gaussians, size, own, function)
+        own = reference_of(gaussians, size, alpha_min=variant.alpha_min, t_min=variant.t_min)
+        found = accuracy_of(variant, gaussians, size, own)
     if not (found.image <= IMAGE_TOLERANCE and found.gradient <= GRADIENT_TOLERANCE):  # not: a NaN is wrong too
         raise UserError(
             f"{variant} is wrong, so it is not timed: its image is off by {found.image:.1e} (at most "
@@ -197,9 +191,9 @@ def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, fu
     return accuracy
 
 
-def accuracy_of(variant: Variant, gaussians: Gaussians, size: int, truth: Truth, function: Draw = splat) -> Accuracy:
+def accuracy_of(variant: Variant, gaussians: Gaussians, size: int, truth: Truth) -> Accuracy:
     leaves = leaves_of(variant, gaussians)
-    found = draw(variant, leaves, size, function)
+    found = draw(variant, leaves, size)
     gradients = torch.autograd.grad(found.image, leaves, truth.cotangent.to(found.image.device))
     difference = (found.image.detach().cpu() - truth.rendering.image)[truth.clear]
     gradient = max(float((a.cpu() - b).norm() / b.norm()) for a, b in zip(gradients, truth.gradients, strict=True))
@@ -212,33 +206,27 @@ def accuracy_of(variant: Variant, gaussians: Gaussians, size: int, truth: Truth,
     )
 
 
-def time_in_turns(
-    variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int, function: Draw = splat
-) -> list[Timing]:
+def time_in_turns(variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int) -> list[Timing]:
     """All variants in turns; the plain ones and the reference, seconds long, have three rounds of their own after them."""
     fast = [v for v in variants if v.backend in ("cpu", *ON_GPU)]
     slow = [v for v in variants if v not in fast]
     times: dict[tuple[Variant, str], Time] = {}
     for group, rounds in ((fast, repeats), (slow, min(repeats, 3))):
         functions = {
-            (variant, name): part
-            for variant in group
-            for name, part in passes_of(variant, gaussians, size, function).items()
+            (variant, name): part for variant in group for name, part in passes_of(variant, gaussians, size).items()
         }
         times |= paired_medians(functions, rounds)
     return [Timing(times[variant, "forward"], times[variant, "backward"]) for variant in variants]
 
 
-def passes_of(
-    variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat
-) -> dict[str, Callable[[], object]]:
+def passes_of(variant: Variant, gaussians: Gaussians, size: int) -> dict[str, Callable[[], object]]:
     """The forward pass, and the backward pass of the drawing that the forward pass made last."""
     device = device_of(variant.backend)
     leaves, cotangent = leaves_of(variant, gaussians), torch.ones(size, size, 3, device=device)
     drawn: list[Rendering] = []
 
     def forward() -> None:
-        drawn[:] = [draw(variant, leaves, size, function)]
+        drawn[:] = [draw(variant, leaves, size)]
         settle(device)
 
     def backward() -> object:
@@ -256,11 +244,13 @@ def leaves_of(variant: Variant, gaussians: Gaussians) -> Gaussians:
     return Gaussians(*(t.detach().clone().to(device).requires_grad_() for t in gaussians))
 
 
-def draw(variant: Variant, gaussians: Gaussians, size: int, function: Draw = splat) -> Rendering:
+def draw(variant: Variant, gaussians: Gaussians, size: int) -> Rendering:
     camera, black = head_camera(size), torch.zeros(3, device=gaussians.means.device)
     with limited_to(threads=variant.threads, simd=variant.simd):
         if variant.backend == "gsplat":
             return splat_gsplat(gaussians, camera)
         if variant.backend == "plain":
-            return splat_plain(gaussians, camera, black, **variant.cutoffs)
-        return function(gaussians, camera, black, backend=variant.backend, **variant.cutoffs)
+            return splat_plain(gaussians, camera, black, alpha_min=variant.alpha_min, t_min=variant.t_min)
+        return splat(
+            gaussians, camera, black, backend=variant.backend, alpha_min=variant.alpha_min, t_min=variant.t_min
+        )

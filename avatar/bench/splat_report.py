@@ -5,22 +5,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
-from typing import Any
 
 from avatar.bench import Request
-from avatar.bench.results import write_report
-from avatar.bench.splat import Row, all_variants, measure
-from avatar.bench.splat_gpu import ON_GPU, gpu_backends
-from avatar.bench.splat_plot import total, write_plot
+from avatar.bench.results import Line, Panel, write_report
+from avatar.bench.splat import Row, Variant, all_variants, measure
+from avatar.bench.splat_gpu import ON_GPU
 from avatar.bench.splat_work import peak_memory
 from avatar.splat.scenes import HEAD_SPLATS
 
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64
 USUAL_SIZES, USUAL_COUNTS = (256, 512), (HEAD_SPLATS, 50_000)
 FULL_SIZES, FULL_COUNTS = (128, 256, 512, 1024), (1_000, 5_000, HEAD_SPLATS, 50_000, 200_000)
-# Packages that draw Gaussians, on a GPU only. gsplat is timed beside the others where there is one.
-OTHER_SPLATTERS = ("gsplat", "diff_gaussian_rasterization", "diff_surfel_rasterization", "msplat")
 
 
 def run(request: Request) -> None:
@@ -39,30 +34,12 @@ def run(request: Request) -> None:
     is_measured = sys.platform == "linux" and not request.quick
     scenes = dict.fromkeys((row.variant.count, row.variant.size) for row in rows) if is_measured else ()
     memory = {scene: peak_memory(*scene) for scene in scenes}
-    lines = [*table(rows), *(memory_table(memory) if memory else ()), others_line()]
-    write_report(request.out, "bench_splat", lines, as_json(rows, memory), lambda path: write_plot(rows, path))
-
-
-def as_json(rows: Sequence[Row], memory: Mapping[tuple[int, int], int]) -> dict[str, Any]:
-    """All figures; milliseconds and bytes."""
-    return {
+    content = {
         "rows": [asdict(row) for row in rows],
         "memory": [{"count": count, "size": size, "bytes": found} for (count, size), found in memory.items()],
-        "other_splatters": installed_splatters(),
     }
-
-
-def installed_splatters() -> list[str]:
-    return [name for name in OTHER_SPLATTERS if find_spec(name)]
-
-
-def others_line() -> str:
-    found = installed_splatters()
-    if not found:
-        return f"Other splatters ({', '.join(OTHER_SPLATTERS)}): none installed"
-    if "gsplat" in gpu_backends():
-        return f"Other splatters: {', '.join(found)} installed, gsplat timed"
-    return f"Other splatters: {', '.join(found)} installed, not timed: they draw on a GPU only"
+    lines = [*table(rows), *(memory_table(memory) if memory else ())]
+    write_report(request.out, "bench_splat", lines, content, panels(rows))
 
 
 def table(rows: Iterable[Row]) -> list[str]:
@@ -83,7 +60,7 @@ def table(rows: Iterable[Row]) -> list[str]:
         )
         lines.append(
             f"{backend:>12} {variant.changed or 'usual':>11} {variant.count:7,} {variant.size:5} {variant.threads:7} "
-            f"{forward:>17} {backward:>17} {total(row):8.2f} {errors}"
+            f"{forward:>17} {backward:>17} {row.total:8.2f} {errors}"
         )
     return lines
 
@@ -92,3 +69,41 @@ def memory_table(memory: Mapping[tuple[int, int], int]) -> list[str]:
     """Of a forward and backward pass, whatever the instruction set and the number of threads."""
     lines = ["", f"{'splats':>7} {'size':>5} {'memory MB':>9}"]
     return [*lines, *(f"{count:7,} {size:5} {found / 1e6:9.1f}" for (count, size), found in memory.items())]
+
+
+def panels(rows: Sequence[Row]) -> list[Panel]:
+    """Both passes' time against the gradients' error where all sweeps cross, against resolution and number of splats."""
+    truth = next(row.variant for row in rows if row.accuracy is None)
+    scene, ms = (truth.count, truth.size), "forward + backward, ms"
+    kinds: dict[str, list[Row]] = {}
+    for row in rows:
+        kinds.setdefault(kind_of(row.variant), []).append(row)
+    by_error = []
+    for name, own in kinds.items():
+        here = [(row, row.accuracy) for row in own if (row.variant.count, row.variant.size) == scene and row.accuracy]
+        notes = [row.variant.changed for row, _ in here]
+        by_error.append(Line(name, [a.gradient for _, a in here], [row.total for row, _ in here], "o", notes))
+    x = f"largest relative error of a gradient, {truth.count:,} splats, {truth.size} x {truth.size} pixels"
+    found = [Panel(x, ms, [line for line in by_error if line.x])]
+    for key, fixed, x in (
+        ("size", "count", f"width and height in pixels, {truth.count:,} splats"),
+        ("count", "size", f"splats, {truth.size} x {truth.size} pixels"),
+    ):
+        lines = []
+        for name, own in kinds.items():
+            there = sorted(
+                (getattr(row.variant, key), row.total)
+                for row in own
+                if row.variant.has_usual_cutoffs and getattr(row.variant, fixed) == getattr(truth, fixed)
+            )
+            lines.append(Line(name, [value for value, _ in there], [time for _, time in there]))
+        ticks = sorted({value for line in lines for value in line.x})
+        found.append(Panel(x, ms, [line for line in lines if len(line.x) > 0], ticks=[int(tick) for tick in ticks]))
+    return found
+
+
+def kind_of(variant: Variant) -> str:
+    """The name of a line."""
+    if variant.backend != "cpu":
+        return variant.backend
+    return f"cpu {variant.simd}, threads: {variant.threads}"

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avatar.bench import Request
-from avatar.bench.results import new_figure, write_report
+from avatar.bench.results import Line, Panel, write_report
 from avatar.gaussians.hyper import Factor, conditional_mean
 
 ATTRIBUTE = 3  # values of a, as of a position
@@ -41,7 +40,7 @@ def run(request: Request) -> None:
     count = 16 if request.quick else 1000 if request.full else 200
     rows = measure(LATENTS[:4] if request.quick else LATENTS, CONDITIONS, count)
     found = {"gaussians": count, "rows": [asdict(row) for row in rows]}
-    write_report(request.out, "stability", table(rows), found, lambda path: write_plot(rows, path))
+    write_report(request.out, "stability", table(rows), found, panels(rows))
 
 
 def measure(latents: Sequence[int], conditions: Sequence[float], count: int) -> list[Row]:
@@ -113,17 +112,13 @@ def table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def write_plot(rows: Sequence[Row], path: Path) -> None:
-    figure = new_figure(10, 4)
+def panels(rows: Sequence[Row]) -> list[Panel]:
     latents = sorted({row.latent for row in rows})
-    shown = [n for n in (8, latents[-1]) if n in latents]
-    for axes, latent in zip(figure.subplots(1, len(shown), sharey=True, squeeze=False)[0], shown, strict=True):
-        for form, style in zip(FORMS, ("o-", "s-", "^--"), strict=True):
+    found = []
+    for latent in (n for n in (8, latents[-1]) if n in latents):
+        lines = []
+        for form in FORMS:
             own = [row for row in rows if (row.form, row.latent) == (form, latent)]
-            axes.plot([row.condition for row in own], [row.median for row in own], style, ms=4, label=form)
-        axes.axhline(FAILED, color="grey", lw=0.8)
-        axes.set(xscale="log", yscale="log", xlabel=f"condition number of the covariance, n = {latent}")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    figure.axes[0].set_ylabel("median relative error of E[a | b]")
-    figure.savefig(path, dpi=90)
+            lines.append(Line(form, [row.condition for row in own], [row.median for row in own]))
+        found.append(Panel(f"condition number of the covariance, n = {latent}", "median relative error", lines))
+    return found

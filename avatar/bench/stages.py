@@ -1,131 +1,63 @@
-"""One training step cut into stages, each timed forward and backward by itself on the values that a real step gives it."""
+"""The stages of a rendered frame or a training step, timed while the program itself goes through them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, cast
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from typing import Any
+from unittest.mock import patch
 
-import torch
 from torch import Tensor
 
-from avatar.errors import UserError
-from avatar.gaussians.base_model import Avatar
-from avatar.gaussians.skull_binding import bind_to_skull
-from avatar.losses.photometric import PhotometricLoss
-from avatar.model import FlashAvatar
-from avatar.train.optimizer import schedule, set_rates
-from avatar.train.step import TrainState, check_step, gradients_of
-from avatar.types import Frame, Gaussians
+from avatar.bench.clock import Time, time_of
 
 
-@dataclass
 class Stopwatch:
-    """Milliseconds by stage, one value a step."""
+    """Milliseconds by stage, of one lap (a frame or a step) after the other. A stage is one function or several.
 
-    spans: dict[str, list[float]] = field(default_factory=dict)
+    Backward, a stage lasts from the gradient of what it gave to that of what it was given.
+    """
 
-    def measure(self, stage: str, function: Callable[[], Any]) -> Any:
-        begin = time.perf_counter()
-        result = function()
-        self.spans.setdefault(stage, []).append(1e3 * (time.perf_counter() - begin))
-        return result
+    def __init__(self) -> None:
+        self._laps: list[dict[str, float]] = []
+        self._stage, self._begin = "", 0.0  # that is running backward
 
+    def lap(self) -> None:
+        self._laps.append({})
 
-@dataclass
-class Link:
-    """A stage that has run forward: its inputs, cut off from what made them, and its outputs."""
+    def watching(self, owner: Any, name: str, stage: str) -> AbstractContextManager[Any]:
+        """Count the calls of `owner.name` as the stage, as long as the context lasts."""
+        function: Callable[..., Any] = getattr(owner, name)
 
-    name: str
-    inputs: list[Tensor]
-    outputs: list[Tensor]
+        def timed(*arguments: Any, **named: Any) -> Any:
+            self._switch("")
+            begin = time.perf_counter()
+            result = function(*arguments, **named)
+            self._add(stage, begin)
+            for tensor in tensors_in(result):
+                if tensor.requires_grad:
+                    tensor.register_hook(lambda _: self._switch(stage))
+            return result
 
+        return patch.object(owner, name, timed)
 
-class StagedStep:
-    """A training step of `avatar`, stage by stage: the operations of `train_step`, without pose corrections."""
+    def times(self, warm_up: int = 2) -> dict[str, Time]:
+        """Of all stages, in the order of a lap, without the first laps."""
+        laps = self._laps[warm_up:]
+        return {stage: time_of([lap[stage] for lap in laps]) for stage in laps[0]}
 
-    def __init__(self, state: TrainState) -> None:
-        self.avatar, self.optimizer, self.objective = with_stages(state.avatar), state.optimizer, state.objective
-        self.watch = Stopwatch()
-        self._chain: list[Link] = []
+    def _switch(self, stage: str) -> None:
+        if self._stage:
+            self._add(f"{self._stage}, backward", self._begin)
+        self._stage, self._begin = stage, time.perf_counter()
 
-    def __call__(self, step: int, make_frame: Callable[[], Frame]) -> PhotometricLoss:
-        """One whole step with its update. `make_frame` decodes or fetches the frame, which is the stage `frame`."""
-        avatar, objective, watch = self.avatar, self.objective, self.watch
-        self._chain.clear()
-        frame = watch.measure("frame", make_frame)
-        target = watch.measure("target", lambda: frame.composite(objective.background))
-        vertices = watch.measure("skinning", lambda: avatar.mesh.vertices(frame.params))
-        points = watch.measure("embedding", lambda: avatar.embedding.points(vertices))
-        condition = avatar.condition(frame.params, frame.camera.R_cam_world)
-
-        network = avatar.deformation
-        (raw,) = self._forward("network", lambda: (network(avatar.code, condition),), [], list(network.parameters()))
-        if avatar.grid is not None:
-            (raw,) = self._forward("interpolation", lambda z: (avatar.interpolate(z),), [raw])
-        if avatar.hyper is not None:
-            (raw,) = self._forward("heads", lambda z: (avatar.offsets(z),), [raw], list(avatar.hyper.parameters()))
-        base = [avatar.quats, avatar.log_scales, avatar.opacity_logits, avatar.sh_dc, avatar.sh_rest]
-        skull_binding = avatar.skull_binding(frame.params)
-        gaussians = self._forward(
-            "compose",
-            lambda z: avatar.compose(bind_to_skull(points, skull_binding), z),
-            [raw],
-            base if avatar.skull_logits is None else [*base, avatar.skull_logits],
-        )
-        (image,) = self._forward(
-            "splat", lambda *g: (objective.draw(step, Gaussians(*g), frame.camera, avatar),), list(gaussians)
-        )
-        loss: list[PhotometricLoss] = []
-
-        def compare(picture: Tensor) -> tuple[Tensor]:
-            loss.append(objective.loss(step, frame, picture, target))
-            return (loss[0].total,)
-
-        self._forward("loss", compare, [image])
-        watch.measure("backward: clearing", self.optimizer.zero_grad)
-        self._backward()
-        watch.measure("check", lambda: check_step(step, frame, loss[0], gradients_of(avatar)))
-        set_rates(self.optimizer, schedule(step, objective.config))
-        watch.measure("optimizer", self.optimizer.step)
-        return loss[0]
-
-    def _forward(
-        self,
-        name: str,
-        function: Callable[..., Sequence[Tensor]],
-        inputs: Sequence[Tensor],
-        parameters: Sequence[Tensor] = (),
-    ) -> list[Tensor]:
-        cut = [tensor.detach().requires_grad_() for tensor in inputs]
-        outputs = list(self.watch.measure(name, lambda: function(*cut)))
-        self._chain.append(Link(name, [*cut, *parameters], outputs))
-        return outputs
-
-    def _backward(self) -> None:
-        """From the loss back to the network: each stage's cotangents are the next one's gradients of its inputs."""
-        cotangents = [torch.ones(())]
-        for link in reversed(self._chain):
-            found = self.watch.measure(
-                f"{link.name}, backward",
-                lambda link=link: gradients(link, cotangents),  # noqa: B023 (called at once)
-            )
-            cotangents = []
-            for tensor, gradient in zip(link.inputs, found, strict=True):
-                if isinstance(tensor, torch.nn.Parameter):
-                    tensor.grad = gradient
-                else:
-                    cotangents.append(gradient)
+    def _add(self, stage: str, begin: float) -> None:
+        lap = self._laps[-1]
+        lap[stage] = lap.get(stage, 0.0) + 1e3 * (time.perf_counter() - begin)
 
 
-def with_stages(avatar: Avatar) -> FlashAvatar:
-    """Raises UserError for an avatar whose steps are others than the stages that are timed."""
-    if not avatar.has_stages:
-        raise UserError(f"the stages of a step of model={avatar.config.name} are not timed; choose another model")
-    return cast(FlashAvatar, avatar)
-
-
-def gradients(link: Link, cotangents: Sequence[Tensor]) -> list[Tensor]:
-    """Of a stage's inputs; laid out densely, as `backward` leaves them and the fused optimizer needs them."""
-    return [found.contiguous() for found in torch.autograd.grad(link.outputs, link.inputs, cotangents)]
+def tensors_in(result: Any) -> Iterable[Tensor]:
+    """A tensor, or those of a tuple."""
+    parts = result if isinstance(result, tuple) else (result,)
+    return [part for part in parts if isinstance(part, Tensor)]

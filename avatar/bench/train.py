@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import cycle
-from typing import Any
 
 import torch
 
 from avatar.bench import Request
-from avatar.bench.clock import Time, paired_medians, time_of
-from avatar.bench.floor import floor_ms
+from avatar.bench.clock import Time, paired_medians
+from avatar.bench.results import write_report
 from avatar.bench.splat_gpu import settle
-from avatar.bench.stages import StagedStep, with_stages
+from avatar.bench.stages import Stopwatch
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import on_gpu
 from avatar.config import Config, load_config
@@ -24,6 +24,7 @@ from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.model import FlashAvatar
 from avatar.runs.model_registry import make_avatar
+from avatar.train import step as train_step
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
@@ -33,16 +34,15 @@ from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
 
+REPEATS, QUICK_REPEATS, FULL_REPEATS = 15, 2, 41
 RECIPES = {"paper": ("experiment=paper", "data.size=null", "trainer.perceptual=auto"), "default": ()}
 FRAMES = 8  # training frames that take turns; all are decoded before the clock runs
-ONCE_A_FRAME = ("skinning",)  # done once for each frame of a training, not in every step
 QUICK = ("model.uv_size=20", "data.size=48", "model.mlp_width=16")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One recipe. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged. Stages and their
-    floors are the CPU's: a GPU's step is not cut."""
+    """One recipe. Milliseconds; `late` steps have the perceptual term, whose sparse steps are averaged."""
 
     recipe: str
     gaussians: int
@@ -50,8 +50,7 @@ class Row:
     parameters: int
     early: Time
     late: Time
-    stages: dict[str, Time]  # of a late step
-    floors: dict[str, float]  # of the stages whose work can be counted, forward and backward together
+    stages: dict[str, Time]  # of a late step with the perceptual term; none on a GPU, which is not waited for in a step
 
 
 @dataclass
@@ -72,11 +71,24 @@ class Learner:
         self.steps.make(number, next(self.frames), self.judge)
 
 
-def measure(request: Request, repeats: int, say: Callable[[str], None] = print) -> list[Row]:
+def run(request: Request) -> None:
+    """Measure, print and write; `quick` takes an avatar too small to say anything."""
+    repeats = QUICK_REPEATS if request.quick else FULL_REPEATS if request.full else REPEATS
+    rows = measure(request, repeats)
+    content = {
+        "folder": str(request.inputs[0]),
+        "overrides": list(request.overrides),
+        "rows": [asdict(row) for row in rows],
+    }
+    write_report(request.out, "bench_train", table(rows), content)
+
+
+def measure(request: Request, repeats: int) -> list[Row]:
     """Time both recipes in turns on the same frames. Raises UserError as `avatar train` does."""
     folder, overrides = request.inputs[0], [*(QUICK if request.quick else ()), *request.overrides]
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
-    subject, assets = open_subject(source, load_config(overrides).data.test_frames, say)
+    subject, assets = open_subject(source, load_config(overrides).data.test_frames, print)
+    device = torch.device(request.device)
     learners = {}
     for recipe, own in RECIPES.items():
         config = load_config([*own, *overrides])
@@ -84,26 +96,20 @@ def measure(request: Request, repeats: int, say: Callable[[str], None] = print) 
         avatar = make_avatar(assets, subject.identity, config.model)
         with torch.no_grad():  # opacities as after training: what is drawn decides what drawing costs
             avatar.opacity_logits.copy_(1.5 * torch.randn(len(avatar)) + 0.5)
-        avatar.to(torch.device(request.device))
-        learners[recipe] = make_learner(avatar, subject, config, say if recipe == "paper" else silent)
-    steps: dict[tuple[str, bool], Callable[[], object]] = {}
-    for recipe, learner in learners.items():
-        for late in (False, True):
-            steps[recipe, late] = lambda learner=learner, late=late: run_steps(learner, late)
-    with own_stream(torch.device(request.device)):
-        times = paired_medians(steps, repeats, warm_up=WARM + 1)
+        learners[recipe] = make_learner(avatar.to(device), subject, config, print)
+    with own_stream(device):
+        times = time_steps(list(learners.values()), repeats, warm_up=WARM + 1)
     return [
         Row(
             recipe,
             len(learner.avatar),
-            len(with_stages(learner.avatar).code),
+            len(learner.avatar.code) if isinstance(learner.avatar, FlashAvatar) else 0,
             sum(p.numel() for p in learner.avatar.parameters()),
-            times[recipe, False],
-            per_step(times[recipe, True], steps_at_once(learner)),
-            {} if on_gpu(learner.avatar.quats) else stages(learner, subject, repeats),
-            {} if on_gpu(learner.avatar.quats) else floors(with_stages(learner.avatar)),
+            early,
+            late,
+            {} if on_gpu(learner.avatar.quats) else stages(learner, repeats),
         )
-        for recipe, learner in learners.items()
+        for (recipe, learner), (early, late) in zip(learners.items(), times, strict=True)
     ]
 
 
@@ -132,8 +138,27 @@ def make_learner(
     return Learner(config, state, cycle(frames), steps, judge)
 
 
-def silent(_: str) -> None:
-    """What was said for one recipe holds for the other."""
+def time_steps(learners: Sequence[Learner], repeats: int, warm_up: int = 2) -> list[tuple[Time, Time]]:
+    """Milliseconds of an early and a late step of each, taken in turns."""
+    steps: dict[tuple[int, bool], Callable[[], object]] = {}
+    for index, learner in enumerate(learners):
+        for late in (False, True):
+            steps[index, late] = lambda learner=learner, late=late: run_steps(learner, late)
+    times = paired_medians(steps, repeats, warm_up=warm_up)
+    return [
+        (times[index, False], per_step(times[index, True], steps_at_once(learner)))
+        for index, learner in enumerate(learners)
+    ]
+
+
+def run_steps(learner: Learner, late: bool) -> None:
+    """One step with all degrees of colour but before the perceptual term; or the last ones, as many as hold one with it."""
+    if late:
+        for number in range(steps_at_once(learner)):
+            learner.step(first_late_step(learner) + number)
+    else:
+        learner.step(perceptual_start(learner.config.trainer) - 1)
+    settle(learner.avatar.device)
 
 
 def steps_at_once(learner: Learner) -> int:
@@ -141,63 +166,56 @@ def steps_at_once(learner: Learner) -> int:
     return learner.state.objective.perceptual.every
 
 
-def run_steps(learner: Learner, late: bool) -> None:
-    """One step with all degrees of colour but before the perceptual term; or the last ones, as many as hold one with it."""
-    iterations = learner.config.trainer.iterations
-    if late:
-        first = iterations // steps_at_once(learner) * steps_at_once(learner)
-        for number in range(first, first + steps_at_once(learner)):
-            learner.step(number)
-    else:
-        learner.step(perceptual_start(learner.config.trainer) - 1)
-    settle(learner.avatar.device)
+def first_late_step(learner: Learner) -> int:
+    """One with the perceptual term, at the end of the training."""
+    every = steps_at_once(learner)
+    return learner.config.trainer.iterations // every * every
 
 
 def per_step(time: Time, steps: int) -> Time:
     return Time(time.median / steps, time.p95 / steps, time.repeats)
 
 
-def stages(learner: Learner, subject: Subject, repeats: int) -> dict[str, Time]:
-    staged = StagedStep(learner.state)
-    size = learner.config.data.size
-    pixels = [
-        (frame.index, subject.pixels(frame.index, size)) for frame in (next(learner.frames) for _ in range(FRAMES))
+def stages(learner: Learner, repeats: int) -> dict[str, Time]:
+    """Of a step on a CPU, forward and backward."""
+    avatar, stopwatch = learner.avatar, Stopwatch()
+    watched = [(avatar, "draw", "splat"), (Objective, "loss", "loss"), (train_step, "check_step", "check")]
+    watched.append((learner.state.optimizer, "step", "optimizer"))
+    if isinstance(avatar, FlashAvatar):
+        watched += [(avatar, "points", "embedding"), (avatar.deformation, "forward", "network")]
+        watched += [] if avatar.grid is None else [(avatar, "interpolate", "interpolation")]
+        watched += [] if avatar.hyper is None else [(avatar, "offsets", "heads")]
+        watched.append((avatar, "compose", "compose"))
+    with ExitStack() as stack:
+        for owner, name, stage in watched:
+            stack.enter_context(stopwatch.watching(owner, name, stage))
+        for _ in range(repeats + 2):
+            stopwatch.lap()
+            learner.step(first_late_step(learner))
+    return stopwatch.times()
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Milliseconds of a step as median (95th percentile), then of the stages of a step with the perceptual term."""
+    lines = [
+        f"{'recipe':>9} {'Gaussians':>9} {'network at':>10} {'parameters':>10} {'ms, first half':>17} "
+        f"{'ms, second half':>17} {'faster':>7}"
     ]
-    number = learner.config.trainer.iterations // steps_at_once(learner) * steps_at_once(learner)
-    for turn in range(repeats + 2):
-        index, decoded = pixels[turn % len(pixels)]
-        staged(number, lambda index=index, decoded=decoded: subject.assemble(index, decoded, size))
-    return {name: time_of(values[2:]) for name, values in staged.watch.spans.items()}
+    for row in rows:
+        early, late = (f"{time.median:.1f} ({time.p95:.1f})" for time in (row.early, row.late))
+        places, faster = f"{row.places:,}" if row.places else "-", rows[0].late.median / row.late.median
+        lines.append(
+            f"{row.recipe:>9} {row.gaussians:9,} {places:>10} {row.parameters:10,} {early:>17} {late:>17} {faster:6.1f}x"
+        )
+    # The row with most stages knows their order.
+    names = [name for name in max((row.stages for row in rows), key=len) if not name.endswith(", backward")]
+    if names:
+        lines += ["", f"{'stage: forward / backward':>40} {''.join(f'{row.recipe:>24}' for row in rows)}"]
+    for name in names:
+        lines.append(f"{name:>40} {''.join(f'{stage_cell(row, name):>24}' for row in rows)}")
+    return lines
 
 
-def floors(avatar: FlashAvatar) -> dict[str, float]:
-    """Milliseconds in which this machine does the products, or moves the bytes, that a stage cannot do without.
-
-    Network: a product for the outputs, one for the weights' gradients and, behind the first layer, one for the inputs'.
-    Heads: parameters and latents read twice, their gradients written once, offsets and their gradients moved once.
-    Optimizer: parameters, gradients and both moments read, all but the gradients written. Check: gradients read.
-    """
-    threads, places, network = torch.get_num_threads(), len(avatar.code), avatar.deformation
-    first, *others = [layer.weight for layer in network.modules() if isinstance(layer, torch.nn.Linear)]
-    code = first[:, : network.code_size].numel()
-    products = 2 * code + 3 * sum(weight.numel() for weight in others)
-    everything = sum(parameter.nbytes for parameter in avatar.parameters())
-    found = {
-        "network": floor_ms(2.0 * places * products, 0.0, threads),
-        "optimizer": floor_ms(0.0, 7.0 * everything, threads),
-        "check": floor_ms(0.0, 1.0 * everything, threads),
-    }
-    if avatar.hyper is not None:
-        own = sum(parameter.nbytes for parameter in avatar.hyper.parameters())
-        moved = 3 * own + 4 * len(avatar) * (3 * avatar.config.latent_dim + 2 * 10)
-        found["heads"] = floor_ms(0.0, moved, threads)
-    return found
-
-
-def share_of_faithful(rows: Sequence[Row]) -> dict[str, float]:
-    """How many times faster each recipe's late step is than the first row's."""
-    return {row.recipe: rows[0].late.median / row.late.median for row in rows}
-
-
-def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    return [asdict(row) for row in rows]
+def stage_cell(row: Row, name: str) -> str:
+    times = [row.stages[part].median for part in (name, f"{name}, backward") if part in row.stages]
+    return " / ".join(f"{time:.2f}" for time in times) or "-"

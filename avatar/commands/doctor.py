@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from avatar.compute.availability import has_gpu_driver
 from avatar.config_values import config_dir
-from avatar.errors import UserError
+from avatar.errors import UserError, install
 from avatar.files.opening import check_file, is_there
 from avatar.files.places import named_path
 from avatar.files.third_party import (
@@ -180,7 +180,7 @@ def package(name: str) -> Finding:
     try:
         return Finding(name, version(name))
     except PackageNotFoundError:
-        return Finding(name, "missing", f"{purpose}: pip install 'hyperavatar[{extra}]'")
+        return Finding(name, "missing", f"{purpose}: {install(extra)}")
 
 
 def run_doctor(_: Namespace) -> int:

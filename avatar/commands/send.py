@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from typing import TYPE_CHECKING
 
 from avatar.commands.view import checked_token
 from avatar.head.assets import load_head_assets
 from avatar.motion.drive_file import read_drive
 from avatar.pipeline import OK
 from avatar.view.sender import send
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_send(arguments: Namespace) -> int:

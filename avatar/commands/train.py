@@ -166,25 +166,11 @@ def refuse_changed_run(run: Path, info: RunInfo, arguments: Namespace, overrides
 
 def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None:
     """Of the options that say how the folder is read, none may change."""
-    given = replace(
-        source,
-        tracking=source.tracking if arguments.tracking is None else arguments.tracking.resolve(),
-        frame_offset=source.frame_offset if arguments.frame_offset is None else arguments.frame_offset,
-        format=arguments.format or source.format,
-        fps=source.fps if arguments.fps is None else arguments.fps,
-        max_left_out=source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
-        ignore_misfit=source.ignore_misfit or arguments.ignore_misfit,
-    )
-    for field, option in (
-        ("tracking", "--tracking"),
-        ("frame_offset", "--frame-offset"),
-        ("format", "--format"),
-        ("fps", "--fps"),
-        ("max_left_out", "--max-left-out"),
-        ("ignore_misfit", "--ignore-misfit"),
-    ):
-        was, now = getattr(source, field), getattr(given, field)
-        if was != now:
-            began = f"without {option}" if was in (None, False) else f"with {option} {was}"
-            given_now = option if now is True else f"{option} {now}"
-            raise UserError(f"{run} began {began}, not with {given_now}: leave it out to resume, or start a new run")
+    for field in ("tracking", "frame_offset", "format", "fps", "max_left_out", "ignore_misfit"):
+        was, now, option = getattr(source, field), getattr(arguments, field), f"--{field.replace('_', '-')}"
+        now = now.resolve() if isinstance(now, Path) else now
+        if now is None or now is False or now == "" or now == was:
+            continue
+        began = f"without {option}" if was in (None, False) else f"with {option} {was}"
+        given_now = option if now is True else f"{option} {now}"
+        raise UserError(f"{run} began {began}, not with {given_now}: leave it out to resume, or start a new run")

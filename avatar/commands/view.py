@@ -14,13 +14,12 @@ from argparse import Namespace
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
 
 from avatar.commands.reenact import head_of
-from avatar.errors import UserError
+from avatar.errors import UserError, check_installed
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_run
@@ -34,9 +33,6 @@ from avatar.view.view_renderer import ViewRenderer
 from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.pictures import open_source
-
-if TYPE_CHECKING:
-    from avatar.view.server import Viewer
 
 WIDTHS = (64, 2048)
 CACHED_PICTURES = 64
@@ -56,7 +52,9 @@ def run_view(arguments: Namespace) -> int:
         raise UserError("--fov belongs to --webcam: it is the field of view of that camera")
     url = None if arguments.url is None else checked_url(arguments.url)
     token = checked_token(arguments.token) or secrets.token_hex(16)
-    viewer_type = viewer_class()
+    check_installed("avatar view", "view", "viser")
+    from avatar.view.server import Viewer
+
     motions = clips(trained, arguments.drive)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
     stage = ViewRenderer(trained, None if run is None else truth_of(run))
@@ -65,7 +63,7 @@ def run_view(arguments: Namespace) -> int:
         newest, name = (None, "") if live is None else (live.newest, live.name)
         player = Player(trained, motions, time.monotonic, newest, name)
         about = (None, None) if live is None else (live.status, live.calibrate)
-        viewer = viewer_type(stage, player, width, arguments.host, arguments.port, token, url, *about)
+        viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, url, *about)
         try:
             print(f"Open     {address(arguments.host, viewer.port, url)}?token={token}", flush=True)
             if isinstance(live, Receiver):
@@ -86,18 +84,6 @@ def run_view(arguments: Namespace) -> int:
         if live is not None:
             live.close()
     return OK
-
-
-def viewer_class() -> type[Viewer]:
-    """Raises UserError where what the viewer needs is not installed."""
-    try:
-        from avatar.view.server import Viewer
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"avatar view needs {error.name}, which is not installed: pip install 'hyperavatar[view]' (from a checkout: "
-            "pip install -e '.[view]')"
-        ) from None
-    return Viewer
 
 
 def checked_token(given: str | None) -> str | None:

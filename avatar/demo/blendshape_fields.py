@@ -129,10 +129,8 @@ def identity_displacement(points: np.ndarray) -> np.ndarray:
 class Mouth:
     """Weights of the mouth region at the vertices; millimetres."""
 
-    def __init__(self, points: np.ndarray, lip_side: np.ndarray) -> None:
+    def __init__(self, points: np.ndarray) -> None:
         self.p = points
-        self.side = lip_side
-        self.across = points[:, 0] / MOUTH_HALF_WIDTH
         self.up = points[:, 1] - MOUTH_CENTRE[1]
         front = smooth_step(points[:, 2], 45, 70)
         self.near = np.exp(-((points[:, 0] / 30) ** 4) - (self.up / 15) ** 4) * front
@@ -151,7 +149,7 @@ def expression_displacement(points: np.ndarray, lip_side: np.ndarray) -> dict[st
     alone cannot tell), and fades to 0 elsewhere.
     """
     p = points * 1e3
-    m = Mouth(p, lip_side)
+    m = Mouth(p)
     x, up = p[:, 0], m.up
     zero = np.zeros(len(p))
     upper, lower = np.clip(lip_side, 0, 1), np.clip(-lip_side, 0, 1)

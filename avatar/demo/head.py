@@ -43,7 +43,6 @@ class DemoHead:
     weights: np.ndarray  # [V, 5]
     eyelid_dirs: np.ndarray  # [2, V, 3] left, right
     regions: dict[str, np.ndarray]  # int64 vertex indices
-    lip_side: np.ndarray  # [V] 1 upper lip and above, -1 lower lip and below
 
 
 @cache
@@ -72,7 +71,6 @@ def demo_head() -> DemoHead:
         weights=_weights(mesh, side).astype(np.float32),
         eyelid_dirs=eyelids.astype(np.float32),
         regions=_regions(mesh, skin),
-        lip_side=side.astype(np.float32),
     )
 
 

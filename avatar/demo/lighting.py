@@ -58,6 +58,16 @@ def along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return turn(vectors, direction[None])[:, 0]
 
 
+def lookup(texture: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Bilinear samples [N, C] of a float32 map [T, T, C <= 4] at texel coordinates [N, 2] (0 is the first centre)."""
+    columns = -(-len(at) // 512)
+    padded = np.zeros((512 * columns, 2), np.float32)
+    padded[: len(at)] = at
+    grid = padded.reshape(512, columns, 2)
+    out = cv2.remap(texture, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return out.reshape(512 * columns, -1)[: len(at)]
+
+
 def ambient(normals: np.ndarray) -> np.ndarray:
     """Irradiance [N, 3] / pi from sky and ground."""
     up = 0.5 + 0.5 * normals[:, 1:2]
@@ -124,12 +134,7 @@ def shadow_basis(light: np.ndarray) -> np.ndarray:
 
 def lit_share(shadow_map: np.ndarray, points_on_map: np.ndarray) -> np.ndarray:
     """Share of the key light [N] that reaches points [N, 3] given in shadow-map pixels and depth in metres."""
-    columns = -(-len(points_on_map) // 512)
-    padded = np.zeros((512 * columns, 2), np.float32)
-    padded[: len(points_on_map)] = points_on_map[:, :2] - 0.5
-    padded = padded.reshape(512, columns, 2)
-    seen = cv2.remap(shadow_map, padded[..., 0], padded[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    seen = seen.reshape(-1)[: len(points_on_map)]
+    seen = lookup(shadow_map, points_on_map[:, :2] - 0.5)[:, 0]
     return np.minimum(seen * np.exp(-SHADOW_SHARPNESS * (points_on_map[:, 2] - SHADOW_BIAS)), 1.0)
 
 

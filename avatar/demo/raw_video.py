@@ -26,8 +26,6 @@ def make_video(
     size: int = 512,
     seed: int = 0,
     motion: Motion = "speech",
-    threads: int | None = None,
-    progress: bool = True,
 ) -> Path:
     """Film `frames` pictures of `size` x `size` pixels of the person of `seed` and write them as H.264 to `out` (.mp4).
 
@@ -40,27 +38,19 @@ def make_video(
         raise UserError(f"a video is written as .mp4, not as {out}")
     if out.exists():
         raise UserError(f"{out} exists; choose another name or remove it first")
-    check_arguments(frames, size, seed, motion, threads)
+    check_arguments(frames, size, seed, motion)
     with video_writer(out, FPS) as add:
-        for picture in tqdm(
-            filmed(frames, size, seed, motion, threads),
-            total=frames,
-            desc="filming",
-            unit="frame",
-            disable=not progress,
-        ):
+        for picture in tqdm(filmed(frames, size, seed, motion), total=frames, desc="filming", unit="frame"):
             add(picture)
     return out
 
 
-def filmed(
-    frames: int, size: int, seed: int, motion: Motion = "speech", threads: int | None = None
-) -> Iterator[np.ndarray]:
+def filmed(frames: int, size: int, seed: int, motion: Motion = "speech") -> Iterator[np.ndarray]:
     """The pictures, uint8 [size, size, 3], before they are encoded."""
     renderer = Renderer(sample_identity(seed))
     performance = perform(seed, frames, motion)
     with single_threads():
-        drawn = rendered(renderer, performance, size, threads)
+        drawn = rendered(renderer, performance, size)
         yield from in_room(((picture.image, picture.alpha) for _, _, picture in drawn), size, seed)
 
 

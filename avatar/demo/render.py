@@ -149,12 +149,12 @@ class Renderer:
         texels = pixels.interpolate(self._texels, performer.head.mesh.uv_faces[pixels.face])
         expression = params.expression.numpy()[: self._wrinkles_of.shape[1]]
         wrinkle = np.clip(self._wrinkles_of[:, : len(expression)] @ expression, 0.0, 1.2)
-        low, high = (shading.lookup(half, texels) for half in self._relief)
+        low, high = (lighting.lookup(half, texels) for half in self._relief)
         relief = low[:, :2] + wrinkle[0] * low[:, 2:] + wrinkle[1] * high[:, :2] + wrinkle[2] * high[:, 2:]
         gradients = np.concatenate(
             (lighting.turn(performer.slopes_u, R_view), lighting.turn(performer.slopes_v, R_view)), -1
         )
-        colour = shading.lookup(self.skin.colour, texels)
+        colour = lighting.lookup(self.skin.colour, texels)
         return shading.skin(surface, self.lights, colour, relief, pixels.interpolate(gradients))
 
     def _key_share(

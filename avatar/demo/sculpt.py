@@ -17,13 +17,13 @@ MOUTH_CENTRE = np.array([0.0, -47.5])  # frontal x, y
 MOUTH_HALF_WIDTH = 25.0
 
 
-def _smooth_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+def smooth_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
     h = np.maximum(k - np.abs(a - b), 0.0) / k
     return np.minimum(a, b) - h * h * (k / 4.0)
 
 
-def _smooth_max(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    return -_smooth_min(-a, -b, k)
+def smooth_max(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    return -smooth_min(-a, -b, k)
 
 
 def _ellipsoid(p: np.ndarray, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> np.ndarray:
@@ -47,40 +47,40 @@ def head_distance(points: np.ndarray) -> np.ndarray:
     p = np.array(points, dtype=np.float64)
     p[..., 0] = np.abs(p[..., 0])
     skull = _ellipsoid(p, (0, 52, -16), (75, 82, 96))
-    skull = _smooth_min(skull, _ellipsoid(p, (0, 56, 26), (60, 56, 66)), 18)
+    skull = smooth_min(skull, _ellipsoid(p, (0, 56, 26), (60, 56, 66)), 18)
     temple = _ellipsoid(p, (92, 34, 58), (24, 36, 36))
-    skull = _smooth_max(skull, -temple, 30)
+    skull = smooth_max(skull, -temple, 30)
 
     face = _ellipsoid(p, (0, 0, 30), (60, 76, 56))
-    face = _smooth_min(face, _ellipsoid(p, (0, -46, 38), (44, 44, 46)), 26)
-    face = _smooth_min(face, _round_cone(p, (44, -40, 0), (15, -77, 64), 12, 12), 26)
-    face = _smooth_min(face, _ellipsoid(p, (0, -80, 73), (17, 14, 16)), 18)
-    face = _smooth_min(face, _ellipsoid(p, (0, -43, 63), (30, 27, 29)), 18)
-    face = _smooth_min(face, _round_cone(p, (36, -4, 64), (52, 0, 30), 15, 12), 24)
-    face = _smooth_min(face, _ellipsoid(p, (27, -17, 68), (19, 19, 17)), 18)
-    head = _smooth_min(skull, face, 22)
+    face = smooth_min(face, _ellipsoid(p, (0, -46, 38), (44, 44, 46)), 26)
+    face = smooth_min(face, _round_cone(p, (44, -40, 0), (15, -77, 64), 12, 12), 26)
+    face = smooth_min(face, _ellipsoid(p, (0, -80, 73), (17, 14, 16)), 18)
+    face = smooth_min(face, _ellipsoid(p, (0, -43, 63), (30, 27, 29)), 18)
+    face = smooth_min(face, _round_cone(p, (36, -4, 64), (52, 0, 30), 15, 12), 24)
+    face = smooth_min(face, _ellipsoid(p, (27, -17, 68), (19, 19, 17)), 18)
+    head = smooth_min(skull, face, 22)
 
     brow = _round_cone(p, (10, 37, 81.5), (40, 39, 65), 9.0, 8.0)
-    head = _smooth_min(head, brow, 14)
+    head = smooth_min(head, brow, 14)
     socket = _ellipsoid(p, (31, 22.5, 90), (19.5, 12.5, 14))
-    head = _smooth_max(head, -socket, 12)
+    head = smooth_max(head, -socket, 12)
     lids = np.sqrt(((p - EYE_CENTRE) ** 2).sum(-1)) - LID_RADIUS
-    head = _smooth_min(head, lids, 6)
+    head = smooth_min(head, lids, 6)
 
     nose = _round_cone(p, (0, 27, 81), (0, -6, 98), 7.2, 8.6)
-    nose = _smooth_min(nose, _ellipsoid(p, (0, -13.5, 103), (10.0, 9.0, 10.0)), 10)
-    nose = _smooth_min(nose, _ellipsoid(p, (11.0, -17.5, 93), (7.0, 7.5, 11.0)), 9)
-    nose = _smooth_min(nose, _round_cone(p, (0, -20, 102), (0, -27, 88), 3.5, 4.0), 7)
-    head = _smooth_min(head, nose, 13)
+    nose = smooth_min(nose, _ellipsoid(p, (0, -13.5, 103), (10.0, 9.0, 10.0)), 10)
+    nose = smooth_min(nose, _ellipsoid(p, (11.0, -17.5, 93), (7.0, 7.5, 11.0)), 9)
+    nose = smooth_min(nose, _round_cone(p, (0, -20, 102), (0, -27, 88), 3.5, 4.0), 7)
+    head = smooth_min(head, nose, 13)
     nostril = _ellipsoid(p, (5.6, -25.5, 98.0), (2.4, 3.4, 4.2))
-    head = _smooth_max(head, -nostril, 3.5)
+    head = smooth_max(head, -nostril, 3.5)
     philtrum = _round_cone(p, (0, -29, 96.0), (0, -38, 97.0), 2.2, 2.8)
-    head = _smooth_max(head, -philtrum, 5)
+    head = smooth_max(head, -philtrum, 5)
     chin_crease = _ellipsoid(p, (0, -64.5, 97), (19, 4.5, 6))
-    head = _smooth_max(head, -chin_crease, 10)
+    head = smooth_max(head, -chin_crease, 10)
 
     neck = _neck_distance(p)
-    return _smooth_min(head, neck, 14)
+    return smooth_min(head, neck, 14)
 
 
 def _neck_distance(p: np.ndarray) -> np.ndarray:
@@ -91,10 +91,10 @@ def _neck_distance(p: np.ndarray) -> np.ndarray:
     half_z = 46.0 + 4.0 * down**2
     q = np.stack((p[..., 0] / half_x, (p[..., 2] - centre_z) / half_z), -1)
     column = (np.sqrt((q * q).sum(-1)) - 1.0) * np.minimum(half_x, half_z)
-    column = _smooth_max(column, p[..., 1] - 10.0, 20)
+    column = smooth_max(column, p[..., 1] - 10.0, 20)
     larynx = _ellipsoid(p, (0, -118, 6), (9, 15, 14))
     tendon = _round_cone(p, (40, -70, -18), (14, -175, 6), 9, 9)
-    return _smooth_min(_smooth_min(column, larynx, 16), tendon, 14)
+    return smooth_min(smooth_min(column, larynx, 16), tendon, 14)
 
 
 def cast(origins: np.ndarray, directions: np.ndarray, far: float = 240.0, near: float = 0.0) -> np.ndarray:

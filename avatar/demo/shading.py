@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from avatar.demo import lighting
-from avatar.demo.lighting import FILL_COLOUR, KEY_COLOUR, RIM_COLOUR, Lights, along, turn, unit
+from avatar.demo.lighting import FILL_COLOUR, KEY_COLOUR, RIM_COLOUR, Lights, along, lookup, turn, unit
 from avatar.demo.sculpt import EYE_RADIUS
 
 SKIN_WRAP = np.array([0.42, 0.20, 0.13], np.float32)
@@ -24,16 +23,6 @@ class Surface(NamedTuple):
     occlusion: np.ndarray  # [N] share of the sky that is seen
     colours: np.ndarray  # [N, 3] of the vertices
     lit: np.ndarray  # [N] share of the key light that arrives
-
-
-def lookup(texture: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Bilinear samples [N, C] of a float32 map [T, T, C <= 4] at texel coordinates [N, 2] (0 is the first centre)."""
-    columns = -(-len(at) // 512)
-    padded = np.zeros((512 * columns, 2), np.float32)
-    padded[: len(at)] = at
-    grid = padded.reshape(512, columns, 2)
-    out = cv2.remap(texture, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(512 * columns, -1)[: len(at)]
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

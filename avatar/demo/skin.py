@@ -16,7 +16,7 @@ from avatar.demo.blendshape_fields import smooth_step
 from avatar.demo.features import lip_line
 from avatar.demo.head import DemoHead
 from avatar.demo.identity import Identity
-from avatar.demo.sculpt import EYE_CENTRE
+from avatar.demo.sculpt import EYE_CENTRE, smooth_max, smooth_min
 from avatar.head.rasterize import rasterize_mesh
 
 
@@ -35,19 +35,10 @@ def hair_cover(points: np.ndarray, identity: Identity) -> np.ndarray:
     # From the temple down in front of the ear to the end of the sideburn, and behind the ear to the nape.
     edge = np.interp(y, (-2.0, 22.0, 45.0, 70.0, 100.0), (6.0, 10.0, 24.0, 40.0, 66.0))
     lowest = np.where(z > -6.0, 0.5, 30.0)
-    side = _round_min(0.8 * (edge - z), y - lowest, 8.0)
+    side = smooth_min(0.8 * (edge - z), y - lowest, 8.0)
     nape = -64.0 + 0.10 * (z + 90.0) + 0.004 * x**2
-    behind = _round_min(-27.0 - z, y - nape, 10.0)
-    return -_round_min(-front, -_round_max(side, behind, 4.0), 22.0)
-
-
-def _round_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    h = np.maximum(k - np.abs(a - b), 0.0) / k
-    return np.minimum(a, b) - h * h * (k / 4.0)
-
-
-def _round_max(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    return -_round_min(-a, -b, k)
+    behind = smooth_min(-27.0 - z, y - nape, 10.0)
+    return -smooth_min(-front, -smooth_max(side, behind, 4.0), 22.0)
 
 
 def fractal_noise(points: np.ndarray, period: float, octaves: int, seed: int) -> np.ndarray:
@@ -63,8 +54,8 @@ def fractal_noise(points: np.ndarray, period: float, octaves: int, seed: int) ->
     return total / np.sqrt(norm)
 
 
-def _chart_positions(head: DemoHead, size: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Per-vertex values [V, C] on the chart [T, T, C] and the covered mask [T, T]; uncovered texels copy the nearest."""
+def _on_chart(head: DemoHead, size: int, values: np.ndarray) -> np.ndarray:
+    """Per-vertex values [V, C] on the chart [T, T, C]; uncovered texels copy the nearest."""
     mesh = head.mesh
     uv = mesh.uvs
     screen = np.stack((uv[:, 0] * size, (1.0 - uv[:, 1]) * size, np.ones(len(uv))), -1)
@@ -73,14 +64,14 @@ def _chart_positions(head: DemoHead, size: int, values: np.ndarray) -> tuple[np.
     corners = values[mesh.faces[raster.face_id]]
     out = (corners * raster.barycentric[..., None]).sum(2)
     nearest = np.asarray(distance_transform_edt(~covered, return_distances=False, return_indices=True))
-    return out[nearest[0], nearest[1]].astype(np.float32), covered
+    return out[nearest[0], nearest[1]].astype(np.float32)
 
 
 def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     """Paint the person's skin on maps of `size` x `size` texels."""
     mesh = head.mesh
     V = len(head.template)
-    vermilion, lash, waterline = (np.zeros(V) for _ in range(3))
+    vermilion, lash, waterline, ears = (np.zeros(V) for _ in range(4))
     for level, weight in enumerate((1.0, 1.0, 1.0, 1.0, 1.0, 0.92, 0.5)):
         vermilion[mesh.mouth_rings[:, level]] = weight
     half = mesh.eye_rings.shape[-1] // 2
@@ -88,10 +79,10 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     lash[mesh.eye_rings[:, 2, 1:half]] = 0.62
     lash[mesh.eye_rings[:, 1, half:]] = 0.35
     waterline[mesh.eye_rings[:, 0]] = 1.0
-    values = np.column_stack((head.template * 1e3, vermilion, lash, waterline))
-    chart, _ = _chart_positions(head, size, values)
+    ears[mesh.ear_rings[:, :-2]] = 1.0
+    chart = _on_chart(head, size, np.column_stack((head.template * 1e3, vermilion, lash, waterline, ears)))
     P = chart[..., :3].reshape(-1, 3)
-    lip, lash_map, water = (chart[..., 3 + k].reshape(-1) for k in range(3))
+    lip, lash_map, water, ear = (chart[..., 3 + k].reshape(-1) for k in range(4))
     lip = smooth_step(lip, 0.25, 0.75)
     x, y, z = P.T
     ax = np.abs(x)
@@ -110,8 +101,6 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
         + 0.35 * spot(0, -82, 16, 11)
         + 0.3 * spot(28, 24, 18, 10)
     )
-    ears = np.zeros(V)
-    ears[mesh.ear_rings[:, :-2]] = 1.0
     red = red + 0.10 * broad
     colour *= np.clip(1.0 - red[:, None] * np.array([-0.02, 0.20, 0.19]), 0.5, 1.3)
     yellow = spot(0, 62, 40, 18)
@@ -145,7 +134,7 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     colour = colour * (1 - brows[:, None]) + brows[:, None] * brow_colour
     inside = hair_cover(P, identity)
     strands = fractal_noise(P * np.array([1.0, 0.2, 1.0]), 3.0, 2, seed + 11)
-    scalp = smooth_step(inside + 2.2 * strands, -2.0, 4.0) * (1 - ears_on_chart(head, size, ears))
+    scalp = smooth_step(inside + 2.2 * strands, -2.0, 4.0) * (1 - ear)
     streak = np.clip(1 + 0.25 * strands, 0.4, 1.7)
     colour = colour * (1 - 0.92 * scalp[:, None]) + 0.92 * scalp[:, None] * identity.hair_colour * streak[:, None]
 
@@ -180,10 +169,6 @@ def strand_tile(seed: int, size: int = 512) -> np.ndarray:
     fine = gaussian_filter(noise, (26.0, 0.8), mode="wrap")
     locks = gaussian_filter(noise[::-1], (40.0, 4.0), mode="wrap")
     return (0.8 * fine / fine.std() + 0.6 * locks / locks.std()).astype(np.float32)
-
-
-def ears_on_chart(head: DemoHead, size: int, ears: np.ndarray) -> np.ndarray:
-    return _chart_positions(head, size, ears[:, None])[0].reshape(-1)
 
 
 def _freckles(P: np.ndarray, identity: Identity) -> np.ndarray:

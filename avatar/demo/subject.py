@@ -36,23 +36,20 @@ def make_subject(
     size: int = 256,
     seed: int = 0,
     motion: Motion = "speech",
-    threads: int | None = None,
-    progress: bool = True,
     neutral_bias: float = 0.0,
 ) -> Path:
     """Render `frames` pictures of `size` x `size` pixels of the person of `seed`, and write them with their tracking.
 
-    The folder appears under its name only when it is complete. Same arguments, same files. `threads` defaults to the
-    number of cores. `neutral_bias` is how much of the shape the tracking explains by the expression (`tracking_bias`); the
-    pictures do not depend on it. Returns `out`. Raises UserError for values out of range and for a folder that is not
-    empty.
+    The folder appears under its name only when it is complete. Same arguments, same files. `neutral_bias` is how much of
+    the shape the tracking explains by the expression (`tracking_bias`); the pictures do not depend on it. Returns `out`.
+    Raises UserError for values out of range and for a folder that is not empty.
     """
     out = Path(out)
-    check_arguments(frames, size, seed, motion, threads)
+    check_arguments(frames, size, seed, motion)
     if not 0.0 <= neutral_bias <= 1.0:
         raise UserError(f"neutral_bias must be from 0 to 1, not {neutral_bias}")
     with _whole(out) as folder:
-        _write_subject(folder, frames, size, seed, motion, threads or os.cpu_count() or 1, progress, neutral_bias)
+        _write_subject(folder, frames, size, seed, motion, neutral_bias)
     return out
 
 
@@ -111,13 +108,12 @@ def tracking_bias(seed: int, strength: float) -> TrackingBias:
     return TrackingBias(torch.from_numpy(expression), shape)
 
 
-def check_arguments(frames: int, size: int, seed: int, motion: str, threads: int | None) -> None:
+def check_arguments(frames: int, size: int, seed: int, motion: str) -> None:
     """Raises UserError for values out of range."""
     for name, value, low, high in (
         ("frames", frames, 1, MAX_FRAMES),
         ("size", size, MIN_SIZE, MAX_SIZE),
         ("seed", seed, 0, 2**32 - 1),
-        ("threads", 1 if threads is None else threads, 1, 1024),
     ):
         if isinstance(value, bool) or not isinstance(value, int):
             raise UserError(f"{name} must be a whole number, not {value!r}")
@@ -134,9 +130,7 @@ def _check_place(out: Path) -> None:
         raise UserError(f"{out} is not empty; choose another output folder or remove it first")
 
 
-def _write_subject(
-    folder: Path, frames: int, size: int, seed: int, motion: Motion, threads: int, progress: bool, neutral_bias: float
-) -> None:
+def _write_subject(folder: Path, frames: int, size: int, seed: int, motion: Motion, neutral_bias: float) -> None:
     for name in ("imgs", "alpha", "parsing", "checkpoint"):
         (folder / name).mkdir()
     identity = sample_identity(seed)
@@ -145,10 +139,8 @@ def _write_subject(
     performance = perform(seed, frames, motion)
     bias = tracking_bias(seed, neutral_bias)
     with single_threads():
-        done = rendered(renderer, performance, size, threads)
-        for index, (params, camera, picture) in enumerate(
-            tqdm(done, total=frames, desc="rendering", unit="frame", disable=not progress)
-        ):
+        done = tqdm(rendered(renderer, performance, size), total=frames, desc="rendering", unit="frame")
+        for index, (params, camera, picture) in enumerate(done):
             tracked = replace(params, expression=params.expression + bias.expression)
             _write_frame(folder, index, tracked, camera, picture, identity.shape + bias.shape)
 
@@ -167,10 +159,10 @@ def single_threads() -> Iterator[None]:
 
 
 def rendered(
-    renderer: Renderer, performance: Performance, size: int, threads: int | None = None
+    renderer: Renderer, performance: Performance, size: int
 ) -> Iterator[tuple[HeadParams, Camera, RenderedFrame]]:
-    """Frames in order, rendered a few ahead by the threads."""
-    threads = threads or os.cpu_count() or 1
+    """Frames in order, rendered a few ahead, by as many threads as there are cores."""
+    threads = os.cpu_count() or 1
 
     def one(frame: int) -> tuple[HeadParams, Camera, RenderedFrame]:
         params, camera = frame_params(performance, frame), frame_camera(performance, frame, size)

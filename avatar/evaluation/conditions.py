@@ -14,13 +14,13 @@ from torch import Tensor
 from avatar.data.recording import Recording
 from avatar.head.model import HeadModel
 from avatar.motion.orbit import seen_from
-from avatar.types import IDENTITY_6D, Camera, HeadParams
+from avatar.types import IDENTITY_6D, HeadParams
 
 
 class Conditions(NamedTuple):
     """Field names are columns of frames.csv."""
 
-    yaw: float  # degrees
+    yaw: float  # degrees, from the front 0, positive from the head's own left; the neck's rotation counts as the head's
     expression_distance: float  # mm
 
 
@@ -30,16 +30,9 @@ def conditions(head: HeadModel, recording: Recording, indices: Sequence[int]) ->
         head, [recording.params(i) for i in indices], [recording.params(i) for i in recording.split.train]
     )
     return {
-        index: Conditions(yaw(recording.camera(index), recording.params(index)), distance)
+        index: Conditions(seen_from(recording.camera(index), recording.params(index)).yaw, distance)
         for index, distance in zip(indices, distances, strict=True)
     }
-
-
-def yaw(camera: Camera, params: HeadParams) -> float:
-    """The angle in degrees, about the head's vertical axis, from which the camera sees it: 0 from the front, positive from
-    the head's own left. The neck's rotation counts as the head's.
-    """
-    return seen_from(camera, params).yaw
 
 
 def expression_distances(head: HeadModel, frames: Sequence[HeadParams], training: Sequence[HeadParams]) -> list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -140,96 +140,75 @@ def choose_protocols(given: Sequence[str] | None) -> list[Protocol]:
 
 def read_protocol(path: Path) -> Protocol:
     """The protocol of a file. Raises UserError naming the file and the key for anything that is not as it should be."""
-    values = _read_yaml(path)
+    values = read_yaml(path, MAX_BYTES)
+    if not isinstance(values, dict):
+        raise UserError(f"{path} is not a protocol: it has to hold lines of the form key: value")
     if not NAME.fullmatch(path.stem):
         raise UserError(f"{path}: the file's name names the protocol and a folder; use letters, digits, - and _ only")
-    keys = [field.name for field in dataclasses.fields(Protocol) if field.name != "name"]
     for key in values:
-        if key not in keys:
-            near = difflib.get_close_matches(str(key), keys, n=1)
+        if key not in EXPECTED:
+            near = difflib.get_close_matches(str(key), EXPECTED, n=1)
             raise UserError(f"{path}: there is no key {key!r}" + (f"; the nearest is {near[0]!r}" if near else ""))
-    missing = [key for key in keys if key not in values]
+    missing = [key for key in EXPECTED if key not in values]
     if missing:
         raise UserError(f"{path}: {', '.join(missing)} missing; a protocol names every choice")
-    checked = {key: _CHECKS[key](path, key, values[key]) for key in keys}
+    checked = {}
+    for key, (read, expected) in EXPECTED.items():
+        try:
+            checked[key] = read(values[key])
+        except (ValueError, OverflowError):
+            shown = repr(values[key])
+            shown = f"{shown[:60]}{'...' if len(shown) > 60 else ''}"
+            raise UserError(f"{path}: {key} is {shown}, and has to be {expected}") from None
     protocol = Protocol(name=path.stem, **checked)
     if not protocol.clamp and protocol.levels != "float":
         raise UserError(f"{path}: clamp: false needs levels: float, because 8 bits hold nothing outside [0, 1]")
     return protocol
 
 
-def _read_yaml(path: Path) -> dict[Any, Any]:
-    values = read_yaml(path, MAX_BYTES)
-    if not isinstance(values, dict):
-        raise UserError(f"{path} is not a protocol: it has to hold lines of the form key: value")
-    return values
-
-
-def _text(path: Path, key: str, value: Any) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise _wrong(path, key, value, "a sentence")
-    return value.strip()
-
-
-def _frames(path: Path, key: str, value: Any) -> str | int:
-    if value == HELD_OUT or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
-        return value
-    raise _wrong(path, key, value, f"{HELD_OUT}, or how many frames at the end of the video")
-
-
-def _colour(path: Path, key: str, value: Any) -> Colour:
-    try:
-        return parse_colour(value)
-    except (ValueError, OverflowError):
-        words = COLOUR_WORDS.replace("#rrggbb", '"#rrggbb"')  # without quotes it is a comment
-        raise _wrong(path, key, value, words) from None
-
-
-def _flag(path: Path, key: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise _wrong(path, key, value, "true or false")
+def _if(is_right: bool, value: Any) -> Any:
+    """The value. Raises ValueError where it is wrong."""
+    if not is_right:
+        raise ValueError
     return value
 
 
-def _regions(path: Path, key: str, value: Any) -> tuple[Region, ...]:
-    if isinstance(value, list) and len(set(map(str, value))) == len(value) and all(v in REGIONS for v in value):
-        return tuple(region for region in REGIONS if region in value)
-    raise _wrong(path, key, value, f"a list of some of {', '.join(REGIONS)}, each once")
+def _text(value: Any) -> str:
+    return _if(isinstance(value, str) and bool(value.strip()), value).strip()
 
 
-def _scale(path: Path, key: str, value: Any) -> float:
-    if not _is_number(value) or not 0 < value <= 1:
-        raise _wrong(path, key, value, "a number above 0, at most 1")
-    return float(value)
+def _frames(value: Any) -> str | int:
+    return _if(value == HELD_OUT or (isinstance(value, int) and not isinstance(value, bool) and value > 0), value)
 
 
-def _one_of(*choices: str) -> Any:
-    def check(path: Path, key: str, value: Any) -> str:
-        if value not in choices:
-            raise _wrong(path, key, value, f"one of {', '.join(choices)}")
-        return value
-
-    return check
+def _flag(value: Any) -> bool:
+    return _if(isinstance(value, bool), value)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _regions(value: Any) -> tuple[Region, ...]:
+    is_list = isinstance(value, list) and len(set(map(str, value))) == len(value)
+    _if(is_list and all(one in REGIONS for one in value), value)
+    return tuple(region for region in REGIONS if region in value)
 
 
-def _wrong(path: Path, key: str, value: Any, expected: str) -> UserError:
-    shown = repr(value)
-    return UserError(f"{path}: {key} is {shown[:60]}{'...' if len(shown) > 60 else ''}, and has to be {expected}")
+def _scale(value: Any) -> float:
+    return float(_if(isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= 1, value))
 
 
-_CHECKS = {
-    "summary": _text,
-    "source": _text,
-    "frames": _frames,
-    "background": _colour,
-    "mask": _one_of(*get_args(Mask)),
-    "clamp": _flag,
-    "levels": _one_of(*get_args(Levels)),
-    "regions": _regions,
-    "lpips_net": _one_of(*get_args(Net)),
-    "lpips_scale": _scale,
+def _choice(*choices: str) -> tuple[Callable[[Any], str], str]:
+    return lambda value: _if(value in choices, value), f"one of {', '.join(choices)}"
+
+
+# Every key of a file: what reads its value, and what that has to be.
+EXPECTED: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "summary": (_text, "a sentence"),
+    "source": (_text, "a sentence"),
+    "frames": (_frames, f"{HELD_OUT}, or how many frames at the end of the video"),
+    "background": (parse_colour, COLOUR_WORDS.replace("#rrggbb", '"#rrggbb"')),  # without quotes it is a comment
+    "mask": _choice(*get_args(Mask)),
+    "clamp": (_flag, "true or false"),
+    "levels": _choice(*get_args(Levels)),
+    "regions": (_regions, f"a list of some of {', '.join(REGIONS)}, each once"),
+    "lpips_net": _choice(*get_args(Net)),
+    "lpips_scale": (_scale, "a number above 0, at most 1"),
 }

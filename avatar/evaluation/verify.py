@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from skimage.io import imread
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import structural_similarity
 from tqdm import tqdm
 
 from avatar.data.images import MAX_BYTES
@@ -27,7 +27,7 @@ from avatar.errors import UserError
 from avatar.evaluation.pictures import MASK_FOLDERS, RENDERS
 from avatar.evaluation.previous_results import MAX_TABLE_BYTES
 from avatar.evaluation.protocol import column
-from avatar.evaluation.tracking_source import Drive, Part, parts
+from avatar.evaluation.tracking_source import Part, parts
 from avatar.files.atomic import write_atomically
 from avatar.files.opening import read_bytes, read_json
 
@@ -68,8 +68,9 @@ def verify(results: Path, protocols: Sequence[str] | None = None, say: Callable[
                 "tolerance": TOLERANCE,
                 "largest_difference": worst.size,
             }
+            title = name if len(own) == 1 else f"{name}, {drive}"
             say(
-                f"{_title(name, drive, own)}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; "
+                f"{title}: PSNR, SSIM and jitter of {frames} frames verified from their pictures; "
                 f"largest difference {worst.size:.1e} ({worst.figure} of {worst.where})"
             )
     write_atomically(results, json.dumps(summary, indent=2, allow_nan=False).encode())
@@ -104,10 +105,6 @@ def verify_part(folder: Path, choices: Mapping[str, Any], part: Part) -> tuple[D
     return worst, len(rows)
 
 
-def _title(protocol: str, drive: Drive, own: Mapping[Drive, Part]) -> str:
-    return protocol if len(own) == 1 else f"{protocol}, {drive}"
-
-
 def differences(recorded: Figures, seen: Figures, where: str, file: Path) -> Iterator[Difference]:
     """Of each figure that both have. Raises UserError for one that is too large, or that only one side has."""
     for name, value in seen.items():
@@ -129,19 +126,14 @@ def recompute(folder: Path, index: int, choices: Mapping[str, Any], renders: str
     renders  the folder of the renders
     """
     render, truth, head = (_read(folder / kind / f"{index:05d}.png") for kind in (renders, "gt", "masks"))
-    regions: Sequence[str] = choices["regions"]
-    masks = {region: _mask(folder, region, index, head.shape) for region in regions}
+    whole = np.ones_like(head)
     if choices["mask"] == "multiply":
         weight = head[..., None] / _LEVELS
-        figures = _of_frame(render * weight, truth * weight)
+        figures = _weighted_figures(render * weight, truth * weight, {None: whole})
     else:
-        figures = _of_frame(render, truth)
-    error, similarity = _maps(render, truth)
-    if choices["mask"] == "only":
-        figures = _of_region(error, similarity, head, None)
-    for region, mask in masks.items():
-        figures |= _of_region(error, similarity, mask, region)
-    return figures
+        figures = _weighted_figures(render, truth, {None: head if choices["mask"] == "only" else whole})
+    masks = {region: _mask(folder, region, index, head.shape) for region in choices["regions"]}
+    return figures | _weighted_figures(render, truth, masks)
 
 
 def recompute_jitter(folder: Path, index: int, renders: str = RENDERS) -> float:
@@ -154,23 +146,16 @@ def recompute_jitter(folder: Path, index: int, renders: str = RENDERS) -> float:
     return _weighted(np.abs(np.diff(errors, n=2, axis=0)[0]).mean(axis=2), np.min(masks, axis=0))
 
 
-def _of_frame(render: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]) -> Figures:
-    with np.errstate(divide="ignore"):  # equal pictures: infinite
-        psnr = float(peak_signal_noise_ratio(truth, render, data_range=_LEVELS))
-    return {"psnr": psnr, "ssim": float(_similarity(render, truth)[0])}
-
-
-def _maps(
-    render: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]
-) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """Squared error of values in [0, 1] and SSIM, means of the channels."""
-    return np.square((render - truth) / _LEVELS).mean(axis=2), _similarity(render, truth)[1].mean(axis=2)
-
-
-def _similarity(a: Float[np.ndarray, "H W 3"], b: Float[np.ndarray, "H W 3"]) -> tuple[float, np.ndarray]:
-    return structural_similarity(  # type: ignore[return-value]
-        a,
-        b,
+def _weighted_figures(
+    render: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], masks: Mapping[str | None, np.ndarray]
+) -> Figures:
+    """Weighted means of squared error and of the SSIM map, by column of frames.csv; None is the main figure."""
+    if not masks:
+        return {}
+    error = np.square((render - truth) / _LEVELS).mean(axis=2)
+    _, similarity = structural_similarity(  # type: ignore[misc]
+        render,
+        truth,
         gaussian_weights=True,
         sigma=1.5,
         use_sample_covariance=False,
@@ -178,18 +163,13 @@ def _similarity(a: Float[np.ndarray, "H W 3"], b: Float[np.ndarray, "H W 3"]) ->
         channel_axis=2,
         full=True,
     )
-
-
-def _of_region(
-    error: Float[np.ndarray, "H W"],
-    similarity: Float[np.ndarray, "H W"],
-    mask: Float[np.ndarray, "H W"],
-    region: str | None,
-) -> Figures:
     inside = np.s_[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
-    with np.errstate(divide="ignore"):
-        psnr = -10.0 * np.log10(_weighted(error, mask))
-    return {column("psnr", region): float(psnr), column("ssim", region): _weighted(similarity[inside], mask[inside])}
+    figures = {}
+    for region, mask in masks.items():
+        with np.errstate(divide="ignore"):  # equal pictures: infinite
+            figures[column("psnr", region)] = float(-10.0 * np.log10(_weighted(error, mask)))
+        figures[column("ssim", region)] = _weighted(similarity.mean(axis=2)[inside], mask[inside])
+    return figures
 
 
 def _weighted(values: Float[np.ndarray, "H W"], weights: Float[np.ndarray, "H W"]) -> float:

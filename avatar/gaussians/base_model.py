@@ -42,7 +42,6 @@ class Avatar(nn.Module):
     """
 
     is_fused = False  # whether a GPU has kernels for all that follows the network, in place of torch's own operations
-    has_stages = False  # whether a frame goes through the stages of `avatar.model`, which `avatar bench` times
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 

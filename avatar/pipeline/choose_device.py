@@ -14,11 +14,11 @@ import torch
 from avatar.compute.availability import has_gpu_driver
 from avatar.compute.device import CPU
 from avatar.config_values import check_device
-from avatar.errors import UserError
+from avatar.errors import UserError, install
 
 LEAST_TRITON = (3, 6, 0)  # the oldest that the kernels have run with
 LEAST_CAPABILITY = (8, 0)  # of NVIDIA's devices: the oldest that the kernels are compiled for
-INSTALL = "pip install 'hyperavatar[gpu]'"
+INSTALL = install("gpu")
 
 
 class NoGpu(UserError):

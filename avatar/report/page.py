@@ -9,11 +9,11 @@ from typing import Any
 
 from avatar.config import flatten
 from avatar.data.images import MAX_BYTES
-from avatar.errors import UserError, check_installed
-from avatar.evaluation.evaluate import RESULTS_FORMAT
+from avatar.errors import check_installed
+from avatar.evaluation.compare import read_evaluation
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import is_there, read_bytes, read_json
+from avatar.files.opening import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
 from avatar.report.pictures import frame_panels
@@ -43,7 +43,8 @@ def write_report(run: Run) -> Path:
 
 
 def render_report(run: Run) -> str:
-    results = read_results(run.path / "eval" / "results.json")
+    is_measured = is_there(run.path / "eval" / "results.json")
+    results = read_evaluation(run.path.name, run.path).results if is_measured else None
     facts = {
         "subject": run.subject.name,
         "method": run.config.model.name,
@@ -62,19 +63,6 @@ def render_report(run: Run) -> str:
         section("Origin", *_origin(run, results)),
     ]
     return document(f"Run {run.path.name}", parts, SCRIPT)
-
-
-def read_results(path: Path) -> dict[str, Any] | None:
-    """What `avatar eval` wrote, or None where it has not run."""
-    if not is_there(path):
-        return None
-    try:
-        results = read_json(path)
-    except UserError as error:
-        raise UserError(f"{error}; run avatar eval again") from None
-    if not isinstance(results, dict) or results.get("format") != RESULTS_FORMAT:
-        raise UserError(f"{path} is not a results file of this version of the program; run avatar eval again")
-    return results
 
 
 def means_table(protocols: Mapping[str, Any], mark: str = "") -> Markup:

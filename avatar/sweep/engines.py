@@ -7,17 +7,17 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
 from avatar.compute.device import visible_gpus
 from avatar.compute.memory import available_bytes
-from avatar.errors import UserError
+from avatar.errors import UserError, check_installed
 from avatar.sweep.spec import Resources, Spec
 from avatar.sweep.worker import Worker, work_until_done
 
-ENGINES = ("local", "ray", "slurm")
-LONGEST_MINUTES = 24 * 60
+LONGEST_MINUTES = 24 * 60  # of a SLURM job; training goes on in the next one
 
 
 class Engine(Protocol):
@@ -47,7 +47,6 @@ class EngineOptions:
     workers: int | None = None  # at a time; None: as many as fit
     address: str | None = None  # of a Ray cluster
     partition: str | None = None  # of a SLURM cluster
-    minutes: int = LONGEST_MINUTES  # of a SLURM job; training goes on in the next one
 
 
 def make_engine(name: str, spec: Spec, folder: Path, options: EngineOptions) -> Engine:
@@ -60,9 +59,7 @@ def make_engine(name: str, spec: Spec, folder: Path, options: EngineOptions) -> 
     gpus = spec.gpus_of_a_job(False)
     if name == "ray":
         return RayCluster(resources, gpus, options.address, options.workers)
-    if name == "slurm":
-        return SlurmCluster(resources, gpus, folder / "slurm", options)
-    raise UserError(f"--engine must be one of {', '.join(ENGINES)}, not {name!r}")
+    return SlurmCluster(resources, gpus, folder / "slurm", options)
 
 
 def workers_that_fit(resources: Resources) -> int:
@@ -148,7 +145,8 @@ class RayCluster:
         own = address is None and "RAY_ADDRESS" not in os.environ
         if own:  # read when Ray is imported; the name is older than its use: without it, Ray takes a public address
             os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
-        ray = _import("ray", "ray")
+        check_installed("--engine ray", "ray", "ray")
+        ray: Any = import_module("ray")
         options: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if own else {}
         try:
             ray.init(address=address, log_to_driver=False, logging_level="error", **options)
@@ -189,7 +187,8 @@ class SlurmCluster:
     name = "slurm"
 
     def __init__(self, resources: Resources, gpus: float, folder: Path, options: EngineOptions) -> None:
-        submitit = _import("submitit", "slurm")
+        check_installed("--engine slurm", "slurm", "submitit")
+        submitit: Any = import_module("submitit")
         if options.address is None and shutil.which("sbatch") is None:  # submitit would run the jobs here
             raise UserError(
                 "there is no SLURM on this machine (no sbatch): start the sweep on one of its cluster's machines, or take "
@@ -204,7 +203,7 @@ class SlurmCluster:
             cpus_per_task=resources.threads,
             mem_gb=resources.memory_gb,
             gpus_per_node=math.ceil(gpus),
-            timeout_min=options.minutes,
+            timeout_min=LONGEST_MINUTES,
             **({"slurm_partition": options.partition} if options.partition else {}),
             **({"slurm_array_parallelism": options.workers} if options.workers else {}),
         )
@@ -242,12 +241,3 @@ class Requeued:
         import submitit
 
         return submitit.helpers.DelayedSubmission(self, folder)
-
-
-def _import(module: str, extra: str) -> Any:
-    try:
-        return __import__(module)
-    except ImportError:
-        raise UserError(
-            f"--engine {extra} needs the package {module}: pip install 'hyperavatar[{extra}]', or {module}"
-        ) from None

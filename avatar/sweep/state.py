@@ -48,7 +48,7 @@ class State:
 
 def write_sweep(folder: Path, spec: Spec) -> None:
     """Write the jobs that are not there yet. Raises UserError for a folder that holds another sweep's jobs."""
-    known = {job.name: job for job in read_jobs(folder)} if (folder / SWEEP_FILE).is_file() else {}
+    known = {job.name: job for job in read_sweep(folder).jobs} if (folder / SWEEP_FILE).is_file() else {}
     for job in spec.jobs:
         if job.name in known and known[job.name] != job:
             raise UserError(
@@ -80,10 +80,6 @@ def read_sweep(folder: Path) -> Spec:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{folder / 'sweep.json'} is damaged ({error}); start the sweep again") from None
-
-
-def read_jobs(folder: Path) -> tuple[Job, ...]:
-    return read_sweep(folder).jobs
 
 
 def read_job(folder: Path) -> Job:

@@ -16,7 +16,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.bench import refine as bench
 from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed, tracking_noise
-from avatar.bench.refine import Figures, Row, coefficients_outside, recovered, report, vertex_errors
+from avatar.bench.refine import Figures, Row, recovered, report, vertex_error
 from avatar.cli import main
 from avatar.data.recording import Recording
 from avatar.gaussians.base_model import Avatar
@@ -50,13 +50,9 @@ def test_the_disturbance_is_as_large_as_it_says(avatar: Avatar, recording: Recor
     assert torch.equal(bent.tracks["shape"], recording.tracks["shape"])
 
 
-def test_it_is_the_same_for_a_seed_and_grows_with_the_scale(avatar: Avatar, recording: Recording) -> None:
+def test_it_is_the_same_for_a_seed(avatar: Avatar, recording: Recording) -> None:
     first, again, other = (disturbed(recording, avatar.head, seed) for seed in (1, 1, 2))
     assert torch.equal(first.tracks["t"], again.tracks["t"]) and not torch.equal(first.tracks["t"], other.tracks["t"])
-    double = disturbed(recording, avatar.head, 1, scale=2.0)
-    one, two = (values_of(bent.tracks)[:, EXPRESSION] for bent in (first, double))
-    expected = 2.0 * (one - values_of(recording.tracks)[:, EXPRESSION])
-    assert torch.allclose(two - values_of(recording.tracks)[:, EXPRESSION], expected, atol=1e-5)
 
 
 def test_most_of_the_noise_drifts_and_a_fifth_does_not() -> None:
@@ -67,49 +63,25 @@ def test_most_of_the_noise_drifts_and_a_fifth_does_not() -> None:
     assert float((noise[20:] * noise[:-20]).mean()) > 0.3 > float((noise[60:] * noise[:-60]).mean())
 
 
-def test_vertex_errors_are_in_the_cameras_millimetres_and_the_videos_pixels(avatar: Avatar) -> None:
+def test_vertex_errors_are_in_the_videos_pixels(avatar: Avatar) -> None:
     truth = drawn_clip(avatar, frames=4, train=2).recording
     off = replace(truth, tracks={**truth.tracks, "t": truth.tracks["t"] + torch.tensor([0.002, 0.0, 0.0])})
-    mm, px = vertex_errors(avatar.head, off, truth)
-    assert mm == pytest.approx(2.0, rel=1e-3)
-    assert px == pytest.approx(truth.intrinsics[0] * 0.002 / 0.8, rel=0.1)
-    assert vertex_errors(avatar.head, truth, truth) == (0.0, 0.0)
-
-
-def test_coefficients_outside_are_those_that_left_the_range_of_training(avatar: Avatar) -> None:
-    before = drawn_clip(avatar, frames=6, train=4).recording
-    highest = before.tracks["expression"][:4].amax(dim=0)
-
-    def moved(frame: int, coefficient: int, value: torch.Tensor) -> Recording:
-        expression = before.tracks["expression"].clone()
-        expression[frame, coefficient] = value
-        return replace(before, tracks={**before.tracks, "expression": expression})
-
-    assert coefficients_outside(before, before) == 0
-    assert coefficients_outside(moved(2, 1, highest[1]), before) == 0
-    assert coefficients_outside(moved(2, 1, highest[1] + 0.01), before) == 1
-    was_outside = moved(5, 0, highest[0] + 1.0)
-    assert coefficients_outside(moved(5, 0, highest[0] + 0.5), was_outside) == 0
-
-
-def figures(value: float) -> Figures:
-    return Figures(value, 0.9, 0.05, 20.0)
+    assert vertex_error(avatar.head, off, truth) == pytest.approx(truth.intrinsics[0] * 0.002 / 0.8, rel=0.1)
+    assert vertex_error(avatar.head, truth, truth) == 0.0
 
 
 def test_the_share_recovered_and_the_report() -> None:
     rows = [
-        Row("as given", figures(28.0), None, figures(28.0), 0.0, 0.0, 0, None),
-        Row("given, refined", figures(28.5), figures(28.1), figures(28.2), 0.2, 0.1, 0, 12.4),
-        Row("disturbed", figures(25.0), None, figures(26.0), 1.2, 0.8, 0, None),
-        Row("disturbed, refined", figures(27.4), figures(25.2), figures(26.5), 0.6, 0.3, 2, 13.6),
+        Row("as given", Figures(28.0, 0.9, 0.05), 0.0),
+        Row("given, refined", Figures(28.5, 0.9, 0.05), 0.1),
+        Row("disturbed", Figures(25.0, 0.8, 0.05), 0.8),
+        Row("disturbed, refined", Figures(27.4, 0.9, 0.05), 0.3),
     ]
     assert recovered(rows) == pytest.approx(0.8)
     config = SimpleNamespace(trainer=SimpleNamespace(iterations=1500, passes=None))
     text = report(rows, config)  # type: ignore[arg-type]
-    assert "80% of the PSNR lost" in text and "12 and 14 s" in text and "1500 steps" in text
-    line = next(line for line in text.splitlines() if "disturbed, refined" in line)
-    assert [line.split()[column] for column in (2, 6, 10)] == ["25.20", "27.40", "26.50"], "the fitted one is not first"
-    assert line.split()[-3:] == ["0.600", "0.300", "2"]
+    assert "1500 steps" in text[0] and "80% of the PSNR lost" in text[-1]
+    assert text[5].split() == ["disturbed,", "refined", "27.40", "0.9000", "0.300"]
 
 
 @pytest.mark.slow
@@ -127,10 +99,9 @@ def test_a_quick_run_leaves_its_figures_and_nothing_else(
         "disturbed",
         "disturbed, refined",
     ]
-    first, better, bent, again = written["rows"]
-    assert first["vertices_mm"] == 0.0 < bent["vertices_mm"] and bent["outside"] == again["outside"] == 0
-    assert first["own"] == first["given"] and first["before"] is None and better["before"] is not None
+    first, _, bent, again = written["rows"]
+    assert first["pixels"] == 0.0 < bent["pixels"]
     assert written["config"]["data"]["size"] == 40 and written["disturbance"]["degrees"] == TURN_DEGREES
-    assert f"{again['own']['psnr']:.2f}" in capsys.readouterr().out
+    assert f"{again['figures']['psnr']:.2f}" in capsys.readouterr().out
     left = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert left == ["bench_refine_someone.json", "bench_refine_someone.md"]

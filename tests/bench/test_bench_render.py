@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_runs import train_small
 
-from avatar.bench.render import STEPS, compare, inputs, measure, next_of
+from avatar.bench.render import compare, inputs, measure, next_of
 from avatar.cli import main
 from avatar.errors import UserError
 from avatar.render import Renderer
@@ -23,19 +23,18 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return run
 
 
-def test_quick_run_prints_a_table_and_writes_figures_and_plot(
+def test_quick_run_prints_a_table_and_writes_figures(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["bench", "render", str(trained), "--quick", "--out", str(tmp_path)]) == 0
     written = json.loads((tmp_path / "bench_render.json").read_text())
     assert written["avatar"]["step"] == 12 and written["machine"]["threads"] == torch.get_num_threads()
     (row,) = written["rows"]
-    assert tuple(row["steps"]) == STEPS
+    assert set(row["steps"]) == {"skinning", "embedding", "network", "heads", "compose", "splat"}
     for span in (*row["steps"].values(), row["frame"], row["latency"], row["latency_of_avatar"]):
         assert 0 < span["median"] <= span["p95"] and span["repeats"] == 3
     assert row["stream_fps"] > 0
     assert row["error"]["gaussians"] <= 1e-4 and row["error"]["image_mean"] <= 1e-5
-    assert (tmp_path / "bench_render.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert f"{row['stream_fps']:.0f} fps" in printed and f"{row['latency']['median']:.2f}" in printed
 
@@ -63,11 +62,11 @@ def test_the_frames_are_held_out_and_of_the_size_that_is_asked_for(trained: Path
     assert len(measure(one_frame, (16,), repeats=2)) == 1
 
 
-def test_an_avatar_without_a_network_gets_a_sentence(tracked_folder: Path, tmp_path: Path) -> None:
+def test_an_avatar_without_a_network_has_fewer_steps(tracked_folder: Path, tmp_path: Path) -> None:
     train_small(tracked_folder, tmp_path / "run", ["model=splattingavatar"])
     run = open_trained(tmp_path / "run")
-    with pytest.raises(UserError, match="the steps of a frame of model=splattingavatar are not timed"):
-        measure(run, (16,), repeats=2)
+    (row,) = measure(run, (16,), repeats=2)
+    assert list(row.steps) == ["skinning", "splat"]
 
 
 def test_calls_take_turns() -> None:

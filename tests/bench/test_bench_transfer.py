@@ -21,9 +21,9 @@ def test_quick_run_prints_a_table_and_writes_figures(tmp_path: Path, capsys: pyt
     rows = {row["transfer"]: row for row in written["rows"]}
     assert {row["tracking"] for row in written["rows"]} == {"as given"}
     assert set(rows) == {"raw", "relative", "mean", "pca", "true motion"}
-    assert all(row["full"] > row["head"] > 10.0 for row in rows.values()), "the avatar is not where the truth is"
+    assert all(row["figures"]["psnr"] > 10.0 for row in rows.values()), "the avatar is not where the truth is"
     printed = capsys.readouterr().out
-    assert all(f"{row['full']:.2f}" in printed for row in rows.values())
+    assert all(f"{row['figures']['psnr']:.2f}" in printed for row in rows.values())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bench_transfer.json", "bench_transfer.md"], (
         "the scratch folder is gone"
     )
@@ -45,7 +45,7 @@ def test_the_bias_is_a_persons_own_and_shape_makes_up_for_most_of_it(tmp_path: P
 
 @pytest.mark.slow
 def test_avatars_of_disturbed_and_refined_tracking_are_driven_too(tmp_path: Path) -> None:
-    rows = transfer.measure(transfer.QUICK, tmp_path, ["trainer.iterations=40"], transfer.TRACKINGS)
+    rows = transfer.measure(transfer.QUICK, tmp_path, ["trainer.iterations=40"], full=True)
     by_tracking = {row.tracking: row for row in rows if row.transfer == "relative"}
     assert tuple(by_tracking) == transfer.TRACKINGS
-    assert len({row.head for row in by_tracking.values()}) == 3
+    assert len({row.figures.psnr for row in by_tracking.values()}) == 3

@@ -76,7 +76,7 @@ def test_what_tracking_lacks_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     said: list[str] = []
     assert not can_track(said.append)
     (why,) = said
-    assert "pip install 'hyperavatar[track]'" in why or "face_landmarker.task" in why
+    assert "pip install '.[track]'" in why or "face_landmarker.task" in why
     made: list[str] = []
     monkeypatch.setattr(demo, "make_tracked", lambda person, out: made.append(person.name))
     avatar("demo", tmp_path / "demo", status=1)  # nothing was made

@@ -86,8 +86,8 @@ def test_a_package_that_is_missing_has_its_extra(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(doctor, "version", version)
     found = rows(avatar("doctor"))
-    assert found["viser"] == ("missing", "avatar view: pip install 'hyperavatar[view]'")
-    assert "hyperavatar[plots]" in found["matplotlib"][1] and "hyperavatar[track]" in found["mediapipe"][1]
+    assert found["viser"] == ("missing", "avatar view: pip install '.[view]' in the program's checkout")
+    assert "'.[plots]'" in found["matplotlib"][1] and "'.[track]'" in found["mediapipe"][1]
 
 
 @pytest.mark.parametrize("part", ["draw_one_triangle", "config_dir"])

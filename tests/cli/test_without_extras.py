@@ -9,7 +9,7 @@ import pytest
 from command_line import avatar
 from small_runs import SMALL
 
-INSTALL = "pip install 'hyperavatar[plots]'"
+INSTALL = "pip install '.[plots]'"
 
 
 @pytest.fixture(autouse=True)

@@ -77,7 +77,7 @@ def attribute(owner: object, name: str, value: object) -> Callable[[pytest.Monke
 
 NO_COMPILER = subprocess.CalledProcessError(1, ["gcc"])
 MISSING: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], str]] = {
-    "CPU-only torch": (lacks_cuda, r"torch \S+ is a build for CPUs; .* pip install 'hyperavatar\[gpu\]'"),
+    "CPU-only torch": (lacks_cuda, r"torch \S+ is a build for CPUs; .* pip install '\.\[gpu\]'"),
     "no driver": (lacks_driver, r"finds no GPU \(Found no NVIDIA driver on your system\.\): .* nvidia-smi"),
     "no device": (lacks_devices, r"finds no GPU \(no device\)"),
     "too old": (

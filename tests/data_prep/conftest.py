@@ -41,7 +41,7 @@ def original(tracked: Path, tmp_path_factory: pytest.TempPathFactory) -> Subject
 def tracking_models() -> Iterator[None]:
     """The published models, from where the person keeps them, else from the development data beside the checkout."""
     if importlib.util.find_spec("mediapipe") is None:
-        pytest.skip("MediaPipe is not installed: pip install 'hyperavatar[track]'")
+        pytest.skip("MediaPipe is not installed: pip install '.[track]'")
     shared = Path(__file__).resolve().parents[3] / "shared" / "assets"
     with pytest.MonkeyPatch.context() as patch:
         if find(FACE_LANDMARKER) is None and shared.is_dir():

@@ -19,7 +19,6 @@ from avatar.files.third_party import sha256_of
 from avatar.head.assets import find_model_file, find_uv_obj, load_head_assets
 from avatar.losses.lpips import load_lpips
 from avatar.pipeline.refine_plan import Plan
-from avatar.report.page import read_results
 from avatar.sweep.state import read_job, read_sweep
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.track.footage.video import open_video
@@ -49,7 +48,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "00001.jpg": read_image,
     "00001.png": read_mask,
     "eval/results.json": lambda path: read_evaluation("run", path.parents[1]),
-    "run/eval/results.json": read_results,
     "verified/results.json": verify,
     "rounds/plan.json": lambda path: Plan.load(path.parents[1]),
     "sweep.json": lambda path: read_sweep(path.parent),

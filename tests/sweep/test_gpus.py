@@ -111,7 +111,7 @@ def test_ray_is_asked_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
         asked.append(needs)
         return lambda function: function
 
-    fake = SimpleNamespace(init=lambda **_: None, remote=remote, shutdown=lambda: None)
+    fake = SimpleNamespace(init=lambda **_: None, remote=remote, shutdown=lambda: None, __spec__="")
     monkeypatch.setitem(sys.modules, "ray", fake)  # type: ignore[arg-type]
     make_engine("ray", spec_of("cuda"), Path(), EngineOptions())
     make_engine("ray", spec_of(""), Path(), EngineOptions())
@@ -121,7 +121,7 @@ def test_ray_is_asked_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_slurm_is_asked_for_whole_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[dict[str, Any]] = []
     executor = SimpleNamespace(update_parameters=lambda **parameters: asked.append(parameters))
-    fake = SimpleNamespace(AutoExecutor=lambda **_: executor)
+    fake = SimpleNamespace(AutoExecutor=lambda **_: executor, __spec__="")
     monkeypatch.setitem(sys.modules, "submitit", fake)  # type: ignore[arg-type]
     for spec in (spec_of("cuda"), spec_of("", gpus=0.25), spec_of("")):
         make_engine("slurm", spec, Path(), EngineOptions(address="slurm"))

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from avatar.errors import UserError
+from avatar.errors import UserError, install
 from avatar.files.third_party import FACE_LANDMARKER, require
 from data_prep.track.faces.landmarks import NUM_POINTS
 
 MAX_FACES = 4
-INSTALL = "tracking needs MediaPipe: pip install 'hyperavatar[track]'"
+INSTALL = f"tracking needs MediaPipe: {install('track')}"
 _SMALL = 0.15  # of the longer side: smaller faces are overlooked in the whole picture (0.12 was found, 0.10 was not)
 _WINDOW = 4.0  # heights of the face, around where it was
 _FLAT = 3.0  # standard deviation of grey levels; a picture without contrast holds no face

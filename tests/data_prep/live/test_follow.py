@@ -101,7 +101,7 @@ def test_a_picture_without_a_face(tmp_path: Path, head: Path) -> None:
 
 def test_the_command_follows_a_video_to_its_end(video: Path, head: Path, tmp_path: Path) -> None:
     pytest.importorskip("viser")
-    make_subject(tmp_path / "subject", frames=12, size=64, seed=2, progress=False)
+    make_subject(tmp_path / "subject", frames=12, size=64, seed=2)
     train_small(tmp_path / "subject", tmp_path / "run", ["trainer.iterations=4", "model.uv_size=16"])
     words = ["view", tmp_path / "run", "--head", head, "--webcam", video, "--port", "0", "--size", "64"]
     process = subprocess.Popen(
