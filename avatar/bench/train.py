@@ -11,6 +11,7 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
+from avatar.bench.floor import floor_ms
 from avatar.bench.results import write_report
 from avatar.bench.splat_gpu import settle
 from avatar.bench.stages import Stopwatch
@@ -51,6 +52,7 @@ class Row:
     early: Time
     late: Time
     stages: dict[str, Time]  # of a late step with the perceptual term; none on a GPU, which is not waited for in a step
+    floors: dict[str, float]  # milliseconds, of the stages whose work can be counted, forward and backward together
 
 
 @dataclass
@@ -108,6 +110,7 @@ def measure(request: Request, repeats: int) -> list[Row]:
             early,
             late,
             {} if on_gpu(learner.avatar.quats) else stages(learner, repeats),
+            {} if on_gpu(learner.avatar.quats) else floors(learner.avatar),
         )
         for (recipe, learner), (early, late) in zip(learners.items(), times, strict=True)
     ]
@@ -195,6 +198,32 @@ def stages(learner: Learner, repeats: int) -> dict[str, Time]:
     return stopwatch.times()
 
 
+def floors(avatar: Avatar) -> dict[str, float]:
+    """Milliseconds in which this machine does the products, or moves the bytes, that a stage cannot do without.
+
+    Network: a product for the outputs, one for the weights' gradients and, behind the first layer, one for the inputs'.
+    Heads: parameters and latents read twice, their gradients written once, offsets and their gradients moved once.
+    Optimizer: parameters, gradients and both moments read, all but the gradients written. Check: gradients read.
+    """
+    if not isinstance(avatar, FlashAvatar):
+        return {}
+    threads, places, network = torch.get_num_threads(), len(avatar.code), avatar.deformation
+    first, *others = [layer.weight for layer in network.modules() if isinstance(layer, torch.nn.Linear)]
+    code = first[:, : network.code_size].numel()
+    products = 2 * code + 3 * sum(weight.numel() for weight in others)
+    everything = sum(parameter.nbytes for parameter in avatar.parameters())
+    found = {
+        "network": floor_ms(2.0 * places * products, 0.0, threads),
+        "optimizer": floor_ms(0.0, 7.0 * everything, threads),
+        "check": floor_ms(0.0, 1.0 * everything, threads),
+    }
+    if avatar.hyper is not None:
+        own = sum(parameter.nbytes for parameter in avatar.hyper.parameters())
+        moved = 3 * own + 4 * len(avatar) * (3 * avatar.config.latent_dim + 2 * 10)
+        found["heads"] = floor_ms(0.0, moved, threads)
+    return found
+
+
 def table(rows: Sequence[Row]) -> list[str]:
     """Milliseconds of a step as median (95th percentile), then of the stages of a step with the perceptual term."""
     lines = [
@@ -210,7 +239,7 @@ def table(rows: Sequence[Row]) -> list[str]:
     # The row with most stages knows their order.
     names = [name for name in max((row.stages for row in rows), key=len) if not name.endswith(", backward")]
     if names:
-        lines += ["", f"{'stage: forward / backward':>40} {''.join(f'{row.recipe:>24}' for row in rows)}"]
+        lines += ["", f"{'stage: forward / backward (floor)':>40} {''.join(f'{row.recipe:>24}' for row in rows)}"]
     for name in names:
         lines.append(f"{name:>40} {''.join(f'{stage_cell(row, name):>24}' for row in rows)}")
     return lines
@@ -218,4 +247,5 @@ def table(rows: Sequence[Row]) -> list[str]:
 
 def stage_cell(row: Row, name: str) -> str:
     times = [row.stages[part].median for part in (name, f"{name}, backward") if part in row.stages]
-    return " / ".join(f"{time:.2f}" for time in times) or "-"
+    floor = f" ({row.floors[name]:.1f})" if name in row.floors else ""
+    return (" / ".join(f"{time:.2f}" for time in times) or "-") + floor

@@ -67,6 +67,7 @@ def test_quick_run_prints_a_table_and_writes_figures(
         assert f"{row['late']['median']:.1f} ({row['late']['p95']:.1f})" in output
         assert row["early"]["median"] > 0
         assert both | {f"{stage}, backward" for stage in both} | {"check", "optimizer"} <= row["stages"].keys()
+        assert set(row["floors"]) == {"network", "heads", "optimizer", "check"} and min(row["floors"].values()) > 0
     assert {"interpolation"} <= figures["rows"][1]["stages"].keys() - figures["rows"][0]["stages"].keys()
 
 
