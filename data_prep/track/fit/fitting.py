@@ -17,7 +17,7 @@ from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.chunks import side_by_side
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
+from data_prep.track.fit.motion import Motion, six_d
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.progress import Progress
@@ -57,20 +57,16 @@ def fit_tracks(
 
 def as_tracks(fit: LandmarkFit, motion: Motion, clip: Clip, expressions: int) -> dict[int, FrameTrack]:
     """By the frames' numbers; all `expressions` of the head model. Raises UserError where a value is not finite."""
-    T = len(motion)
-    expression = np.zeros((T, expressions))
+    expression = np.zeros((len(motion), expressions))
     expression[:, fit.expressions.numpy()] = motion.expression.numpy()
     shape = np.zeros(IDENTITY_COEFFICIENTS)
     shape[: len(fit.identity)] = fit.identity.numpy()
     columns = {
         "R": motion.R.numpy(),
         "t": motion.t.numpy(),
-        "jaw": rotations(motion.jaw)[:, :2].reshape(T, 6).numpy(),
-        "eyes": gaze_rotations(motion.gaze.reshape(T, 2, 2))[:, :, :2].reshape(T, 12).numpy(),
         "eyelids": motion.eyelids.numpy(),
-        "neck": rotations(motion.neck)[:, :2].reshape(T, 6).numpy(),
         "expression": expression,
-    }
+    } | {name: values.numpy() for name, values in six_d(motion).items()}
     if not all(np.isfinite(values).all() for values in columns.values()):
         raise UserError("the fit did not come to finite values; try another part of the video with --start and --end")
     return {

@@ -26,7 +26,7 @@ from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import minimise
 from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
-from data_prep.track.fit.skin_points import by_joints, seen_weights, skin_triangles, spread_points
+from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints
 from data_prep.track.fit.texture import light_basis, lit_texture
 from data_prep.track.progress import Progress
@@ -61,9 +61,8 @@ def fit_pictures(
     """`images` and `mattes` are those of the fit's frames by row. The identity stays as it is."""
     T, motion = len(start.motion), start.motion
     corners, barycentric = spread_points(assets, skin_triangles(assets))
-    order = by_joints(assets, corners, barycentric)  # the derivatives of neighbours are made in place
-    corners, barycentric = corners[order], barycentric[order]
-    is_held = order % HELD_OUT == HELD_OUT // 2
+    number = torch.arange(len(corners))
+    is_held = number % HELD_OUT == HELD_OUT // 2
     eyes = float(start.term.unit.mean()) / POINT_SHARE  # pixels of the frames
     points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
     boxes = _boxes(points, start.identity, motion, camera)
@@ -71,7 +70,7 @@ def fit_pictures(
     crops = cut_out(images, mattes, rows, boxes, min(1.0, EYES_IN_CROPS / eyes))
     skin = _Skin(assets, corners, barycentric, camera, crops, start)
     held, compared_at = skin.subset(is_held), dict.fromkeys(BLURS, ~is_held)
-    compared_at[BLURS[0]] = ~is_held & (order % COARSE_SHARE == 0)
+    compared_at[BLURS[0]] = ~is_held & (number % COARSE_SHARE == 0)
     on_mouth = _near_lips(assets, start, points)
     terms = (_quieter(start.term), start.priors, start.smoothness)
     first = skin.weights(motion)
@@ -93,9 +92,7 @@ def fit_pictures(
         wanted = lit_texture(values, own, compared.basis).values(compared.basis)
         own = own * torch.where(on_mouth[compared_at[blur]], 1.0, _trust(values - wanted, own))
         term = PhotometricTerm(seen, wanted, own)
-        motion = minimise(
-            (term, *terms), start.identity, motion, start.columns, ITERATIONS, with_identity=False, coupled=True
-        ).motion
+        motion = minimise((term, *terms), start.identity, motion, ITERATIONS).motion
     assert blurred is not None
     before = _psnr(held.values(blurred, start.motion), first[:, is_held], held.basis)
     after = _psnr(held.values(blurred, motion), weights[:, is_held], held.basis)

@@ -56,10 +56,7 @@ def test_the_landmarks_are_met(scene: Fitted) -> None:
     errors = scene.fit.term.errors(scene.fit.identity, scene.fit.motion)
     assert 100 * float(errors.mean()) / scene.seen.eyes < 200 * NOISE
     assert scene.error(scene.fit.motion) < 100 * DRIFT
-    for costs in scene.fit.costs:
-        assert len(costs) > 1 and list(costs) == sorted(set(costs), reverse=True)
     assert float(scene.fit.identity.abs().max()) < 4.0
-    assert not scene.fit.motion.neck.any()
 
 
 def test_the_fit_repeats_to_the_bit(scene: Fitted, demo_head_model: Path) -> None:
