@@ -28,13 +28,21 @@ def source_of(arguments: Namespace) -> Source:
     return Source(
         folder=arguments.folder,
         head=find_head(arguments.folder, arguments.head),
-        tracking=arguments.tracking,
-        frame_offset=arguments.frame_offset,
-        format=arguments.format,
-        fps=arguments.fps,
-        max_left_out=Source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
-        ignore_misfit=arguments.ignore_misfit,
+        **source_options(arguments, arguments.tracking),
     )
+
+
+def source_options(arguments: Namespace, tracking: Path | None) -> dict[str, Any]:
+    """What the options say of a tracked folder, as fields of a Source."""
+    options = {
+        "tracking": tracking,
+        "frame_offset": arguments.frame_offset,
+        "format": arguments.format,
+        "fps": arguments.fps,
+        "ignore_misfit": arguments.ignore_misfit,
+    }
+    left_out = arguments.max_left_out
+    return options if left_out is None else {**options, "max_left_out": left_out}
 
 
 def split_sizes(config: Config) -> SplitSizes:
@@ -92,23 +100,10 @@ def open_driver(folder: Path, trained: TrainedAvatar, arguments: Namespace | Non
     """A tracked folder as driver: with its own head model where it has one, so that another one is noticed."""
     check_folder(folder)
     own = folder / "head_model"
-    options = {} if arguments is None else driver_options(arguments)
+    options = {} if arguments is None else source_options(arguments, arguments.driver_tracking)
     if not own.is_dir() or (arguments is not None and arguments.head is not None):
         return open_subject(Source(folder, trained.source, **options), None, print, trained.assets)[0]
     return open_subject(Source(folder, own, **options), None, print)[0]
-
-
-def driver_options(arguments: Namespace) -> dict[str, Any]:
-    """The options of `add_driver` as fields of a Source."""
-    options = {
-        "tracking": arguments.driver_tracking,
-        "frame_offset": arguments.frame_offset,
-        "format": arguments.format,
-        "fps": arguments.fps,
-        "ignore_misfit": arguments.ignore_misfit,
-    }
-    left_out = arguments.max_left_out
-    return options if left_out is None else {**options, "max_left_out": left_out}
 
 
 def open_drive_file(path: Path, trained: TrainedAvatar) -> Drive:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
+from data_prep.progress import Progress
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.fit.camera import Pinhole, to_camera
 from data_prep.track.fit.chunks import over_chunks
@@ -29,7 +30,6 @@ from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
 from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints
 from data_prep.track.fit.texture import light_basis, lit_texture
-from data_prep.track.progress import Progress
 
 EYES_IN_CROPS = 110.0  # pixels between the eyes, at most
 BLURS = (3.0, 1.2)  # per cent of the distance between the eyes
@@ -58,7 +58,7 @@ class PhotometricFit:
 def fit_pictures(
     assets: HeadAssets, start: LandmarkFit, camera: Pinhole, images: Images, mattes: Mattes, progress: Progress
 ) -> PhotometricFit:
-    """`images` and `mattes` are those of the fit's frames by row. The identity stays as it is."""
+    """`images` and `mattes` are by the frames' numbers. The identity stays as it is."""
     T, motion = len(start.motion), start.motion
     corners, barycentric = spread_points(assets, skin_triangles(assets))
     number = torch.arange(len(corners))
@@ -66,8 +66,8 @@ def fit_pictures(
     eyes = float(start.term.unit.mean()) / POINT_SHARE  # pixels of the frames
     points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
     boxes = _boxes(points, start.identity, motion, camera)
-    rows = progress(range(T), T, "reading faces")
-    crops = cut_out(images, mattes, rows, boxes, min(1.0, EYES_IN_CROPS / eyes))
+    frames = progress(start.frames.tolist(), T, "reading faces")
+    crops = cut_out(images, mattes, frames, boxes, min(1.0, EYES_IN_CROPS / eyes))
     skin = _Skin(assets, corners, barycentric, camera, crops, start)
     held, compared_at = skin.subset(is_held), dict.fromkeys(BLURS, ~is_held)
     compared_at[BLURS[0]] = ~is_held & (number % COARSE_SHARE == 0)
