@@ -41,7 +41,6 @@ from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import as_tracks, find_embedding
 from data_prep.track.fit.landmark_fit import fit_landmarks
-from data_prep.track.fit.result import Clip
 from data_prep.track.track import Choices, track
 
 SEEDS, ALL_SEEDS = (1,), (1, 2, 3)
@@ -174,10 +173,9 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
 
 def tracked_by_landmarks(tracked: Path, head: Path, own: Recording, assets: HeadAssets) -> Recording:
     """The fit to the stored landmarks of a tracked folder alone, without its pictures."""
-    clip = Clip(load_landmarks(tracked / LANDMARKS_FILE), own.intrinsics, [], [])
-    names = assets.names
-    fit = fit_landmarks(assets, names, find_embedding(head, assets), clip.landmarks, Pinhole(*own.intrinsics))
-    rows = as_tracks(fit, fit.motion, clip, assets.num_expressions)
+    seen = load_landmarks(tracked / LANDMARKS_FILE)
+    fit = fit_landmarks(assets, assets.names, find_embedding(head, assets), seen, Pinhole(*own.intrinsics))
+    rows = as_tracks(fit, fit.motion, own.intrinsics, seen.size, assets.num_expressions)
     tracks = {
         name: torch.from_numpy(np.stack([getattr(rows[int(number)], name) for number in own.names])).float()
         for name in TRACK_SHAPES

@@ -10,9 +10,9 @@ from tqdm import tqdm
 
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.config import load_config
-from avatar.data.source import Source
 from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
+from avatar.pipeline.open import source_options
 from avatar.train.cost_estimate import measure_cost
 from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
@@ -28,13 +28,10 @@ def run_check(arguments: Namespace) -> int:
     outcome = check_tracked_folder(
         arguments.folder,
         lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
-        tracking=arguments.tracking,
-        frame_offset=arguments.frame_offset,
-        format=arguments.format,
-        fps=arguments.fps,
-        max_left_out=Source.max_left_out if arguments.max_left_out is None else arguments.max_left_out,
-        ignore_misfit=arguments.ignore_misfit,
-        progress=lambda items, total, what: tqdm(items, total=total, desc=what, leave=False, disable=total == 0),
+        progress=lambda items, total, title, unit="": tqdm(
+            items, total=total, desc=title, leave=False, disable=total == 0
+        ),
+        **source_options(arguments, arguments.tracking),
     )
     print(json.dumps(outcome.to_dict(), indent=1, allow_nan=False) if arguments.json else as_text(outcome))
     if arguments.out is not None:

@@ -23,15 +23,24 @@ DRIVE_SUFFIXES = (".npz", ".csv")
 
 def source_of(arguments: Namespace) -> Source:
     """What the options of `add_source` say."""
-    head = find_head(arguments.folder, arguments.head)
-    return Source(arguments.folder, head, tracking=arguments.tracking, **reading_options(arguments))
+    return Source(
+        folder=arguments.folder,
+        head=find_head(arguments.folder, arguments.head),
+        **source_options(arguments, arguments.tracking),
+    )
 
 
-def reading_options(arguments: Namespace) -> dict[str, Any]:
-    """How a tracked folder is read, as fields of a Source."""
-    left_out = Source.max_left_out if arguments.max_left_out is None else arguments.max_left_out
-    names = ("frame_offset", "format", "fps", "ignore_misfit")
-    return {"max_left_out": left_out, **{name: getattr(arguments, name) for name in names}}
+def source_options(arguments: Namespace, tracking: Path | None) -> dict[str, Any]:
+    """What the options say of a tracked folder, as fields of a Source."""
+    options = {
+        "tracking": tracking,
+        "frame_offset": arguments.frame_offset,
+        "format": arguments.format,
+        "fps": arguments.fps,
+        "ignore_misfit": arguments.ignore_misfit,
+    }
+    left_out = arguments.max_left_out
+    return options if left_out is None else {**options, "max_left_out": left_out}
 
 
 def open_run(
@@ -85,9 +94,7 @@ def open_driver(folder: Path, trained: TrainedAvatar, arguments: Namespace | Non
     """A tracked folder as driver: with its own head model where it has one, so that another one is noticed."""
     check_folder(folder)
     own = folder / "head_model"
-    options: dict[str, Any] = {}
-    if arguments is not None:
-        options = {"tracking": arguments.driver_tracking, **reading_options(arguments)}
+    options = {} if arguments is None else source_options(arguments, arguments.driver_tracking)
     if not own.is_dir() or (arguments is not None and arguments.head is not None):
         return open_subject(Source(folder, trained.source, **options), None, print, trained.assets)[0]
     return open_subject(Source(folder, own, **options), None, print)[0]

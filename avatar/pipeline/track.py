@@ -16,10 +16,10 @@ from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.formats.avatar_track import recognise
 from data_prep.prepare.contents import find_damage, write_contents
 from data_prep.prepare.open import HEAD_VARIABLE
+from data_prep.progress import Item
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.inputs import tracking_key
-from data_prep.track.progress import Item
 from data_prep.track.track import Choices, track
 
 

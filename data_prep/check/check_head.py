@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,24 +36,23 @@ def check_head(assets: HeadAssets) -> list[Finding]:
     ]
 
 
-def _faces(bad: np.ndarray, assets: HeadAssets, what: str, consequence: str) -> list[Finding]:
+def _faces(bad: np.ndarray, assets: HeadAssets, what: str, consequence: str) -> Iterator[Finding]:
     if not bad.any():
-        return []
+        return
     first = int(bad.argmax())
     problem = (
         f"{bad.sum()} of {len(bad)} faces of the head model have {what}, the first is face {first} of the vertices "
         f"{', '.join(map(str, assets.faces[first].tolist()))}"
     )
-    return [Finding("note", _CHECK, problem, f"nothing, if that is meant: {consequence}")]
+    yield Finding("note", _CHECK, problem, f"nothing, if that is meant: {consequence}")
 
 
-def _edges(mesh: Trimesh) -> list[Finding]:
-    findings = []
+def _edges(mesh: Trimesh) -> Iterator[Finding]:
     shared = np.bincount(mesh.edges_unique_inverse) > 2
     if shared.any():
         a, b = mesh.edges_unique[shared][0]
         problem = f"{shared.sum()} edges of the head model belong to three faces or more, the first joins {a} and {b}"
-        findings.append(Finding("note", _CHECK, problem, "nothing, if that is meant: the surface branches there"))
+        yield Finding("note", _CHECK, problem, "nothing, if that is meant: the surface branches there")
     if not mesh.is_winding_consistent:
         runs, times = np.unique(mesh.edges, axis=0, return_counts=True)
         (a, b), count = runs[times > 1][0], (times > 1).sum()
@@ -60,15 +60,13 @@ def _edges(mesh: Trimesh) -> list[Finding]:
             f"the faces of the head model are not all wound the same way: at {count} edges two neighbours face opposite "
             f"sides, the first is the one from vertex {a} to {b}"
         )
-        findings.append(Finding("warning", _CHECK, problem, "turn the vertices of these faces round in the model file"))
-    return findings
+        yield Finding("warning", _CHECK, problem, "turn the vertices of these faces round in the model file")
 
 
-def _inside_out(mesh: Trimesh) -> list[Finding]:
+def _inside_out(mesh: Trimesh) -> Iterator[Finding]:
     """Pieces of the surface whose faces look inwards: they get no first colours and are not drawn over the images."""
     from trimesh.graph import connected_components
 
-    findings = []
     for piece in connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces))):
         corners = mesh.triangles[piece]
         corners = corners - corners.mean(axis=(0, 1))
@@ -76,5 +74,4 @@ def _inside_out(mesh: Trimesh) -> list[Finding]:
         if np.linalg.det(corners).sum() / 6 < _INSIDE_OUT * box:
             problem = f"{len(piece)} faces of the head model, among them face {min(piece)}, look inwards"
             advice = "turn their vertices round in the model file: counter-clockwise seen from outside"
-            findings.append(Finding("warning", _CHECK, problem, advice))
-    return findings
+            yield Finding("warning", _CHECK, problem, advice)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -36,23 +37,21 @@ def repeated_images(clip: Clip) -> list[int]:
     ]
 
 
-def _repeated(clip: Clip) -> list[Finding]:
+def _repeated(clip: Clip) -> Iterator[Finding]:
     repeated = repeated_images(clip)
     if not repeated:
-        return []
+        return
     spacing, times = Counter(np.diff(repeated).tolist()).most_common(1)[0] if len(repeated) > 1 else (0, 0)
     every = ""
     if spacing > 1 and times >= max(MIN_REPEATS_FOR_PERIOD - 1, 0.8 * (len(repeated) - 1)):
         every = f", every {spacing}th: the frame rate was changed when they were extracted"
-    return [
-        Finding(
-            "warning",
-            "repeated-images",
-            f"the image repeats the one before in {clip.phrase(repeated)}{every}",
-            "extract the frames at the video's own rate (ffmpeg -fps_mode passthrough) and track those",
-            clip.names(repeated),
-        )
-    ]
+    yield Finding(
+        "warning",
+        "repeated-images",
+        f"the image repeats the one before in {clip.phrase(repeated)}{every}",
+        "extract the frames at the video's own rate (ffmpeg -fps_mode passthrough) and track those",
+        clip.names(repeated),
+    )
 
 
 def _flat_background(clip: Clip) -> str | None:
@@ -60,19 +59,17 @@ def _flat_background(clip: Clip) -> str | None:
     return composited_background(clip.files, bad) if clip.files.alphas else None
 
 
-def _composited(clip: Clip) -> list[Finding]:
+def _composited(clip: Clip) -> Iterator[Finding]:
     colour = _flat_background(clip)
     if colour is None or clip.files.is_transparent:  # a PNG keeps its colours whole beside its transparency
-        return []
-    return [
-        Finding(
-            "warning",
-            "composited",
-            f"the images seem to be composited on {colour} already: compositing them again with their matte squares "
-            "it at the edges (hair gets a rim of that colour)",
-            f"use the frames as the camera recorded them; or train with this background colour ({colour})",
-        )
-    ]
+        return
+    yield Finding(
+        "warning",
+        "composited",
+        f"the images seem to be composited on {colour} already: compositing them again with their matte squares "
+        "it at the edges (hair gets a rim of that colour)",
+        f"use the frames as the camera recorded them; or train with this background colour ({colour})",
+    )
 
 
 class _MatteLimit(NamedTuple):
@@ -108,44 +105,38 @@ _MATTE_LIMITS = (
 )
 
 
-def _matte(clip: Clip) -> list[Finding]:
+def _matte(clip: Clip) -> Iterator[Finding]:
     mattes = {n: view.matte for n, view in clip.views.items() if view.matte is not None}
-    findings = []
     for check, measure, limit, problem, advice in _MATTE_LIMITS:
         values = {n: getattr(matte, measure) for n, matte in mattes.items()}
         over = [n for n, value in values.items() if value > limit]
         if over:
             sentence = problem.format(worst=max(values.values()))
-            findings.append(Finding("warning", check, f"{sentence} in {clip.phrase(over)}", advice, clip.names(over)))
+            yield Finding("warning", check, f"{sentence} in {clip.phrase(over)}", advice, clip.names(over))
     whole = [n for n, matte in mattes.items() if matte.covered > MAX_COVERED]
     if whole:
-        findings.append(
-            Finding(
-                "warning",
-                "background-leak",
-                f"matte and head mask cover the whole image in {clip.phrase(whole)}: the background is trained as head",
-                "make masks of the head alone",
-                clip.names(whole),
-            )
+        yield Finding(
+            "warning",
+            "background-leak",
+            f"matte and head mask cover the whole image in {clip.phrase(whole)}: the background is trained as head",
+            "make masks of the head alone",
+            clip.names(whole),
         )
-    return findings
 
 
-def _mask_area(clip: Clip) -> list[Finding]:
+def _mask_area(clip: Clip) -> Iterator[Finding]:
     ratios = {n: fit.mask_ratio for n, fit in clip.fits.items() if np.isfinite(fit.mask_ratio)}
     if not ratios or clip.judgement is None or clip.judgement.problem is not None:
-        return []  # the mesh lies elsewhere: its area says nothing about the mask's
+        return  # the mesh lies elsewhere: its area says nothing about the mask's
     usual = float(np.median(list(ratios.values())))
     if usual > MAX_MASK_RATIO:
-        return [
-            Finding(
-                "warning",
-                "background-leak",
-                f"the head masks are {usual:.1f} times as large as the tracked head in the median",
-                "leave clothes and background out of the head masks: they do not move with the head",
-            )
-        ]
-    findings = []
+        yield Finding(
+            "warning",
+            "background-leak",
+            f"the head masks are {usual:.1f} times as large as the tracked head in the median",
+            "leave clothes and background out of the head masks: they do not move with the head",
+        )
+        return
     for is_odd, what, advice in (
         (lambda r: r > MASK_CHANGE * usual, "larger", "background is taken for head"),
         (lambda r: r * MASK_CHANGE < usual, "smaller", "parts of the head are missing"),
@@ -153,17 +144,14 @@ def _mask_area(clip: Clip) -> list[Finding]:
         odd = [n for n, ratio in ratios.items() if is_odd(ratio)]
         if odd:
             worst = max(odd, key=lambda n: abs(np.log(ratios[n] / usual)))
-            findings.append(
-                Finding(
-                    "warning",
-                    "mask-area",
-                    f"the head mask is much {what} than usual against the tracked head in {clip.phrase(odd)} "
-                    f"({ratios[worst] / usual:.2f} times in {clip.name(worst)})",
-                    f"make these masks again: {advice}",
-                    clip.names(odd),
-                )
+            yield Finding(
+                "warning",
+                "mask-area",
+                f"the head mask is much {what} than usual against the tracked head in {clip.phrase(odd)} "
+                f"({ratios[worst] / usual:.2f} times in {clip.name(worst)})",
+                f"make these masks again: {advice}",
+                clip.names(odd),
             )
-    return findings
 
 
 def exposure(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -186,11 +174,11 @@ def exposure(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     return np.array(numbers), head, background
 
 
-def _exposure(clip: Clip) -> list[Finding]:
+def _exposure(clip: Clip) -> Iterator[Finding]:
     """The camera's exposure changes what head and background show alike; a lamp or a turning head does not."""
     measured = exposure(clip)
     if measured is None:
-        return []
+        return
     numbers, head, background = measured
     has_background = bool(np.isfinite(background).all()) and _flat_background(clip) is None
     both = np.where(np.sign(head) == np.sign(background), np.sign(head), 0) * np.minimum(abs(head), abs(background))
@@ -198,18 +186,16 @@ def _exposure(clip: Clip) -> list[Finding]:
     low, high = int(np.argmin(change)), int(np.argmax(change))
     span = float(change[high] - change[low])
     if span <= (EXPOSURE if has_background else HEAD_EXPOSURE):
-        return []
+        return
     where = "head and background together" if has_background else "the head"
-    return [
-        Finding(
-            "warning",
-            "exposure",
-            f"the brightness of {where} changes by {span:.2f} stops ({2**span - 1:.0%}) over the clip: darkest about "
-            f"{clip.name(numbers[low])}, brightest about {clip.name(numbers[high])}",
-            "record with exposure and white balance locked; the avatar has one colour and averages the two",
-            clip.names((int(numbers[low]), int(numbers[high]))),
-        )
-    ]
+    yield Finding(
+        "warning",
+        "exposure",
+        f"the brightness of {where} changes by {span:.2f} stops ({2**span - 1:.0%}) over the clip: darkest about "
+        f"{clip.name(numbers[low])}, brightest about {clip.name(numbers[high])}",
+        "record with exposure and white balance locked; the avatar has one colour and averages the two",
+        clip.names((int(numbers[low]), int(numbers[high]))),
+    )
 
 
 def steady(values: np.ndarray) -> np.ndarray:

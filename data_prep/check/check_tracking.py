@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
 from data_prep.check.clip import NOT_SOUGHT, Clip
-from data_prep.check.findings import Finding, from_sentence, grouped, loss_severity
+from data_prep.check.findings import Finding, from_sentence, grouped
 from data_prep.check.motion import suddenness
-from data_prep.formats.frame_files import TRACKING, describe_numbers
+from data_prep.formats.frame_files import TRACKING
+from data_prep.prepare.pairing import BEHIND_CAMERA, REPEATS
 
 # A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
 # neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.
@@ -29,29 +31,25 @@ MAX_OFF_CENTRE = 0.1  # of the image; cropping moves the principal point
 def check_tracking(clip: Clip) -> list[Finding]:
     return [
         *_unusable(clip),
-        *_repeats(clip),
+        *_left_out(clip),
         *_offset(clip),
         *_camera(clip),
         *_jumps(clip),
     ]
 
 
-def _unusable(clip: Clip) -> list[Finding]:
-    findings = []
+def _unusable(clip: Clip) -> Iterator[Finding]:
     for reason, numbers in grouped(clip.tracking.bad).items():
         first = clip.tracking.paths[numbers[0]]
         keys = [f"{key} ({what})" for key, what in non_finite_values(first).items()]
         detail = f"not finite: {', '.join(keys)} in {first.name}" if keys else reason
-        findings.append(
-            Finding(
-                loss_severity(len(numbers), len(clip.files.tracking), clip.max_left_out),
-                "non-finite" if keys or "is not finite" in reason else "no-face" if "no face" in reason else "tracking",
-                f"the tracking cannot be used in {clip.phrase(numbers)} of {clip.files.title(TRACKING)}: {detail}",
-                "track these frames again, or accept that they are left out of training",
-                clip.names(numbers),
-            )
+        yield Finding(
+            clip.loss_severity(len(numbers), len(clip.files.tracking)),
+            "non-finite" if keys or "is not finite" in reason else "no-face" if "no face" in reason else "tracking",
+            f"the tracking cannot be used in {clip.phrase(numbers)} of {clip.files.title(TRACKING)}: {detail}",
+            "track these frames again, or accept that they are left out of training",
+            clip.names(numbers),
         )
-    return findings
 
 
 def non_finite_values(path: Path) -> dict[str, str]:
@@ -73,103 +71,85 @@ def non_finite_values(path: Path) -> dict[str, str]:
     return found
 
 
-def _repeats(clip: Clip) -> list[Finding]:
-    repeated = repeated_tracking(clip)
-    if not repeated:
-        return []
-    return [
-        Finding(
-            loss_severity(len(repeated), len(clip.pairs()), clip.max_left_out),
+def _left_out(clip: Clip) -> Iterator[Finding]:
+    """Frames whose tracking can be read and not be used."""
+    for check, reason, problem, cause in (
+        (
             "tracking-repeats",
-            f"the tracking repeats that of the frame before while the image does not, in {clip.phrase(repeated)}",
-            "the tracker lost the face there: track again, or accept that they are left out of training",
-            clip.names(repeated),
-        )
-    ]
+            REPEATS,
+            "the tracking repeats that of the frame before while the image does not, in",
+            "the tracker lost the face there: track again",
+        ),
+        ("behind-camera", BEHIND_CAMERA, "the tracked head is behind the camera in", "track these frames again"),
+    ):
+        numbers = grouped(clip.left_out).get(reason, [])
+        if numbers:
+            yield Finding(
+                clip.loss_severity(len(numbers), len(clip.pairs())),
+                check,
+                f"{problem} {clip.phrase(numbers)}",
+                f"{cause}, or accept that they are left out of training",
+                clip.names(numbers),
+            )
 
 
-def repeated_tracking(clip: Clip) -> list[int]:
-    """Image numbers whose tracking equals the one before, although the image is another."""
-    tracked = dict(clip.tracked())
-    return [
-        n
-        for n, track in tracked.items()
-        if n - 1 in tracked
-        and np.array_equal(track.moving_values(), tracked[n - 1].moving_values())
-        and clip.views[n].digest != clip.views[n - 1].digest
-    ]
-
-
-def _offset(clip: Clip) -> list[Finding]:
-    findings = []
+def _offset(clip: Clip) -> Iterator[Finding]:
     if clip.offset is None and clip.offset_evidence != NOT_SOUGHT:
-        findings.append(from_sentence("frame-offset", clip.offset_evidence))
+        yield from_sentence("frame-offset", clip.offset_evidence)
     if clip.part_offsets is not None and clip.part_offsets[0] != clip.part_offsets[1]:
         first, last = clip.part_offsets
-        findings.append(
-            Finding(
-                "error",
-                "dropped-frames",
-                f"the image offset is {first} in the first third of the clip and {last} in the last: frames were dropped "
-                "or doubled in between on one side",
-                "extract the frames again without changing the frame rate (ffmpeg -fps_mode passthrough), and track those",
-            )
+        yield Finding(
+            "error",
+            "dropped-frames",
+            f"the image offset is {first} in the first third of the clip and {last} in the last: frames were dropped "
+            "or doubled in between on one side",
+            "extract the frames again without changing the frame rate (ffmpeg -fps_mode passthrough), and track those",
         )
-    return findings
 
 
-def _camera(clip: Clip) -> list[Finding]:
+def _camera(clip: Clip) -> Iterator[Finding]:
     first = next(iter(clip.tracking.frames.values()), None)
     if first is None:
-        return []
+        return
     fx, fy, cx, cy = first.intrinsics
     width, height = first.size
-    findings = []
     fov = float(np.degrees(2 * np.arctan(0.5 * width / fx)))
     if not FOV_RANGE[0] <= fov <= FOV_RANGE[1]:
-        findings.append(
-            Finding(
-                "warning",
-                "focal-length",
-                f"a focal length of {fx:.0f} pixels in an image {width} wide is a field of view of {fov:.1f} degrees, "
-                f"outside {FOV_RANGE[0]:.0f} to {FOV_RANGE[1]:.0f}",
-                "give the tracker the camera's focal length, or let it optimise it from a plausible start",
-            )
+        yield Finding(
+            "warning",
+            "focal-length",
+            f"a focal length of {fx:.0f} pixels in an image {width} wide is a field of view of {fov:.1f} degrees, "
+            f"outside {FOV_RANGE[0]:.0f} to {FOV_RANGE[1]:.0f}",
+            "give the tracker the camera's focal length, or let it optimise it from a plausible start",
         )
     if abs(fy / fx - 1) > MAX_ASPECT:
-        findings.append(
-            Finding(
-                "warning",
-                "focal-length",
-                f"fx = {fx:.1f} and fy = {fy:.1f} differ by {abs(fy / fx - 1):.0%}: the pixels would not be square",
-                "were the frames stretched after tracking? Resize both sides by one factor",
-            )
+        yield Finding(
+            "warning",
+            "focal-length",
+            f"fx = {fx:.1f} and fy = {fy:.1f} differ by {abs(fy / fx - 1):.0%}: the pixels would not be square",
+            "were the frames stretched after tracking? Resize both sides by one factor",
         )
     off = float(max(abs(cx / width - 0.5), abs(cy / height - 0.5)))
     if off > MAX_OFF_CENTRE:
-        findings.append(
-            Finding(
-                "warning" if off > 0.5 else "note",
-                "principal-point",
-                f"the principal point ({cx:.1f}, {cy:.1f}) is {off:.0%} of the image away from the centre of "
-                f"{width}x{height}",
-                "was the tracking made before the frames were cropped? Track the cropped frames"
-                if off > 0.5
-                else "nothing, if the frames were cropped off-centre: it is used as it is",
-            )
+        yield Finding(
+            "warning" if off > 0.5 else "note",
+            "principal-point",
+            f"the principal point ({cx:.1f}, {cy:.1f}) is {off:.0%} of the image away from the centre of "
+            f"{width}x{height}",
+            "was the tracking made before the frames were cropped? Track the cropped frames"
+            if off > 0.5
+            else "nothing, if the frames were cropped off-centre: it is used as it is",
         )
-    return findings
 
 
-def _jumps(clip: Clip) -> list[Finding]:
+def _jumps(clip: Clip) -> Iterator[Finding]:
     tracked = dict(clip.tracked()) or dict(clip.tracking.frames)
     numbers = list(tracked)
     if not numbers:
-        return []
+        return
     sudden = suddenness(numbers, list(tracked.values()))
     expressions = np.stack([track.expression for track in tracked.values()])
     spread = float(np.sqrt(((expressions - expressions.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    findings = []
     for what, values, floor, unit in (
         ("rotation", sudden.rotation, MIN_ROTATION, "degrees"),
         ("position", sudden.translation, MIN_TRANSLATION, "mm"),
@@ -184,37 +164,11 @@ def _jumps(clip: Clip) -> list[Finding]:
         worst = numbers[int(np.nanargmax(values))]
         largest = float(np.nanmax(values))
         size = f"{largest:{'.1f' if largest < 1e5 else '.1e'}} {unit}".strip()
-        findings.append(
-            Finding(
-                "warning",
-                "jumps",
-                f"the tracked {what} jumps at {clip.phrase(jumping)}: {clip.name(worst)} lies {size} from half-way between "
-                f"its neighbours, where {np.nanmedian(values):.2g} is usual",
-                "look at these frames in the tracker's output; track them again or remove them",
-                clip.names(jumping),
-            )
+        yield Finding(
+            "warning",
+            "jumps",
+            f"the tracked {what} jumps at {clip.phrase(jumping)}: {clip.name(worst)} lies {size} from half-way between "
+            f"its neighbours, where {np.nanmedian(values):.2g} is usual",
+            "look at these frames in the tracker's output; track them again or remove them",
+            clip.names(jumping),
         )
-    return findings
-
-
-def behind_camera(clip: Clip) -> list[int]:
-    """Image numbers whose tracked head lies behind the camera."""
-    if clip.head is None:
-        return []
-    centre = clip.head.neutral_vertices().mean(0).numpy()
-    return [n for n, track in clip.tracked() if (track.R @ centre + track.t)[2] <= 0]
-
-
-def check_behind_camera(clip: Clip) -> list[Finding]:
-    behind = behind_camera(clip)
-    if not behind:
-        return []
-    return [
-        Finding(
-            loss_severity(len(behind), len(clip.pairs()), clip.max_left_out),
-            "behind-camera",
-            f"the tracked head is behind the camera in frames {describe_numbers(behind, name=clip.name)}",
-            "track these frames again, or accept that they are left out of training",
-            clip.names(behind),
-        )
-    ]

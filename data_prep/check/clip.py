@@ -7,19 +7,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from avatar.data.source import DEFAULT_FPS, DEFAULT_LEFT_OUT
+from avatar.data.source import DEFAULT_FPS, Source
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from data_prep.check.findings import frames_phrase
+from data_prep.check.findings import Severity, frames_phrase
 from data_prep.check.view import View, look_at
 from data_prep.formats.detect import METRICAL_TRACKER, open_tracked_folder
-from data_prep.formats.frame_files import IMAGE, TRACKING, FrameFiles
+from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, TRACKING, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder
@@ -28,24 +27,16 @@ from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
 from data_prep.prepare.masks import read_masks
 from data_prep.prepare.misfit import Judgement, judge, sample
+from data_prep.prepare.pairing import unusable
+from data_prep.progress import Progress, silent
 
 MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
 GIVEN, NOT_SOUGHT = "given with --frame-offset", "not looked for: images, tracking or head model are missing"
-T = TypeVar("T")
-
-
-class Progress(Protocol):
-    """Passes items through, of which there will be `total`, and shows how far it is."""
-
-    def __call__(self, items: Iterable[T], total: int, what: str) -> Iterable[T]: ...
-
-
-def silent(items: Iterable[T], total: int, what: str) -> Iterable[T]:
-    return items
 
 
 @dataclass(frozen=True)
 class Clip:
+    given: Source
     source: TrackedFolder
     tracking: Tracking
     complaints: tuple[tuple[str, str], ...]  # (which check, sentence): what stops `prepare` while reading
@@ -57,9 +48,6 @@ class Clip:
     views: dict[int, View] = field(default_factory=dict)  # by image number
     fits: dict[int, Fit] = field(default_factory=dict)  # by image number
     steps: dict[int, float] = field(default_factory=dict)  # image number -> mean grey-level change since the one before
-    given_fps: float | None = None
-    max_left_out: float = DEFAULT_LEFT_OUT  # share of the frames that may be unusable
-    ignore_misfit: bool = False  # a head that does not lie on the masks is no error
 
     @property
     def files(self) -> FrameFiles:
@@ -68,7 +56,7 @@ class Clip:
     @property
     def fps(self) -> float:
         """Frames a second."""
-        return self.given_fps or self.source.fps or DEFAULT_FPS
+        return self.given.fps or self.source.fps or DEFAULT_FPS
 
     @cached_property
     def judgement(self) -> Judgement | None:
@@ -91,6 +79,28 @@ class Clip:
 
     def phrase(self, numbers: Sequence[int]) -> str:
         return frames_phrase(numbers, self.name)
+
+    def loss_severity(self, lost: int, total: int) -> Severity:
+        """Frames that cannot be used are left out, up to the share above which `prepare` refuses the folder."""
+        return "error" if lost > self.given.max_left_out * total else "warning"
+
+    @cached_property
+    def left_out(self) -> dict[int, str]:
+        """Image number -> why the frame cannot be used, for the pairs of the clip."""
+        kinds = [(kind, found) for kind, found in self.files.of_kind().items() if kind != TRACKING and found]
+        bad = {}
+        for image, view in self.views.items():
+            absent = [self.files.title(kind) for kind, found in kinds if image not in found]
+            empty = [what for kind, what in ((HEAD, "head mask"), (ALPHA, "matte")) if view.brightest.get(kind) == 0]
+            if view.problems:
+                bad[image] = "a file cannot be read"
+            elif absent:
+                bad[image] = f"it has no file in {', '.join(absent)}"
+            elif empty:
+                bad[image] = f"its {empty[0]} is empty"
+        digests = {image: view.digest for image, view in self.views.items()}
+        centre = None if self.head is None else self.head.neutral_vertices().mean(0).numpy()
+        return unusable(self.pairs(), self.tracking, bad, digests, centre)
 
     def pairs(self) -> list[tuple[int, int]]:
         """(image number, tracking number) of everything that has a partner, usable or not."""
@@ -116,24 +126,22 @@ class Clip:
 
 
 def read_clip(
-    folder: Path,
+    given: Source,
     assets: HeadAssets | None,
-    tracking: Path | None,
-    frame_offset: int | None,
-    format: str | None = None,
     progress: Progress = silent,
-    *,
-    fps: float | None = None,
-    max_left_out: float = DEFAULT_LEFT_OUT,
-    ignore_misfit: bool = False,
 ) -> Clip:
-    """Read everything. Raises UserError only when the folder's files cannot be listed."""
+    """Read everything; `assets` are those of the head model, where there is one.
+
+    Raises UserError only when the folder's files cannot be listed.
+    """
     complaints: list[tuple[str, str]] = []
-    source = open_tracked_folder(folder, tracking, format, lambda message: complaints.append(("layout", message)))
+    source = open_tracked_folder(
+        given.folder, given.tracking, given.format, lambda message: complaints.append(("layout", message))
+    )
     files, label_notes = with_labels(source.files)
     source = replace(source, files=files)
     for check, refuse in (
-        ("frame-offset", lambda: source.refuse_offset(frame_offset)),
+        ("frame-offset", lambda: source.refuse_offset(given.frame_offset)),
         ("mask-range", lambda: refuse_colours(files)),
     ):
         try:
@@ -150,10 +158,11 @@ def read_clip(
             head = HeadModel(assets, torch.from_numpy(next(iter(tracks.frames.values())).shape))
         except UserError as error:
             complaints.append(("head-model", str(error)))
-    offset, evidence = frame_offset, NOT_SOUGHT if frame_offset is None else GIVEN
+    offset, evidence = given.frame_offset, NOT_SOUGHT if given.frame_offset is None else GIVEN
     if source.is_paired:
         offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
     clip = Clip(
+        given,
         source,
         tracks,
         tuple(complaints),
@@ -164,14 +173,11 @@ def read_clip(
         None,
         views,
         steps=steps,
-        given_fps=fps,
-        max_left_out=max_left_out,
-        ignore_misfit=ignore_misfit,
     )
     if head is None or not clip.files.images:
         return clip
     if not source.is_paired:
-        clip = _with_offset(clip, head, frame_offset)
+        clip = _with_offset(clip, head)
     return replace(clip, fits=_measure_fits(clip, head, progress))
 
 
@@ -220,7 +226,7 @@ def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, 
     return {number: fit for number, fit in found.items() if fit is not None}
 
 
-def _with_offset(clip: Clip, head: HeadModel, given: int | None) -> Clip:
+def _with_offset(clip: Clip, head: HeadModel) -> Clip:
     """Find the offset of the whole clip, and of its first and last third: they differ where frames were dropped."""
     numbers = list(clip.tracking.frames)
     third = len(numbers) // 3
@@ -229,7 +235,7 @@ def _with_offset(clip: Clip, head: HeadModel, given: int | None) -> Clip:
         first, last = (_estimate(clip, head, part) for part in (numbers[:third], numbers[-third:]))
         if isinstance(first, OffsetEstimate) and isinstance(last, OffsetEstimate):
             parts = first.offset, last.offset
-    if given is not None:
+    if clip.given.frame_offset is not None:
         return replace(clip, part_offsets=parts)
     estimate = _estimate(clip, head, numbers)
     if isinstance(estimate, OffsetEstimate):
@@ -242,7 +248,7 @@ def _estimate(clip: Clip, head: HeadModel, numbers: list[int]) -> OffsetEstimate
     tracks = {n: clip.tracking.frames[n] for n in numbers}
     without = {n for n in clip.files.images if not clip.is_whole(n)}
     try:
-        return detect_offset(head, tracks, clip.files, without, clip.ignore_misfit)
+        return detect_offset(head, tracks, clip.files, without, clip.given.ignore_misfit)
     except UserError as error:
         return str(error)
 

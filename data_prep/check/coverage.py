@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,51 +69,41 @@ def measure_coverage(clip: Clip, usable: list[int], test_frames: int | None) -> 
     )
 
 
-def check_coverage(clip: Clip, coverage: Coverage) -> list[Finding]:
+def check_coverage(clip: Clip, coverage: Coverage) -> Iterator[Finding]:
     """Notes: nothing is wrong with the files, but the avatar cannot know what the video does not show."""
-    findings = []
     count = len(coverage.images)
     seconds = count / clip.fps
     if seconds < SHORT_CLIP:
-        findings.append(
-            Finding(
-                "note",
-                "short-clip",
-                f"there are {count} usable frames, {seconds:.0f} seconds at {clip.fps:g} per second",
-                "record half a minute to two minutes with speech, smiles, closed eyes and head turns",
-            )
+        yield Finding(
+            "note",
+            "short-clip",
+            f"there are {count} usable frames, {seconds:.0f} seconds at {clip.fps:g} per second",
+            "record half a minute to two minutes with speech, smiles, closed eyes and head turns",
         )
     train = list(coverage.split.train)
     low, high = np.percentile(coverage.angles.yaw[train], [1, 99])
     if high - low < NARROW_YAW:
-        findings.append(
-            Finding(
-                "note",
-                "narrow-views",
-                f"the head turns only from {low:.0f} to {high:.0f} degrees of yaw in the training frames",
-                "expect the avatar to hold in front views only, or record slow turns to both sides",
-            )
+        yield Finding(
+            "note",
+            "narrow-views",
+            f"the head turns only from {low:.0f} to {high:.0f} degrees of yaw in the training frames",
+            "expect the avatar to hold in front views only, or record slow turns to both sides",
         )
     sizes = [fit.size for fit in clip.fits.values() if np.isfinite(fit.size)]
     if sizes and np.median(sizes) < SMALL_HEAD:
-        findings.append(
-            Finding(
-                "note",
-                "small-head",
-                f"the head is {np.median(sizes):.0f} pixels large in the images",
-                "crop the video closer around the head before tracking, if it has more pixels",
-            )
+        yield Finding(
+            "note",
+            "small-head",
+            f"the head is {np.median(sizes):.0f} pixels large in the images",
+            "crop the video closer around the head before tracking, if it has more pixels",
         )
     tests = len(coverage.split.test)
     for what, far in (("poses", coverage.far_pose), ("expressions", coverage.far_expression)):
         if len(far) > OUTSIDE_SHARE * tests:
-            findings.append(
-                Finding(
-                    "note",
-                    "test-coverage",
-                    f"{clip.phrase(far)} of the {tests} held-out frames show {what} that no training frame shows",
-                    "expect lower figures there; they measure extrapolation",
-                    clip.names(far),
-                )
+            yield Finding(
+                "note",
+                "test-coverage",
+                f"{clip.phrase(far)} of the {tests} held-out frames show {what} that no training frame shows",
+                "expect lower figures there; they measure extrapolation",
+                clip.names(far),
             )
-    return findings

@@ -42,11 +42,6 @@ def count_phrase(findings: Sequence[Finding]) -> str:
     return ", ".join(f"{count} {severity}{'s' * (count != 1)}" for count, severity in counts)
 
 
-def loss_severity(lost: int, total: int, share: float) -> Severity:
-    """Frames that cannot be used are left out, up to the share above which `prepare` refuses the folder."""
-    return "error" if lost > share * total else "warning"
-
-
 def from_sentence(check: str, sentence: str) -> Finding:
     """An error from a UserError's sentence, `what is wrong; what to do`."""
     problem, _, advice = sentence.rpartition("; ")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.data.source import DEFAULT_LEFT_OUT
+from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.check.check_files import check_files, lost_frames
@@ -17,13 +17,13 @@ from data_prep.check.check_fit import check_fit
 from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
 from data_prep.check.check_motion import check_motion
-from data_prep.check.check_tracking import behind_camera, check_behind_camera, check_tracking, repeated_tracking
-from data_prep.check.clip import Clip, Progress, read_clip, silent
+from data_prep.check.check_tracking import check_tracking
+from data_prep.check.clip import Clip, read_clip
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
-from data_prep.formats.frame_files import ALPHA, HEAD, TRACKING
 from data_prep.prepare.not_subjects import check_folder
 from data_prep.prepare.pairing import describe_reasons
+from data_prep.progress import Progress, silent
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
 
@@ -58,16 +58,11 @@ def check_tracked_folder(
     folder: Path,
     load_head: Callable[[], HeadAssets],
     *,
-    tracking: Path | None = None,
-    frame_offset: int | None = None,
-    format: str | None = None,
-    fps: float | None = None,
-    max_left_out: float = DEFAULT_LEFT_OUT,
-    ignore_misfit: bool = False,
     test_frames: int | None = None,
     progress: Progress = silent,
+    **options: Any,
 ) -> Check:
-    """Check a tracked folder as `prepare` would read it, with the options of a `Source`.
+    """Check a tracked folder as `prepare` would read it; `options` are those of a `Source`.
 
     A folder that is not there or has no head model is a finding.
     """
@@ -82,27 +77,17 @@ def check_tracked_folder(
     except UserError as error:
         findings.append(from_sentence("head-model", str(error)))
     try:
-        clip = read_clip(
-            folder.resolve(),
-            assets,
-            tracking,
-            frame_offset,
-            format,
-            progress,
-            fps=fps,
-            max_left_out=max_left_out,
-            ignore_misfit=ignore_misfit,
-        )
+        # Its head model is what `load_head` gives.
+        clip = read_clip(Source(folder.resolve(), folder, **options), assets, progress)
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     findings += [] if assets is None else check_head(assets)
     findings += check_files(clip) + check_tracking(clip) + check_motion(clip) + check_fit(clip)
-    findings += check_behind_camera(clip) + check_images(clip)
+    findings += check_images(clip)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
-    lost = left_out(clip)
     if not any(finding.severity == "error" for finding in findings):
-        findings += lost_frames(clip, lost)
-    usable = [image for image, _ in clip.tracked() if image not in lost]
+        findings += lost_frames(clip)
+    usable = [image for image, _ in clip.tracked() if image not in clip.left_out]
     coverage = None
     if clip.offset is not None:
         measured = measure_coverage(clip, usable, test_frames)
@@ -114,32 +99,6 @@ def check_tracked_folder(
     return Check(folder, tuple(by_severity(findings)), clip, coverage)
 
 
-def left_out(clip: Clip) -> dict[int, str]:
-    """Image number -> why the frame cannot be used, for the pairs of the clip."""
-    reasons: dict[int, str] = {}
-    repeated, behind = set(repeated_tracking(clip)), set(behind_camera(clip))
-    for image, number in clip.pairs():
-        view = clip.views[image]
-        absent = [
-            clip.files.title(k) for k, f in clip.files.of_kind().items() if k != TRACKING and f and image not in f
-        ]
-        if number in clip.tracking.bad:
-            reasons[image] = clip.tracking.bad[number]
-        elif view.problems:
-            reasons[image] = "a file cannot be read"
-        elif absent:
-            reasons[image] = f"it has no file in {', '.join(absent)}"
-        elif view.brightest.get(HEAD) == 0:
-            reasons[image] = "its head mask is empty"
-        elif view.brightest.get(ALPHA) == 0:
-            reasons[image] = "its matte is empty"
-        elif image in behind:
-            reasons[image] = "the tracked head is behind the camera"
-        elif image in repeated:
-            reasons[image] = "the tracking repeats that of the frame before, while the image does not"
-    return reasons
-
-
 def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
     """Figures about the clip, none of which is a judgement."""
     found: dict[str, Any] = {"format": clip.source.format}
@@ -148,7 +107,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
             found[f"files in {clip.files.title(kind)}"] = len(paths)
     if (size := clip.size()) is not None:
         found["image size"] = f"{size[0]}x{size[1]}"
-    found["frames a second"] = f"{clip.fps:g}{'' if clip.given_fps or clip.source.fps else ' (assumed)'}"
+    found["frames a second"] = f"{clip.fps:g}{'' if clip.given.fps or clip.source.fps else ' (assumed)'}"
     found |= {"frame offset": clip.offset, "offset found": clip.offset_evidence}
     first = next(iter(clip.tracking.frames.values()), None)
     if first is not None:
@@ -166,8 +125,7 @@ def facts(clip: Clip, coverage: Coverage | None) -> dict[str, Any]:
             values = np.array([getattr(fit, name) for fit in clip.fits.values()])
             if (finite := values[np.isfinite(values)]).size:
                 found[title] = round(float(np.median(finite)), 3)
-    lost = left_out(clip)
-    found["frames left out"] = describe_reasons(lost, clip.name) if lost else 0
+    found["frames left out"] = describe_reasons(clip.left_out, clip.name) if clip.left_out else 0
     if coverage is not None:
         found["usable frames"] = len(coverage.images)
         found["training frames"], found["held-out frames"] = len(coverage.split.train), len(coverage.split.test)

@@ -24,7 +24,7 @@ from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import find_embedding
 from data_prep.track.fit.focal import choose_focal
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
+from data_prep.track.fit.motion import Motion, six_d
 
 CALIBRATION_SECONDS = 4.0
 FEWEST, MOST = 20, 60  # pictures with the face that calibration is made from
@@ -186,8 +186,7 @@ def _as_faces(motion: Motion, times: list[float], expressions: Tensor, assets: H
     T = len(motion)
     expression = torch.zeros(T, assets.num_expressions)
     expression[:, expressions] = motion.expression.float()
-    jaw, neck = (rotations(v)[:, :2].reshape(T, 6).float() for v in (motion.jaw, motion.neck))
-    eyes = gaze_rotations(motion.gaze.reshape(T, 2, 2))[:, :, :2].reshape(T, 12).float()
+    jaw, eyes, neck = (values.float() for values in six_d(motion).values())
     lids, R, t = motion.eyelids.float(), motion.R.float(), motion.t.float()
     return [
         FollowedFace(HeadParams(expression[n], jaw[n], eyes[n], lids[n], neck[n]), R[n], t[n], times[n])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
@@ -96,7 +96,7 @@ class FrameFit:
             self._before = []
         if self._before:
             terms.append(_follows(self._smoothness, self._before, taken))
-        done = minimise(terms, self._fit.identity, start, self._fit.columns, steps, with_identity=False, coupled=False)
+        done = minimise(terms, self._fit.identity, start, steps)
         if not (torch.isfinite(done.motion.coefficients()).all() and done.motion.t[0, 2] > _BEHIND):
             self._before = []
             return None
@@ -155,12 +155,10 @@ class _Follows:
     def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
         return self.smoothness.cost(identity, concatenated([self.before, motion]))
 
-    def add_to(
-        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
-    ) -> None:
+    def add_to(self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion) -> None:
         together = concatenated([self.before, motion])
-        of_all = NormalEquations.zeros(len(together), len(columns), 0, coupled=True)
-        self.smoothness.add_to(of_all, identity, together, columns)
+        of_all = NormalEquations.zeros(len(together), equations.gradient.shape[1], 0)
+        self.smoothness.add_to(of_all, identity, together)
         equations.diagonal[0] += of_all.diagonal[-1]
         equations.gradient[0] += of_all.gradient[-1]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ from data_prep.formats.frame_track import Tracking
 from data_prep.prepare.frame_offset import RADIUS
 from data_prep.prepare.inspect_images import Inspection
 
+BEHIND_CAMERA = "the tracked head is behind the camera"
+REPEATS = "the tracking repeats that of the frame before, while the image does not"
 _REASONS_SHOWN = 5
 
 
@@ -62,24 +64,39 @@ def pair_frames(
             f"tracking is {_range(files.tracking)}; give another --frame-offset"
         )
     _refuse_if_unpaired(files, len(numbered), offset, max_left_out)
+    left_out = unusable(numbered, tracking, inspection.bad, inspection.image_digests, head_centre)
+    refuse_if_many(left_out, len(numbered), "frames", max_left_out)
+    return Pairing(tuple(pair for pair in numbered if pair[0] not in left_out), left_out, notes)
+
+
+def unusable(
+    pairs: Sequence[tuple[int, int]],
+    tracking: Tracking,
+    bad: Mapping[int, str],
+    digests: Mapping[int, bytes],
+    head_centre: np.ndarray | None,
+) -> dict[int, str]:
+    """Image number -> why the frame cannot be used, for pairs of image number and tracking number.
+
+    `bad` says which images cannot be used, `digests` are of all of them; without a head model, none lies behind the camera.
+    """
     left_out: dict[int, str] = {}
     previous: tuple[int, np.ndarray] | None = None
-    for image, number in numbered:
+    for image, number in pairs:
         if number in tracking.bad:
             left_out[image] = tracking.bad[number]
             continue
         track = tracking.frames[number]
         values = track.moving_values()
         repeats = previous is not None and previous[0] == number - 1 and np.array_equal(previous[1], values)
-        if image in inspection.bad:
-            left_out[image] = inspection.bad[image]
-        elif (track.R @ head_centre + track.t)[2] <= 0:
-            left_out[image] = "the tracked head is behind the camera"
-        elif repeats and inspection.image_digests[image] != inspection.image_digests.get(image - 1):
-            left_out[image] = "the tracking repeats that of the frame before, while the image does not"
+        if image in bad:
+            left_out[image] = bad[image]
+        elif head_centre is not None and (track.R @ head_centre + track.t)[2] <= 0:
+            left_out[image] = BEHIND_CAMERA
+        elif repeats and digests[image] != digests.get(image - 1):
+            left_out[image] = REPEATS
         previous = number, values
-    refuse_if_many(left_out, len(numbered), "frames", max_left_out)
-    return Pairing(tuple(pair for pair in numbered if pair[0] not in left_out), left_out, notes)
+    return left_out
 
 
 def _count_notes(files: FrameFiles) -> list[str]:

@@ -6,20 +6,19 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar, overload
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from avatar.data.images import read_image, read_mask
 from avatar.errors import UserError
 from data_prep.formats.frame_files import describe_numbers
+from data_prep.progress import Progress
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.look import Look
 from data_prep.track.own_mattes import OPAQUE, OwnMattes, share_on
-from data_prep.track.progress import Progress
 from data_prep.track.spill import despilled
 
 # JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
@@ -28,37 +27,7 @@ WORKERS = 2
 MAX_WITHOUT = 0.1  # of the frames may have a given matte that leaves out the face
 _AHEAD = 4  # frames that wait for a worker
 Made = TypeVar("Made")
-
-
-class FrameImages(Sequence[UInt8[np.ndarray, "H W 3"]]):
-    """The pictures of some frames, read from their files when they are asked for."""
-
-    def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
-        self._paths = [frame_file(folder, number) for number in numbers]
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    @overload
-    def __getitem__(self, index: int) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[np.ndarray]: ...
-    def __getitem__(self, index: int | slice) -> np.ndarray | list[np.ndarray]:
-        if isinstance(index, slice):
-            return [read_image(path) for path in self._paths[index]]
-        return read_image(self._paths[index])
-
-
-class FrameMattes(FrameImages):
-    """The same for mattes, uint8 [H, W]."""
-
-    def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
-        self._paths = [mask_file(folder, number) for number in numbers]
-
-    def __getitem__(self, index: int | slice) -> np.ndarray | list[np.ndarray]:  # type: ignore[override]
-        if isinstance(index, slice):
-            return [read_mask(path) for path in self._paths[index]]
-        return read_mask(self._paths[index])
+Read = Callable[[int], np.ndarray]  # the picture or the mask of the frame with this number
 
 
 def frame_file(folder: Path, number: int) -> Path:
@@ -147,15 +116,15 @@ def write_masks(
 
 
 def write_despilled(
-    folder: Path, numbers: Sequence[int], images: FrameImages, mattes: FrameMattes, width: int, progress: Progress
+    folder: Path, numbers: Sequence[int], images: Read, mattes: Read, width: int, progress: Progress
 ) -> None:
     """The frames as `spill.despilled` makes them, as JPEG; by some threads."""
 
-    def one(row: int) -> None:
-        made = despilled(images[row], mattes[row], width)  # type: ignore[arg-type]
-        write_image(frame_file(folder, numbers[row]), cv2.cvtColor(made, cv2.COLOR_RGB2BGR), JPEG)
+    def one(number: int) -> None:
+        made = despilled(images(number), mattes(number), width)
+        write_image(frame_file(folder, number), cv2.cvtColor(made, cv2.COLOR_RGB2BGR), JPEG)
 
-    for _ in ahead(range(len(numbers)), one, progress, "cleaning the outline"):
+    for _ in ahead(numbers, one, progress, "cleaning the outline"):
         pass
 
 

@@ -10,7 +10,7 @@ from avatar.head.assets import HeadAssets
 from data_prep.track.faces.embedding import official_file
 from data_prep.track.faces.rendered_embedding import RECIPE
 from data_prep.track.footage.source import Footage
-from data_prep.track.stages import hash_of
+from data_prep.track.stage_folder import hash_of
 
 STAGES_VERSION = 11  # raised when what a stage makes changes
 
@@ -22,7 +22,7 @@ def tracking_key(footage: Footage, choices: dict[str, Any], head_path: Path, hea
 
 def look_inputs(footage: Footage) -> dict[str, Any]:
     """Of the landmarks."""
-    return {"video": footage.content_hash(), "version": STAGES_VERSION, "landmarks": FACE_LANDMARKER.sha256}
+    return {"video": footage.content_hash, "version": STAGES_VERSION, "landmarks": FACE_LANDMARKER.sha256}
 
 
 def head_inputs(head_path: Path, head: HeadAssets) -> dict[str, Any]:

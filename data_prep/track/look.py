@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from avatar.errors import UserError
+from data_prep.progress import Progress
 from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.faces.person import follow_one
 from data_prep.track.footage.cuts import CutFinder, Shot
 from data_prep.track.footage.source import Footage, Span, stride, whole
 from data_prep.track.footage.timing import regular_timing
-from data_prep.track.progress import Progress
 
 LOOKED_AT = 1920  # pixels of the longer side; the landmarks come from 256 pixels around the face
 MAX_PICTURES = 3600  # two minutes at 30 a second

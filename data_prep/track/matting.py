@@ -31,11 +31,9 @@ _LOADING = threading.Lock()
 Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
 
 
-def open_matter() -> tuple[Matter, str]:
-    """The best network that is there, as a function from a picture to its matte (0 to 255), and the network's name."""
-    if find(SELFIE_MULTICLASS) is not None:
-        return _with_mirrored(_multiclass()), SELFIE_MULTICLASS.name
-    return _with_mirrored(_segmentation()), SELFIE_SEGMENTATION.name
+def open_matter() -> Matter:
+    """The best network that is there, as a function from a picture to its matte (0 to 255)."""
+    return _with_mirrored(_segmentation() if find(SELFIE_MULTICLASS) is None else _multiclass())
 
 
 def sharpened(

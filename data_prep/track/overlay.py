@@ -14,8 +14,8 @@ from avatar.head.model import HeadModel
 from data_prep.check.overlay import MASK, MOUTH, draw_mesh, outline
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.mask_overlap import MeshProjector
+from data_prep.progress import Progress
 from data_prep.track.frames import JPEG, ahead, write_image
-from data_prep.track.progress import Progress
 
 OVERLAY_VIDEO, OVERLAY_SHEET = "overlay.mp4", "overlay.jpg"
 _WIDEST = 512  # pixels of a picture

@@ -30,6 +30,7 @@ from data_prep.formats.avatar_track import (
     write_tracking,
 )
 from data_prep.formats.frame_files import describe_numbers
+from data_prep.progress import Progress, silent
 from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.footage.pictures import open_footage
@@ -39,11 +40,10 @@ from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, matte_network, tracking_key
 from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.own_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
-from data_prep.track.progress import Progress, silent
 from data_prep.track.quality import judge
-from data_prep.track.stages import Stages, growing
+from data_prep.track.stage_folder import StageFolder, growing
+from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
 from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
-from data_prep.track.work import DESPILLED, Choices, Work
 
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
@@ -92,7 +92,7 @@ def track(
         seen |= {"matte": options["matte"], "rotate": choices.rotate}
         turn, look = _look(stages, choices, footage, mattes, seen, progress)
         footage, mattes = turned(footage, turn), mattes and mattes.turned(turn)
-        work = Work(stages, footage, choices, head, progress)
+        work = TrackingStages(stages, footage, choices, head, progress)
         for note in look.notes:
             say(f"note: {note}")
         view, focal = work.view_and_focal(look)
@@ -114,7 +114,7 @@ def track(
         quality = judge(landmarks, fit, overlaps, focal)
         for line in quality.lines():
             say(line)
-        save_landmarks(stages.folder / LANDMARKS_FILE, landmarks)
+        save_landmarks(stages.path / LANDMARKS_FILE, landmarks)
         info = TrackingInfo(
             fps=look.landmarks.fps,
             width=view.width,
@@ -126,7 +126,7 @@ def track(
             head_fingerprint=head.fingerprint,
             source={
                 "video": video.name,
-                "sha256": footage.content_hash(),
+                "sha256": footage.content_hash,
                 "key": key,
                 "turned": turn,
                 "box": list(view.box),
@@ -136,7 +136,7 @@ def track(
             notes=notes,
             quality=quality.to_json(),
         )
-        write_tracking(stages.folder, info, fit.tracks)
+        write_tracking(stages.path, info, fit.tracks)
         if spill:
             stages.finish(out, ("look", "fit"), {DESPILLED: FRAMES}, seal)
         else:
@@ -146,7 +146,7 @@ def track(
 
 
 def _look(
-    stages: Stages,
+    stages: StageFolder,
     choices: Choices,
     footage: Footage,
     mattes: OwnMattes | None,
@@ -172,7 +172,7 @@ def _look(
         return to_json(look) | {"turn": turn}
 
     raw, _ = stages.run("look", inputs | {"span": list(choices.span)}, make)
-    return raw["turn"], from_json(raw, load_landmarks(stages.folder / "look" / LANDMARKS_FILE))
+    return raw["turn"], from_json(raw, load_landmarks(stages.path / "look" / LANDMARKS_FILE))
 
 
 def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, float, float]:

@@ -209,7 +209,7 @@ def test_a_damaged_tracking_in_the_cache_is_made_again_and_it_is_said(
         made.append(out)
 
     monkeypatch.setattr(track, "track", fake_track)
-    monkeypatch.setattr(track, "open_footage", lambda path: SimpleNamespace(content_hash=lambda: "ab"))
+    monkeypatch.setattr(track, "open_footage", lambda path: SimpleNamespace(content_hash="ab"))
     folder = track.tracked_once(video, head)
     assert track.tracked_once(video, head) == folder and made == [folder]
     flip(folder / "frames" / "00000.jpg", 2)

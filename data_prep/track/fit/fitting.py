@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,16 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from data_prep.formats.frame_track import FrameTrack
+from data_prep.progress import Progress
 from data_prep.track.faces.detect import FaceDetector
 from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding, official_embedding
 from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.chunks import side_by_side
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.fit.motion import Motion, gaze_rotations, rotations
+from data_prep.track.fit.motion import Motion, six_d
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.result import Clip, Fit
-from data_prep.track.progress import Progress
 from data_prep.track.quality import landmark_figures
 
 
@@ -34,15 +34,14 @@ def fit_tracks(
     camera = Pinhole(*clip.intrinsics)
     with side_by_side():
         by_landmarks = fit_landmarks(head, head.names, embedding, clip.landmarks, camera)
-        read = clip.images.__getitem__, clip.mattes.__getitem__
-        by_pictures = fit_pictures(head, by_landmarks, camera, *read, progress)
-    tracks = as_tracks(by_landmarks, by_pictures.motion, clip, head.num_expressions)
+        by_pictures = fit_pictures(head, by_landmarks, camera, clip.images, clip.mattes, progress)
 
-    def figures(tracks: dict[int, FrameTrack]) -> dict[str, Any]:
+    def judged(motion: Motion) -> tuple[dict[int, FrameTrack], dict[str, Any]]:
+        tracks = as_tracks(by_landmarks, motion, clip.intrinsics, clip.landmarks.size, head.num_expressions)
         with_irises = embedding.with_others(iris_embedding(head))
-        return landmark_figures(head, Fit(tracks, {}), clip.landmarks, with_irises)
+        return tracks, landmark_figures(head, Fit(tracks, {}), clip.landmarks, with_irises)
 
-    own = figures(tracks)
+    tracks, own = judged(by_pictures.motion)
     own["photometric"] = [
         ["face on its mean texture, by landmarks", by_pictures.before, "dB"],
         ["  fitted to the pictures", by_pictures.after, "dB"],
@@ -50,35 +49,32 @@ def fit_tracks(
     if by_pictures.is_taken:
         # The pictures' fit leaves the landmarks' noise behind, so their error grades the fit to them alone.
         own["photometric"].append(["  landmark error after that", own["errors"]["all"], "% eyes"])
-        before = figures(as_tracks(by_landmarks, by_landmarks.motion, clip, head.num_expressions))
-        own["errors"] = before["errors"]
+        own["errors"] = judged(by_landmarks.motion)[1]["errors"]
     return Fit(tracks, own)
 
 
-def as_tracks(fit: LandmarkFit, motion: Motion, clip: Clip, expressions: int) -> dict[int, FrameTrack]:
+def as_tracks(
+    fit: LandmarkFit, motion: Motion, intrinsics: Sequence[float], size: tuple[int, int], expressions: int
+) -> dict[int, FrameTrack]:
     """By the frames' numbers; all `expressions` of the head model. Raises UserError where a value is not finite."""
-    T = len(motion)
-    expression = np.zeros((T, expressions))
+    expression = np.zeros((len(motion), expressions))
     expression[:, fit.expressions.numpy()] = motion.expression.numpy()
     shape = np.zeros(IDENTITY_COEFFICIENTS)
     shape[: len(fit.identity)] = fit.identity.numpy()
     columns = {
         "R": motion.R.numpy(),
         "t": motion.t.numpy(),
-        "jaw": rotations(motion.jaw)[:, :2].reshape(T, 6).numpy(),
-        "eyes": gaze_rotations(motion.gaze.reshape(T, 2, 2))[:, :, :2].reshape(T, 12).numpy(),
         "eyelids": motion.eyelids.numpy(),
-        "neck": rotations(motion.neck)[:, :2].reshape(T, 6).numpy(),
         "expression": expression,
-    }
+    } | {name: values.numpy() for name, values in six_d(motion).items()}
     if not all(np.isfinite(values).all() for values in columns.values()):
         raise UserError("the fit did not come to finite values; try another part of the video with --start and --end")
     return {
         int(number): FrameTrack(
             **{name: values[row] for name, values in columns.items()},
             shape=shape,
-            intrinsics=np.array(clip.intrinsics),
-            size=clip.landmarks.size,
+            intrinsics=np.array(intrinsics),
+            size=size,
         )
         for row, number in enumerate(fit.frames.tolist())
     }

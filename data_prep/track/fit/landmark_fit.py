@@ -15,16 +15,15 @@ from torch import Tensor
 
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames
-from avatar.head.model import JAW, LEFT_EYE, RIGHT_EYE
+from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.faces.embedding import LandmarkEmbedding, as_points, iris_embedding
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
-from data_prep.track.fit.columns import free_columns
 from data_prep.track.fit.expression_kind import is_statistical, used_expressions
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import IdentityPrior, minimise
-from data_prep.track.fit.motion import Columns, Motion, at_rest
+from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.priors import Priors, make_priors
 from data_prep.track.fit.smoothness import Smoothness, make_smoothness
 from data_prep.track.fit.start import start_poses
@@ -51,11 +50,9 @@ class LandmarkFit:
     motion: Motion  # of the frames in `frames`
     frames: Int[Tensor, " T"]  # numbers of the frames with a face
     expressions: Int[Tensor, " E"]  # the head model's coefficients that `motion` holds
-    columns: Int[Tensor, " D"]  # of a step, that are free
     term: LandmarkTerm
     priors: Priors
     smoothness: Smoothness
-    costs: tuple[tuple[float, ...], ...]
 
 
 def fit_landmarks(
@@ -72,10 +69,6 @@ def fit_landmarks(
     term = _with_unit(term, assets, camera, t)
     priors = make_priors(seen, names, expressions, statistical)
     smoothness = make_smoothness(assets, torch.from_numpy(frames), landmarks.fps, len(expressions), statistical)
-    fixed = [Columns.NECK]
-    if not (assets.weights[:, JAW] > 0).any():
-        fixed.append(Columns.JAW)
-    columns = free_columns(len(expressions), *fixed)
     motion = at_rest(R, t, len(expressions)).moved(
         torch.cat((torch.zeros(len(R), 6, dtype=torch.float64), _plausible(priors)), dim=1)
     )
@@ -83,16 +76,10 @@ def fit_landmarks(
     key = torch.from_numpy(np.unique(np.linspace(0, len(frames) - 1, min(KEY_FRAMES, len(frames))).round().astype(int)))
     first = minimise(
         (term.take(key), priors.take(key), IdentityPrior(len(key) / CLIP_WORTH)),
-        identity, motion[key], columns, IDENTITY_ITERATIONS, with_identity=True, coupled=False,
+        identity, motion[key], IDENTITY_ITERATIONS, with_identity=True,
     )  # fmt: skip
-    identity = first.identity
-    second = minimise(
-        (term, priors, smoothness), identity, motion, columns, MOTION_ITERATIONS, with_identity=False, coupled=True
-    )
-    return LandmarkFit(
-        identity, second.motion, torch.from_numpy(frames), expressions, columns, term, priors, smoothness,
-        (first.costs, second.costs),
-    )  # fmt: skip
+    second = minimise((term, priors, smoothness), first.identity, motion, MOTION_ITERATIONS)
+    return LandmarkFit(first.identity, second.motion, torch.from_numpy(frames), expressions, term, priors, smoothness)
 
 
 def make_landmark_term(

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from data_prep.track.fit.camera import Pinhole, by_pose, to_camera
 from data_prep.track.fit.chunks import chunks_of, over_chunks
-from data_prep.track.fit.columns import frame_columns
 from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.surface import SurfacePoints
@@ -69,10 +68,8 @@ class LandmarkTerm:
         at = [to_camera(motion[c], self.points.positions(identity, motion[c])) for c in chunks]
         return (self.camera.project(torch.cat(at)) - self.observed).norm(dim=-1)
 
-    def add_to(
-        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
-    ) -> None:
-        """Add the Gauss-Newton Hessian and the gradient by columns of a step, and by the identity where that is shared."""
+    def add_to(self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion) -> None:
+        """Add the Gauss-Newton Hessian and the gradient by a step, and by the identity where that is shared."""
         with_identity = len(equations.shared) > 0
 
         def rows_of(chunk: slice) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -83,7 +80,7 @@ class LandmarkTerm:
             in_head = (slopes.flatten(1, 2) @ moving.R).unflatten(1, slopes.shape[1:3])  # [T, L, 2, 3]
             derivatives = self.points.derivatives(placed, in_head, with_identity)
             pose = by_pose(moving, at, slopes).permute(1, 2, 0, 3)  # [L, 2, T, 6]
-            by_step = frame_columns(pose.flatten(0, 1), derivatives, columns).unflatten(0, (-1, 2))  # [L, 2, T, D]
+            by_step = torch.cat((pose, derivatives.coefficients.unflatten(0, (-1, 2))), dim=-1)  # [L, 2, T, D]
             residuals, weights, scales = part._residuals(self.camera.project(at))
             robust = (weights / (1 + (residuals**2).sum(-1) / scales**2)).sqrt()  # [T, L + P]
             row_scale = (robust / part.unit[:, None]).T[:, None, :, None]

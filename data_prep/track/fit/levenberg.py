@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from data_prep.track.fit.columns import spread
-from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.motion import NUM_FIXED, Motion
 from data_prep.track.fit.normal_equations import NormalEquations, NotPositiveDefinite, solve
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-8, 1e6
@@ -23,57 +22,54 @@ class Term(Protocol):
 
     def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float: ...
 
-    def add_to(
-        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
-    ) -> None: ...
+    def add_to(self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion) -> None: ...
 
 
 @dataclass(frozen=True)
 class Fitted:
     identity: Float[Tensor, " I"]
     motion: Motion
-    costs: tuple[float, ...]  # of the start and of every accepted step
-    rejected: int
 
 
 def minimise(
     terms: Sequence[Term],
     identity: Float[Tensor, " I"],
     motion: Motion,
-    columns: Int[Tensor, " D"],
     iterations: int,
-    with_identity: bool,
-    coupled: bool,
+    with_identity: bool = False,
 ) -> Fitted:
-    """At most `iterations` steps, accepted or not, of the given columns of all frames, and of the identity if asked for."""
-    damping, rejected = FIRST_DAMPING, 0
-    costs = [_total(terms, identity, motion)]
+    """At most `iterations` steps, accepted or not, of all frames, and of the identity if asked for.
+
+    With the identity, no term may tie frames to each other.
+    """
+    damping, least = FIRST_DAMPING, _total(terms, identity, motion)
     equations: NormalEquations | None = None
     for _ in range(iterations):
         if equations is None:
-            equations = NormalEquations.zeros(len(motion), len(columns), len(identity) if with_identity else 0, coupled)
+            equations = NormalEquations.zeros(
+                len(motion), NUM_FIXED + motion.expression.shape[1], len(identity) if with_identity else 0
+            )
             for term in terms:
-                term.add_to(equations, identity, motion, columns)
+                term.add_to(equations, identity, motion)
         try:
             step = solve(equations, damping)
         except NotPositiveDefinite:
             damping *= 10.0
             continue
-        new_motion = motion.moved(spread(step.frames, columns, motion.expression.shape[1]))
+        new_motion = motion.moved(step.frames)
         new_identity = identity + step.shared if with_identity else identity
         cost = _total(terms, new_identity, new_motion)
-        if not cost < costs[-1]:  # not a number is not less
-            rejected += 1
+        if not cost < least:  # not a number is not less
             damping *= 8.0
             if damping > MOST_DAMPING:
                 break
             continue
         identity, motion, equations = new_identity, new_motion, None
-        costs.append(cost)
         damping = max(damping / 4.0, LEAST_DAMPING)
-        if costs[-2] - cost < CONVERGED * cost:
+        least, before = cost, least
+        if before - cost < CONVERGED * cost:
             break
-    return Fitted(identity, motion, tuple(costs), rejected)
+    return Fitted(identity, motion)
 
 
 def _total(terms: Sequence[Term], identity: Tensor, motion: Motion) -> float:
@@ -89,13 +85,7 @@ class IdentityPrior:
     def cost(self, identity: Float[Tensor, " I"], motion: Motion) -> float:
         return float(0.5 * self.weight * (identity @ identity))
 
-    def add_to(
-        self,
-        equations: NormalEquations,
-        identity: Float[Tensor, " I"],
-        motion: Motion,
-        columns: Int[Tensor, " D"],
-    ) -> None:
+    def add_to(self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion) -> None:
         if len(equations.shared):
             equations.shared.diagonal().add_(self.weight)
             equations.shared_gradient += self.weight * identity

@@ -1,7 +1,7 @@
 """What moves a head in each frame of a clip, as the fit holds it, and the local coordinates in which it is improved.
 
-Head model parameters of T frames. The head's pose is in the camera: p_cam = R p_head + t. A step is a vector of D numbers
-a frame in the order of `Columns`: the rotation R becomes exp(step) R, everything else is added to.
+Head model parameters of T frames. The head's pose is in the camera: p_cam = R p_head + t; its neck stays at rest. A step
+is a vector of D numbers a frame in the order of `Columns`: the rotation R becomes exp(step) R, everything else is added to.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-NUM_FIXED = 18  # columns before those of the expression
+NUM_FIXED = 15  # columns before those of the expression
 
 
 class Columns:
@@ -24,7 +24,6 @@ class Columns:
     JAW = slice(6, 9)  # rotation vector
     GAZE = slice(9, 13)  # radians: yaw and pitch of the left eye, of the right eye
     EYELIDS = slice(13, 15)
-    NECK = slice(15, 18)  # rotation vector
     EXPRESSION = slice(NUM_FIXED, None)
     HEAD = slice(6, None)  # all but the pose
 
@@ -38,7 +37,6 @@ class Motion:
     jaw: Float[Tensor, "T 3"]
     gaze: Float[Tensor, "T 4"]
     eyelids: Float[Tensor, "T 2"]
-    neck: Float[Tensor, "T 3"]
     expression: Float[Tensor, "T E"]
 
     def __len__(self) -> int:
@@ -49,7 +47,7 @@ class Motion:
 
     def coefficients(self) -> Float[Tensor, "T C"]:
         """All but the pose, in the order of `Columns`."""
-        return torch.cat((self.jaw, self.gaze, self.eyelids, self.neck, self.expression), dim=1)
+        return torch.cat((self.jaw, self.gaze, self.eyelids, self.expression), dim=1)
 
     def moved(self, step: Float[Tensor, "T D"]) -> Motion:
         """The motion after a step."""
@@ -59,9 +57,19 @@ class Motion:
             jaw=self.jaw + step[:, Columns.JAW],
             gaze=self.gaze + step[:, Columns.GAZE],
             eyelids=self.eyelids + step[:, Columns.EYELIDS],
-            neck=self.neck + step[:, Columns.NECK],
             expression=self.expression + step[:, Columns.EXPRESSION],
         )
+
+
+def six_d(motion: Motion) -> dict[str, Float[Tensor, "T C"]]:
+    """Jaw, eyes and neck as tracks and head parameters have them: the first two rows of every rotation matrix."""
+    T = len(motion)
+    turns = {
+        "jaw": rotations(motion.jaw)[:, None],
+        "eyes": gaze_rotations(motion.gaze.unflatten(1, (2, 2))),
+        "neck": torch.eye(3, dtype=motion.jaw.dtype).expand(T, 1, 3, 3),
+    }
+    return {name: matrices[:, :, :2].reshape(T, -1) for name, matrices in turns.items()}
 
 
 def at_rest(R: Float[Tensor, "T 3 3"], t: Float[Tensor, "T 3"], expressions: int) -> Motion:
@@ -70,7 +78,7 @@ def at_rest(R: Float[Tensor, "T 3 3"], t: Float[Tensor, "T 3"], expressions: int
     def zeros(columns: int) -> Tensor:
         return R.new_zeros(len(R), columns)
 
-    return Motion(R, t, zeros(3), zeros(4), zeros(2), zeros(3), zeros(expressions))
+    return Motion(R, t, zeros(3), zeros(4), zeros(2), zeros(expressions))
 
 
 def cross_matrix(v: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:

@@ -1,9 +1,9 @@
 """Gauss-Newton's normal equations of a clip and their solution.
 
-The unknowns are D numbers for each of T frames and G that all frames share. Frames are coupled to the two before them
-(differences over time), so the matrix is block-banded with a border:
+The unknowns are D numbers for each of T frames, and perhaps G that all frames share. Either frames are coupled to the two
+before them (differences over time), so that the matrix is block-banded, or they share unknowns, which are its border:
 
-    [ A  B ] [frames]     [a]        A [T D, T D] with blocks (t, t), (t, t-1), (t, t-2)
+    [ A  B ] [frames]     [a]        A [T D, T D] with blocks (t, t), and (t, t-1), (t, t-2) where nothing is shared
     [ B' C ] [shared] = - [c]
 
 A is factorised by blocks (Cholesky), the border by its Schur complement C - B' A^-1 B: time grows with T, not T^3.
@@ -30,23 +30,24 @@ class NormalEquations:
 
     diagonal: Float[Tensor, "T D D"]
     gradient: Float[Tensor, "T D"]
-    before: Float[Tensor, "T D D"] | None  # block (t, t-1), row 0 unused; None where frames are not coupled
-    before_that: Float[Tensor, "T D D"] | None  # block (t, t-2)
+    before: Float[Tensor, "T D D"]  # block (t, t-1), row 0 unused; T = 0 where something is shared
+    before_that: Float[Tensor, "T D D"]  # block (t, t-2)
     border: Float[Tensor, "T D G"]
     shared: Float[Tensor, "G G"]
     shared_gradient: Float[Tensor, " G"]
 
     @staticmethod
-    def zeros(frames: int, columns: int, shared: int, coupled: bool) -> NormalEquations:
+    def zeros(frames: int, columns: int, shared: int) -> NormalEquations:
         def empty(*shape: int) -> Tensor:
             return torch.zeros(*shape, dtype=torch.float64)
 
         T, D, G = frames, columns, shared
+        coupled = 0 if shared else frames
         return NormalEquations(
             empty(T, D, D),
             empty(T, D),
-            empty(T, D, D) if coupled else None,
-            empty(T, D, D) if coupled else None,
+            empty(coupled, D, D),
+            empty(coupled, D, D),
             empty(T, D, G),
             empty(G, G),
             empty(G),
@@ -83,7 +84,6 @@ class NormalEquations:
 class Step:
     frames: Float[Tensor, "T D"]
     shared: Float[Tensor, " G"]
-    decrease: float  # of the cost, that the quadratic model promises
 
 
 class NotPositiveDefinite(Exception):
@@ -95,70 +95,55 @@ def solve(equations: NormalEquations, damping: float) -> Step:
 
     Raises NotPositiveDefinite where that is not enough.
     """
-    diagonal = equations.diagonal.clone()
-    own = torch.diagonal(diagonal, dim1=1, dim2=2)
-    own += damping * own
-    shared = equations.shared.clone()
-    shared.diagonal().add_(damping * equations.shared.diagonal())
+    diagonal, shared = equations.diagonal.clone(), equations.shared.clone()
+    for own in (torch.diagonal(diagonal, dim1=1, dim2=2), shared.diagonal()):
+        own += damping * own
     try:
-        factors = _Factors(diagonal, equations.before, equations.before_that)
-        right = torch.cat((equations.gradient[..., None], equations.border), dim=2)
-        solved = factors.solve(right)  # A^-1 [a, B]
-        Ainv_a, Ainv_B = solved[..., 0], solved[..., 1:]
-        G = len(shared)
-        schur = shared - torch.einsum("tdg,tdh->gh", equations.border, Ainv_B)
-        rest = equations.shared_gradient - torch.einsum("tdg,td->g", equations.border, Ainv_a)
-        by_shared = -torch.cholesky_solve(rest[:, None], torch.linalg.cholesky(schur))[:, 0] if G else rest
+        if len(shared):
+            return _with_shared(equations, diagonal, shared)
+        return Step(-_banded(equations, diagonal), equations.shared_gradient)
     except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
         raise NotPositiveDefinite(str(error)) from None
-    by_frames = -Ainv_a - Ainv_B @ by_shared
-    # Of 1/2 x' H x + g' x with the damped H: half of -g' x at its minimum; the undamped model promises more.
-    linear = float((equations.gradient * by_frames).sum() + equations.shared_gradient @ by_shared)
-    return Step(by_frames, by_shared, -0.5 * linear)
 
 
-class _Factors:
-    """The block Cholesky factor of a block-banded matrix."""
+def _with_shared(equations: NormalEquations, diagonal: Tensor, shared: Tensor) -> Step:
+    """The step of frames that share unknowns; `diagonal` and `shared` are damped."""
+    right = torch.cat((equations.gradient[..., None], equations.border), dim=2)
+    solved = torch.cholesky_solve(right, torch.linalg.cholesky(diagonal))  # A^-1 [a, B]
+    Ainv_a, Ainv_B = solved[..., 0], solved[..., 1:]
+    schur = shared - torch.einsum("tdg,tdh->gh", equations.border, Ainv_B)
+    rest = equations.shared_gradient - torch.einsum("tdg,td->g", equations.border, Ainv_a)
+    by_shared = -torch.cholesky_solve(rest[:, None], torch.linalg.cholesky(schur))[:, 0]
+    return Step(-Ainv_a - Ainv_B @ by_shared, by_shared)
 
-    def __init__(self, diagonal: Tensor, before: Tensor | None, before_that: Tensor | None) -> None:
-        if before is None or before_that is None:
-            self._own, self._before, self._before_that = torch.linalg.cholesky(diagonal), None, None
-            return
-        T = len(diagonal)
-        self._own = torch.empty_like(diagonal)
-        self._before, self._before_that = torch.zeros_like(before), torch.zeros_like(before_that)
-        for t in range(T):
-            block = diagonal[t]
-            if t >= 2:
-                # X L' = M  ->  X: what stands left of the diagonal of the factor
-                self._before_that[t] = _right_solve(before_that[t], self._own[t - 2])
-                block = block - self._before_that[t] @ self._before_that[t].T
-            if t >= 1:
-                coupled = before[t] - self._before_that[t] @ self._before[t - 1].T
-                self._before[t] = _right_solve(coupled, self._own[t - 1])
-                block = block - self._before[t] @ self._before[t].T
-            self._own[t] = torch.linalg.cholesky(block)
 
-    def solve(self, right: Float[Tensor, "T D K"]) -> Float[Tensor, "T D K"]:
-        if self._before is None or self._before_that is None:
-            return torch.cholesky_solve(right, self._own)
-        T = len(right)
-        y = torch.empty_like(right)
-        for t in range(T):
-            rest = right[t]
-            if t >= 1:
-                rest = rest - self._before[t] @ y[t - 1]
-            if t >= 2:
-                rest = rest - self._before_that[t] @ y[t - 2]
-            y[t] = torch.linalg.solve_triangular(self._own[t], rest, upper=False)
-        for t in reversed(range(T)):
-            rest = y[t]
-            if t + 1 < T:
-                rest = rest - self._before[t + 1].T @ y[t + 1]
-            if t + 2 < T:
-                rest = rest - self._before_that[t + 2].T @ y[t + 2]
-            y[t] = torch.linalg.solve_triangular(self._own[t].T, rest, upper=True)
-        return y
+def _banded(equations: NormalEquations, diagonal: Float[Tensor, "T D D"]) -> Float[Tensor, "T D"]:
+    """A^-1 a of frames that are coupled to the two before, by the block Cholesky factor of A; `diagonal` is damped."""
+    T = len(diagonal)
+    own, before, before_that = (torch.zeros_like(diagonal) for _ in range(3))
+    y = torch.empty_like(equations.gradient[..., None])
+    for t in range(T):
+        block, rest = diagonal[t], equations.gradient[t, :, None]
+        if t >= 2:
+            # X L' = M  ->  X: what stands left of the diagonal of the factor
+            before_that[t] = _right_solve(equations.before_that[t], own[t - 2])
+            block = block - before_that[t] @ before_that[t].T
+            rest = rest - before_that[t] @ y[t - 2]
+        if t >= 1:
+            coupled = equations.before[t] - before_that[t] @ before[t - 1].T
+            before[t] = _right_solve(coupled, own[t - 1])
+            block = block - before[t] @ before[t].T
+            rest = rest - before[t] @ y[t - 1]
+        own[t] = torch.linalg.cholesky(block)
+        y[t] = torch.linalg.solve_triangular(own[t], rest, upper=False)
+    for t in reversed(range(T)):
+        rest = y[t]
+        if t + 1 < T:
+            rest = rest - before[t + 1].T @ y[t + 1]
+        if t + 2 < T:
+            rest = rest - before_that[t + 2].T @ y[t + 2]
+        y[t] = torch.linalg.solve_triangular(own[t].T, rest, upper=True)
+    return y[..., 0]
 
 
 def _right_solve(matrix: Tensor, factor: Tensor) -> Tensor:

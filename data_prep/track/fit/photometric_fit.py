@@ -17,6 +17,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
+from data_prep.progress import Progress
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.fit.camera import Pinhole, to_camera
 from data_prep.track.fit.chunks import over_chunks
@@ -26,10 +27,9 @@ from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg import minimise
 from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
-from data_prep.track.fit.skin_points import by_joints, seen_weights, skin_triangles, spread_points
+from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints
 from data_prep.track.fit.texture import light_basis, lit_texture
-from data_prep.track.progress import Progress
 
 EYES_IN_CROPS = 110.0  # pixels between the eyes, at most
 BLURS = (3.0, 1.2)  # per cent of the distance between the eyes
@@ -58,20 +58,19 @@ class PhotometricFit:
 def fit_pictures(
     assets: HeadAssets, start: LandmarkFit, camera: Pinhole, images: Images, mattes: Mattes, progress: Progress
 ) -> PhotometricFit:
-    """`images` and `mattes` are those of the fit's frames by row. The identity stays as it is."""
+    """`images` and `mattes` are by the frames' numbers. The identity stays as it is."""
     T, motion = len(start.motion), start.motion
     corners, barycentric = spread_points(assets, skin_triangles(assets))
-    order = by_joints(assets, corners, barycentric)  # the derivatives of neighbours are made in place
-    corners, barycentric = corners[order], barycentric[order]
-    is_held = order % HELD_OUT == HELD_OUT // 2
+    number = torch.arange(len(corners))
+    is_held = number % HELD_OUT == HELD_OUT // 2
     eyes = float(start.term.unit.mean()) / POINT_SHARE  # pixels of the frames
     points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
     boxes = _boxes(points, start.identity, motion, camera)
-    rows = progress(range(T), T, "reading faces")
-    crops = cut_out(images, mattes, rows, boxes, min(1.0, EYES_IN_CROPS / eyes))
+    frames = progress(start.frames.tolist(), T, "reading faces")
+    crops = cut_out(images, mattes, frames, boxes, min(1.0, EYES_IN_CROPS / eyes))
     skin = _Skin(assets, corners, barycentric, camera, crops, start)
     held, compared_at = skin.subset(is_held), dict.fromkeys(BLURS, ~is_held)
-    compared_at[BLURS[0]] = ~is_held & (order % COARSE_SHARE == 0)
+    compared_at[BLURS[0]] = ~is_held & (number % COARSE_SHARE == 0)
     on_mouth = _near_lips(assets, start, points)
     terms = (_quieter(start.term), start.priors, start.smoothness)
     first = skin.weights(motion)
@@ -93,9 +92,7 @@ def fit_pictures(
         wanted = lit_texture(values, own, compared.basis).values(compared.basis)
         own = own * torch.where(on_mouth[compared_at[blur]], 1.0, _trust(values - wanted, own))
         term = PhotometricTerm(seen, wanted, own)
-        motion = minimise(
-            (term, *terms), start.identity, motion, start.columns, ITERATIONS, with_identity=False, coupled=True
-        ).motion
+        motion = minimise((term, *terms), start.identity, motion, ITERATIONS).motion
     assert blurred is not None
     before = _psnr(held.values(blurred, start.motion), first[:, is_held], held.basis)
     after = _psnr(held.values(blurred, motion), weights[:, is_held], held.basis)

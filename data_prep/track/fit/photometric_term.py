@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from data_prep.track.fit.camera import Pinhole, by_pose, to_camera
 from data_prep.track.fit.chunks import over_chunks
-from data_prep.track.fit.columns import frame_columns
 from data_prep.track.fit.crops import BlurredCrops
 from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.normal_equations import NormalEquations
@@ -58,12 +57,11 @@ class PhotometricTerm:
         robust = ROBUST**2 * torch.log1p((residuals / ROBUST) ** 2)
         return float(0.5 * (self.weights * robust).sum())
 
-    def add_to(
-        self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion, columns: Int[Tensor, " D"]
-    ) -> None:
-        with_identity, seen = len(equations.shared) > 0, self.seen
+    def add_to(self, equations: NormalEquations, identity: Float[Tensor, " I"], motion: Motion) -> None:
+        """Add the Gauss-Newton Hessian and the gradient by a step; the identity is given."""
+        seen = self.seen
 
-        def rows_of(chunk: slice) -> tuple[Tensor, Tensor, Tensor | None]:
+        def rows_of(chunk: slice) -> tuple[Tensor, Tensor, None]:
             moving = motion[chunk]
             placed = seen.points.placed(identity, moving)
             at = to_camera(moving, placed.positions)
@@ -73,9 +71,8 @@ class PhotometricTerm:
             robust = (self.weights[chunk] / (1 + (residuals / ROBUST) ** 2)).sqrt()
             slopes = slopes * robust[..., None, None]
             in_head = (slopes.flatten(1, 2) @ moving.R)[:, :, None]
-            derivatives = seen.points.derivatives(placed, in_head, with_identity)
+            derivatives = seen.points.derivatives(placed, in_head)
             pose = by_pose(moving, at, slopes)[:, :, 0].transpose(0, 1)  # [N, T, 6]
-            J = frame_columns(pose, derivatives, columns)
-            return J, (residuals * robust).T, derivatives.identity if with_identity else None
+            return torch.cat((pose, derivatives.coefficients), dim=-1), (residuals * robust).T, None
 
         equations.add_chunks(rows_of, _FRAMES_AT_ONCE)

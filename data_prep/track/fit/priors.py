@@ -24,7 +24,6 @@ JAW_PER_SCORE = 0.3  # radians that jawOpen = 1 stands for
 JAW_DEVIATION = (0.15, 0.05, 0.03)  # radians: opening, to the sides, tilted
 GAZE_DEVIATION = 0.35  # radians
 EYES_TIED = (0.05, 0.03)  # radians between the eyes: yaw (they converge), pitch
-NECK_DEVIATION = 0.10  # radians
 BOX = (-0.15, 1.25)  # of coefficients that go from 0 to 1, and of eyelids
 BOX_DEVIATION = 0.05  # how far outside
 
@@ -56,10 +55,8 @@ class Priors:
         equations: NormalEquations,
         identity: Float[Tensor, " I"],
         motion: Motion,
-        columns: Int[Tensor, " D"],
     ) -> None:
         values = motion.coefficients()
-        T, C = values.shape
         outside = values - values.clamp(self.low, self.high)
         gradient = (values - self.mean) * self.precision + outside / BOX_DEVIATION**2
         curvature = self.precision + (outside != 0) / BOX_DEVIATION**2
@@ -72,12 +69,8 @@ class Priors:
             gradient[:, right] -= between[:, axis] / deviation**2
             for a, b, sign in ((left, left, 1), (right, right, 1), (left, right, -1), (right, left, -1)):
                 hessian[:, a, b] += sign / deviation**2
-        pose = Columns.HEAD.start
-        moved = columns[columns >= pose]
-        at = len(columns) - len(moved)
-        equations.gradient[:, at:] += gradient[:, moved - pose]
-        equations.diagonal[:, at:, at:] += hessian[:, moved - pose][:, :, moved - pose]
-        assert len(equations.gradient) == T and len(self.precision) == C
+        equations.gradient[:, Columns.HEAD] += gradient
+        equations.diagonal[:, Columns.HEAD, Columns.HEAD] += hessian
 
 
 def _between_eyes(motion: Motion) -> Float[Tensor, "T 2"]:
@@ -136,7 +129,6 @@ def make_priors(
     deviation[_part(Columns.JAW)] = torch.tensor(JAW_DEVIATION, dtype=torch.float64)
     deviation[_part(Columns.GAZE)] = GAZE_DEVIATION
     deviation[lids] = EYELID_DEVIATION
-    deviation[_part(Columns.NECK)] = NECK_DEVIATION
     deviation[expression] = STATISTICAL_DEVIATION if statistical else EXPRESSION_DEVIATION
     low[lids], high[lids] = BOX
     if not statistical:

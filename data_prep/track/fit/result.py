@@ -28,8 +28,8 @@ class Clip:
 
     landmarks: Landmarks  # in pixels of the frames
     intrinsics: tuple[float, float, float, float]
-    images: Sequence[np.ndarray]  # uint8 [H, W, 3], of the frames with a face, read when asked for
-    mattes: Sequence[np.ndarray]  # uint8 [H, W]
+    images: Callable[[int], np.ndarray]  # by a frame's number: uint8 [H, W, 3]
+    mattes: Callable[[int], np.ndarray]  # uint8 [H, W]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from torch import Tensor
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from avatar.head.rasterize import rasterize_mesh
-from data_prep.track.fit.surface import joint_dependence
 
 # With 1,300 to 2,000 points the face's error on two demo people is 0.44 or 0.51 % of the irises' distance, by how many
 # exactly; from here on it does not fall.
@@ -55,12 +54,6 @@ def spread_points(
     u, v = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack((1 - u, u * (1 - v), u * v), axis=-1)
     return torch.from_numpy(chosen), torch.from_numpy(weights)
-
-
-def by_joints(assets: HeadAssets, corners: Int[Tensor, "N 3"], barycentric: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
-    """An order of points in which those that the same joints move are neighbours."""
-    depends = joint_dependence(assets, barycentric[..., None] * assets.weights[corners].double())
-    return torch.unique(depends, dim=0, return_inverse=True)[1].argsort(stable=True)
 
 
 def seen_weights(

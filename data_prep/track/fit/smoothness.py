@@ -16,7 +16,7 @@ from data_prep.track.fit.normal_equations import NormalEquations
 
 NOMINAL_FPS = 25.0
 POSE_SECOND = (0.6e-3, 0.6e-3, 1.2e-3)  # metres, of four points on the head along the camera's axes
-EXPRESSION_BOTH, JAW_BOTH, GAZE_BOTH, NECK_BOTH = 0.06, 0.02, 0.06, 0.02  # of first and of second differences
+EXPRESSION_BOTH, JAW_BOTH, GAZE_BOTH = 0.06, 0.02, 0.06  # of first and of second differences
 EYELIDS_FIRST = 0.3  # lids move fast: first differences only
 
 
@@ -48,24 +48,21 @@ class Smoothness:
         equations: NormalEquations,
         identity: Float[Tensor, " I"],
         motion: Motion,
-        columns: Int[Tensor, " D"],
     ) -> None:
         if len(motion) < 2:
             return
-        self._add_coefficients(equations, motion, columns)
+        self._add_coefficients(equations, motion)
         if len(motion) > 2:
             self._add_pose(equations, motion)
 
-    def _add_coefficients(self, equations: NormalEquations, motion: Motion, columns: Tensor) -> None:
-        moved = columns[columns >= Columns.HEAD.start]
-        own = slice(len(columns) - len(moved), len(columns))
-        values = motion.coefficients()[:, moved - Columns.HEAD.start]
+    def _add_coefficients(self, equations: NormalEquations, motion: Motion) -> None:
+        own, values = Columns.HEAD, motion.coefficients()
         for order, precision in ((1, self.first), (2, self.second)):
             if len(motion) <= order:
                 continue
             stencil = (-1.0, 1.0) if order == 1 else (1.0, -2.0, 1.0)
             counted = self.follows[1:] if order == 1 else self.follows[2:] * self.follows[1:-1]
-            weight = counted[:, None] * precision[moved - Columns.HEAD.start]  # [T - order, C]
+            weight = counted[:, None] * precision  # [T - order, C]
             difference = weight * values.diff(n=order, dim=0)
             T = len(motion) - order
             for i, a in enumerate(stencil):
@@ -92,9 +89,7 @@ class Smoothness:
 
 
 def _block(equations: NormalEquations, back: int) -> Tensor:
-    blocks = (equations.diagonal, equations.before, equations.before_that)[back]
-    assert blocks is not None
-    return blocks
+    return (equations.diagonal, equations.before, equations.before_that)[back]
 
 
 def make_smoothness(
@@ -113,7 +108,6 @@ def make_smoothness(
         (Columns.JAW, JAW_BOTH),
         (Columns.GAZE, GAZE_BOTH),
         (Columns.EYELIDS, EYELIDS_FIRST),
-        (Columns.NECK, NECK_BOTH),
         (Columns.EXPRESSION, EXPRESSION_BOTH * (3.0 if statistical else 1.0)),
     ):
         stop = None if columns.stop is None else columns.stop - Columns.HEAD.start

@@ -1,39 +1,39 @@
 """Points on a head model's surface and their derivatives by everything that moves them.
 
-Linear blend skinning of a point that a triangle's corners k carry with weights b_k is
+Linear blend skinning of a point that a triangle's corners k carry with weights b_k, where jaw and eyes turn by R_j about
+their places c_j and nothing else does (a tracked head's pose is the camera's, and its neck stays at rest), is
 
-    p = sum_k b_k sum_j w_kj (R_j s_k + t_j) + eyelids,    s = template + shape + expression + pose correctives.
+    p = g_0 + sum_j (R_j - 1) g_j,    g_0 = sum_k b_k s_k + eyelids,    g_j = sum_k b_k w_kj (s_k - c_j),
 
-Sorted by the rotations R_j, with every bone (the joint's place relative to its parent's) given to the joint that turns it,
-
-    p = sum_j R_j g_j + eyelids,    g_j linear in identity, expression and pose features,
-
-which leaves one basis for each joint. Turning a joint by d in its parent's axes turns R_i g_i of all joints i that hang on
-it and nothing else, so that dp = (R_parent d) x sum_i R_i g_i, besides what the pose correctives add.
+with s = template + shape + expression + pose correctives: every g is linear in the coefficients and the pose features. When
+a joint turns by d, p moves by d x (R_j g_j), besides what the pose correctives add.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import JAW, LEFT_EYE, NECK, RIGHT_EYE, ROOT
 from data_prep.track.fit.motion import Motion, cross_matrix, gaze_axes, gaze_rotations, left_jacobians, rotations
 
+JOINTS = (JAW, LEFT_EYE, RIGHT_EYE)  # that turn
+FEATURES = 9 * len(JOINTS)  # pose features: the entries of R_j - 1
+
 
 class _Group(NamedTuple):
-    """Points that hang on the same joints: g of all of them is `template` plus `basis` times the coefficients."""
+    """Points that the same joints turn: their g_0 and g_j are `template` plus the bases times the coefficients."""
 
-    joints: tuple[int, ...]  # P of them, the root first
-    rows: Int[Tensor, " M"] | slice  # a slice where they are neighbours, which saves copies
+    joints: tuple[int, ...]  # P - 1 positions in JOINTS
+    rows: Int[Tensor, " M"]
     template: Float[Tensor, "M 3*P"]
     identity: Float[Tensor, "M 3*P I"]
-    basis: Float[Tensor, "M 3*P E+2+F"]  # expression, eyelids (which are not skinned: the root's), pose features
+    basis: Float[Tensor, "M 3*P E+2+F"]  # expression, eyelids, pose features
 
 
 class Derivatives(NamedTuple):
@@ -42,9 +42,7 @@ class Derivatives(NamedTuple):
     One row for each direction of each point (row n Q + q), then frames, then columns: what a product over the rows wants.
     """
 
-    joints: Float[Tensor, "N*Q T 10"]  # jaw 3, gaze 4, neck 3
-    expression: Float[Tensor, "N*Q T E"]
-    eyelids: Float[Tensor, "N*Q T 2"]
+    coefficients: Float[Tensor, "N*Q T C"]  # jaw 3, gaze 4, eyelids 2, expression: as in `Motion.coefficients`
     identity: Float[Tensor, "N*Q T I"]  # I = 0 unless asked for
 
 
@@ -53,9 +51,8 @@ class Placed(NamedTuple):
 
     positions: Float[Tensor, "T N 3"]  # in the head's own space, metres
     motion: Motion
-    local: list[Float[Tensor, "T 3 3"]]  # every joint's rotation relative to its parent
-    world: Float[Tensor, "T J 3 3"]  # and in the head's space
-    turned: list[Float[Tensor, "T M P 3"]]  # R_j g_j of every group's points and joints
+    turns: Float[Tensor, "T 3 3 3"]  # rotations of JOINTS
+    unturned: list[Float[Tensor, "T M P 3"]]  # g_0 and g_j of every group's points
 
 
 class SurfacePoints:
@@ -73,11 +70,12 @@ class SurfacePoints:
         identities: int,
         expressions: Int[Tensor, " E"],
     ) -> None:
+        """Raises UserError for a head model whose jaw or eyes hang on each other."""
+        if any(assets.parents[joint] not in (ROOT, NECK) for joint in JOINTS):
+            raise UserError("the head model's jaw and eyes must hang on its neck or its root; track with another one")
         self._made_of = assets, corners, barycentric, identities, expressions
-        self._parents = assets.parents
         self.num_points, self.num_identities, self.num_expressions = len(corners), identities, len(expressions)
-        self._has_features = bool(assets.pose_dirs[corners].any())
-        self._groups = _groups(assets, corners, barycentric.double(), identities, expressions, self._has_features)
+        self._groups = _groups(assets, corners, barycentric.double(), identities, expressions)
         self._rest: tuple[Tensor, list[Tensor]] | None = None  # an identity and what `_at_rest` gives for it
 
     def of(self, rows: Int[Tensor, " M"]) -> SurfacePoints:
@@ -87,122 +85,73 @@ class SurfacePoints:
 
     def positions(self, identity: Float[Tensor, " I"], motion: Motion) -> Float[Tensor, "T N 3"]:
         """Where the points are in the head's own space, metres."""
-        local, world = self._pose(motion)
-        T = len(motion)
-        total = torch.empty(T, self.num_points, 3, dtype=torch.float64)
-        for group, g in zip(self._groups, self._unturned(identity, motion, local), strict=True):
-            # [g_1 .. g_P] times the transposed rotations below each other: the sum of R_j g_j
-            total[:, group.rows] = g @ world[:, list(group.joints)].transpose(2, 3).flatten(1, 2)
-        return total
+        return self.placed(identity, motion).positions
 
     def placed(self, identity: Float[Tensor, " I"], motion: Motion) -> Placed:
-        """`positions`, to the last digits, on the way to `derivatives`."""
-        local, world = self._pose(motion)
-        turned = self._turned(identity, motion, local, world)
-        return Placed(self._carried(turned, ROOT, len(motion)), motion, local, world, turned)
+        """`positions`, with what `derivatives` needs."""
+        turns, T = _turns(motion), len(motion)
+        change = turns - torch.eye(3, dtype=torch.float64)
+        coefficients = torch.cat((motion.expression, motion.eyelids, change.flatten(1)), dim=1)
+        positions, unturned = torch.empty(T, self.num_points, 3, dtype=torch.float64), []
+        for group, rest in zip(self._groups, self._at_rest(identity), strict=True):
+            g = rest.flatten() + coefficients @ group.basis.flatten(0, 1).T
+            unturned.append(g.unflatten(1, (len(rest), -1, 3)))
+            placed = unturned[-1][:, :, 0]
+            for k, joint in enumerate(group.joints, start=1):
+                placed = placed + unturned[-1][:, :, k] @ change[:, joint].mT
+            positions[:, group.rows] = placed
+        return Placed(positions, motion, turns, unturned)
 
     def derivatives(
         self, placed: Placed, directions: Float[Tensor, "T N Q 3"], with_identity: bool = False
     ) -> Derivatives:
         """Of directions . positions."""
-        (T, N, Q), motion = directions.shape[:3], placed.motion
+        (T, N, Q), motion, turns = directions.shape[:3], placed.motion, placed.turns
         E, I = self.num_expressions, self.num_identities if with_identity else 0  # noqa: E741
-        local, world, turned = placed[2:]
-        by_coefficients = torch.empty(N, Q * T, E + 2 + self._num_features, dtype=torch.float64)
+        by_coefficients = torch.empty(N, Q * T, E + 2 + FEATURES, dtype=torch.float64)
         by_identity = torch.empty(N, Q * T, I, dtype=torch.float64)
+        moments = torch.zeros(len(JOINTS), N, Q, T, 3, dtype=torch.float64)
         q = directions.permute(1, 2, 0, 3)  # [N, Q, T, 3]
-        for group in self._groups:
-            along = torch.cat([_rows_times(q[group.rows], world[:, j]) for j in group.joints], dim=-1).flatten(1, 2)
-            _multiply(along, group.basis, by_coefficients, group.rows)
+        change = turns - torch.eye(3, dtype=torch.float64)
+        for group, g in zip(self._groups, placed.unturned, strict=True):
+            own = q[group.rows]
+            along = torch.cat([own, *(_rows_times(own, change[:, j]) for j in group.joints)], dim=-1).flatten(1, 2)
+            by_coefficients[group.rows] = along @ group.basis
             if with_identity:
-                _multiply(along, group.identity, by_identity, group.rows)
+                by_identity[group.rows] = along @ group.identity
+            for k, joint in enumerate(group.joints, start=1):
+                turned = (g[:, :, k] @ turns[:, joint].mT).transpose(0, 1)[:, None]  # [M, 1, T, 3]
+                moments[joint, group.rows] = torch.linalg.cross(turned, own)  # q . (w x r) = w . (r x q)
         by_coefficients = by_coefficients.unflatten(1, (Q, T)).flatten(0, 1)
-        by_features = by_coefficients[..., E + 2 :]
-        axes = _axes(motion)
+        by_features = by_coefficients[..., E + 2 :].unflatten(-1, (len(JOINTS), 9))
         columns = []
-        for joint in (JAW, LEFT_EYE, RIGHT_EYE, NECK):
-            carried = self._carried(turned, joint, T).transpose(0, 1)[:, None]  # [N, 1, T, 3]
-            moment = torch.linalg.cross(carried, q)  # q . (w x r) = w . (r x q)
-            column = _rows_times(moment, world[:, self._parents[joint]] @ axes[joint]).flatten(0, 1)
-            if self._has_features:
-                change = cross_matrix(axes[joint].transpose(1, 2)) @ local[joint][:, None]  # [T, K, 3, 3]
-                own = by_features[..., 9 * (joint - 1) : 9 * joint]
-                column = column + _rows_times(own, change.flatten(2).transpose(1, 2))
-            columns.append(column)
+        for joint, axes in enumerate(_axes(motion)):
+            features = cross_matrix(axes.mT) @ turns[:, joint, None]  # [T, K, 3, 3]
+            columns.append(
+                _rows_times(moments[joint].flatten(0, 1), axes)
+                + _rows_times(by_features[..., joint, :], features.flatten(2).mT)
+            )
+        eyelids, expression = by_coefficients[..., E : E + 2], by_coefficients[..., :E]
         return Derivatives(
-            torch.cat(columns, dim=-1),
-            by_coefficients[..., :E],
-            by_coefficients[..., E : E + 2],
-            by_identity.unflatten(1, (Q, T)).flatten(0, 1),
+            torch.cat([*columns, eyelids, expression], dim=-1), by_identity.unflatten(1, (Q, T)).flatten(0, 1)
         )
 
-    @property
-    def _num_features(self) -> int:
-        return 9 * (len(self._parents) - 1) if self._has_features else 0
-
-    def _pose(self, motion: Motion) -> tuple[list[Float[Tensor, "T 3 3"]], Float[Tensor, "T J 3 3"]]:
-        """Every joint's rotation relative to its parent, and in the head's space."""
-        local = [torch.eye(3, dtype=torch.float64).expand(len(motion), 3, 3)]
-        world = [local[0]]
-        for joint in range(1, len(self._parents)):
-            local.append(_joint_rotations(motion, joint))
-            world.append(world[self._parents[joint]] @ local[-1])
-        return local, torch.stack(world, dim=1)
-
     def _at_rest(self, identity: Tensor) -> list[Float[Tensor, "M 3*P"]]:
-        """g_j of every group's points and joints without expression and features. Kept: all frames share an identity."""
+        """g of every group's points without expression and features. Kept: all frames share an identity."""
         kept = self._rest
         if kept is None or kept[0] is not identity:
             kept = self._rest = identity, [group.template + group.identity @ identity for group in self._groups]
         return kept[1]
 
-    def _unturned(self, identity: Tensor, motion: Motion, local: list[Tensor]) -> Iterator[Float[Tensor, "T M 3*P"]]:
-        """g_j of every group's points and joints."""
-        parts = [motion.expression, motion.eyelids]
-        if self._has_features:
-            parts.append((torch.stack(local[1:], dim=1) - local[0][:, None]).flatten(1))
-        coefficients = torch.cat(parts, dim=1)
-        for group, rest in zip(self._groups, self._at_rest(identity), strict=True):
-            g = rest.flatten() + coefficients @ group.basis.flatten(0, 1).T
-            yield g.reshape(len(motion), *rest.shape)
 
-    def _turned(
-        self, identity: Tensor, motion: Motion, local: list[Tensor], world: Tensor
-    ) -> list[Float[Tensor, "T M P 3"]]:
-        """R_j g_j of every group's points and joints."""
-        turned = []
-        for group, g in zip(self._groups, self._unturned(identity, motion, local), strict=True):
-            g = g.unflatten(2, (len(group.joints), 3))
-            turned.append(torch.einsum("tpcd,tmpd->tmpc", world[:, list(group.joints)], g))
-        return turned
-
-    def _carried(self, turned: list[Tensor], below: int, T: int) -> Float[Tensor, "T N 3"]:
-        """The sum of R_i g_i over the joint `below` and the joints that hang on it; over all of them for the root."""
-        total = torch.zeros(T, self.num_points, 3, dtype=torch.float64)
-        for group, own in zip(self._groups, turned, strict=True):
-            for k, joint in enumerate(group.joints):
-                if below in _ancestry(self._parents, joint):
-                    total[:, group.rows] += own[:, :, k]
-        return total
+def _turns(motion: Motion) -> Float[Tensor, "T 3 3 3"]:
+    """The rotations of JOINTS."""
+    return torch.cat((rotations(motion.jaw)[:, None], gaze_rotations(motion.gaze.unflatten(1, (2, 2)))), dim=1)
 
 
-def _joint_rotations(motion: Motion, joint: int) -> Float[Tensor, "T 3 3"]:
-    """A joint's rotation relative to its parent."""
-    if joint == NECK:
-        return rotations(motion.neck)
-    if joint == JAW:
-        return rotations(motion.jaw)
-    return gaze_rotations(motion.gaze[:, :2] if joint == LEFT_EYE else motion.gaze[:, 2:])
-
-
-def _axes(motion: Motion) -> dict[int, Float[Tensor, "T 3 K"]]:
-    """In the parent's space, the axes about which a joint turns when one of its K parameters grows."""
-    return {
-        NECK: left_jacobians(motion.neck),
-        JAW: left_jacobians(motion.jaw),
-        LEFT_EYE: gaze_axes(motion.gaze[:, :2]),
-        RIGHT_EYE: gaze_axes(motion.gaze[:, 2:]),
-    }
+def _axes(motion: Motion) -> tuple[Float[Tensor, "T 3 K"], ...]:
+    """The axes about which each of JOINTS turns when one of its K parameters grows."""
+    return left_jacobians(motion.jaw), gaze_axes(motion.gaze[:, :2]), gaze_axes(motion.gaze[:, 2:])
 
 
 def _rows_times(rows: Float[Tensor, "*B T C"], matrices: Float[Tensor, "T C K"]) -> Float[Tensor, "*B T K"]:
@@ -211,89 +160,33 @@ def _rows_times(rows: Float[Tensor, "*B T C"], matrices: Float[Tensor, "T C K"])
     return by_frame.transpose(0, 1).unflatten(0, rows.shape[:-2])
 
 
-def _multiply(left: Tensor, right: Tensor, out: Tensor, rows: Tensor | slice) -> None:
-    """out[rows] = left @ right, in place where the rows are neighbours."""
-    if isinstance(rows, slice):
-        torch.bmm(left, right, out=out[rows])
-    else:
-        out[rows] = torch.bmm(left, right)
-
-
-def _ancestry(parents: tuple[int, ...], joint: int) -> list[int]:
-    """The joint itself, its parent, and so on up to the root."""
-    line = [joint]
-    while parents[line[-1]] >= 0:
-        line.append(parents[line[-1]])
-    return line
-
-
-def joint_dependence(assets: HeadAssets, share: Float[Tensor, "N 3 J"]) -> Bool[Tensor, "N J"]:
-    """Which joints move points, whose corners follow each joint by `share`."""
-    depends = (share != 0).any(1)
-    for joint in reversed(range(1, len(assets.parents))):  # a bone is turned by the joint above it
-        depends[:, assets.parents[joint]] |= depends[:, joint]
-    depends[:, ROOT] = True
-    return depends
-
-
 def _groups(
-    assets: HeadAssets,
-    corners: Tensor,
-    barycentric: Tensor,
-    identities: int,
-    expressions: Tensor,
-    has_features: bool,
+    assets: HeadAssets, corners: Tensor, barycentric: Tensor, identities: int, expressions: Tensor
 ) -> list[_Group]:
-    """The points by the set of joints that they depend on."""
-    share = barycentric[..., None] * assets.weights[corners].double()  # [N, 3, J]
-    depends = joint_dependence(assets, share)
-    bases = torch.cat(
-        (
-            assets.template[:, :, None],
-            assets.shape_dirs[:, :, :identities],
-            assets.expression_dirs[:, :, expressions],
-        ),
+    """The points by the set of joints that turn them."""
+    skinned = torch.cat(
+        (assets.template[:, :, None], assets.shape_dirs[:, :, :identities], assets.expression_dirs[:, :, expressions]),
         dim=2,
     ).double()
-    joints = torch.einsum("jv,vcb->jcb", assets.joint_regressor.double(), bases)
+    places = torch.einsum("jv,vcb->jcb", assets.joint_regressor.double()[list(JOINTS)], skinned)
+    eyelids = assets.eyelid_dirs.double().permute(1, 2, 0)  # are not skinned
+    by_pose = assets.pose_dirs.double()[..., 9 * (JAW - 1) :]
+    whole = assets.weights.double().sum(1)[:, None, None]  # 1, but for rounding
+    everything = torch.cat((whole * skinned, eyelids, whole * by_pose), dim=2)
+    turning = torch.cat((skinned, torch.zeros_like(eyelids), by_pose), dim=2)
+    places = torch.nn.functional.pad(places, (0, everything.shape[2] - places.shape[2]))
+    share = barycentric[..., None] * assets.weights[corners][..., list(JOINTS)].double()  # [N, 3, 3]
+    depends: Bool[Tensor, "N 3"] = (share != 0).any(1)
     groups = []
     for members in torch.unique(depends, dim=0):
         rows = torch.nonzero((depends == members).all(1)).squeeze(1)
-        own = torch.nonzero(members).squeeze(1).tolist()
-        parts = []
-        for j in own:
-            skinned = torch.einsum("nk,nkcb->ncb", share[rows, :, j], bases[corners[rows]])
-            skinned = skinned + _bones(assets.parents, j, share[rows].sum(1), joints)
-            lids = torch.einsum("nk,snkc->ncs", barycentric[rows], assets.eyelid_dirs[:, corners[rows]].double())
-            part = [skinned, lids if j == ROOT else torch.zeros_like(lids)]
-            if has_features:
-                part.append(torch.einsum("nk,nkcb->ncb", share[rows, :, j], assets.pose_dirs[corners[rows]].double()))
-            parts.append(torch.cat(part, dim=2))
-        basis = torch.stack(parts, dim=1).flatten(1, 2)  # [M, 3 P, 1 + I + E + 2 + F]
-        is_run = len(rows) == int(rows[-1] - rows[0]) + 1
-        groups.append(
-            _Group(
-                tuple(own),
-                slice(int(rows[0]), int(rows[-1]) + 1) if is_run else rows,
-                basis[..., 0].clone(),
-                basis[..., 1 : 1 + identities].contiguous(),
-                basis[..., 1 + identities :].contiguous(),
-            )
-        )
+        joints = torch.nonzero(members).squeeze(1).tolist()
+        parts = [torch.einsum("nk,nkcb->ncb", barycentric[rows], everything[corners[rows]])]
+        for j in joints:
+            own = share[rows, :, j]
+            moved = torch.einsum("nk,nkcb->ncb", own, turning[corners[rows]])
+            parts.append(moved - own.sum(1)[:, None, None] * places[j])
+        basis = torch.cat(parts, dim=1)  # [M, 3 P, 1 + I + E + 2 + F]
+        template, identity, rest = basis.split((1, identities, basis.shape[2] - 1 - identities), dim=2)
+        groups.append(_Group(tuple(joints), rows, template[..., 0].clone(), identity.contiguous(), rest.contiguous()))
     return groups
-
-
-def _bones(
-    parents: tuple[int, ...], joint: int, carried: Float[Tensor, "M J"], joints: Float[Tensor, "J 3 B"]
-) -> Float[Tensor, "M 3 B"]:
-    """What a joint turns besides the skin: the bones to its children, less its own place, which it does not turn."""
-
-    def below(j: int) -> Tensor:
-        return torch.stack([carried[:, i] for i in range(len(parents)) if j in _ancestry(parents, i)]).sum(0)
-
-    total = -carried[:, joint, None, None] * joints[joint]
-    for child in (c for c in range(len(parents)) if parents[c] == joint):
-        total = total + below(child)[:, None, None] * (joints[child] - joints[joint])
-    if parents[joint] < 0:
-        total = total + below(joint)[:, None, None] * joints[joint]
-    return total

@@ -6,7 +6,8 @@ import hashlib
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -37,19 +38,12 @@ def read_picture(file: Path) -> tuple[np.ndarray, bool]:
 
 
 @dataclass(frozen=True)
-class PictureFolder:
-    """Implements `Footage`; the pictures are taken in the order of their numbers, `rate` a second."""
+class PictureFolder(Footage):
+    """The pictures are taken in the order of their numbers, `rate` a second."""
 
-    path: Path
-    files: tuple[Path, ...]
-    width: int
-    height: int
     rate: float
-    duration: float
-    equivalent_focal: float | None
-    notes: tuple[str, ...]
+    files: tuple[Path, ...]
     decode: Callable[[Path], tuple[np.ndarray, bool]] = read_picture
-    _hash: list[str] = field(default_factory=list, compare=False)
 
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         """Raises UserError for pictures of another size and for files that cannot be decoded."""
@@ -68,13 +62,12 @@ class PictureFolder:
         if was_transparent:
             complain(LAID_OVER_GREY)
 
+    @cached_property
     def content_hash(self) -> str:
-        if not self._hash:
-            digest = hashlib.sha256()
-            for file in self.files:
-                digest.update(file.name.encode(errors="surrogateescape") + b"\0" + read_bytes(file))
-            self._hash.append(digest.hexdigest())
-        return self._hash[0]
+        digest = hashlib.sha256()
+        for file in self.files:
+            digest.update(file.name.encode(errors="surrogateescape") + b"\0" + read_bytes(file))
+        return digest.hexdigest()
 
 
 def resampled(image: np.ndarray, view: View) -> np.ndarray:
@@ -121,7 +114,7 @@ def open_pictures(folder: Path) -> PictureFolder:
     check_size(files[0], width, height)
     note = f"a folder of pictures has no frame rate: {DEFAULT_FPS:g} a second are assumed"
     duration = len(files) / DEFAULT_FPS
-    return PictureFolder(folder, files, width, height, DEFAULT_FPS, duration, _focal_of(files[0]), (note,))
+    return PictureFolder(folder, width, height, DEFAULT_FPS, duration, _focal_of(files[0]), (note,), files)
 
 
 def _natural(path: Path) -> tuple[Any, ...]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -54,40 +56,26 @@ class TimedPicture(NamedTuple):
     image: UInt8[np.ndarray, "H W 3"]
 
 
-class Footage(Protocol):
+@dataclass(frozen=True)
+class Footage(ABC):
     """A source of pictures that can be read several times, each time the same ones."""
 
-    @property
-    def path(self) -> Path: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def rate(self) -> float | None:
-        """Pictures a second, as the file says, before `stride`."""
-        ...
+    path: Path
+    width: int
+    height: int
+    rate: float | None  # pictures a second, as the file says, before `stride`
+    duration: float | None  # seconds, as the file says
+    equivalent_focal: float | None  # millimetres for film of 36x24 mm, from the metadata
+    notes: tuple[str, ...]
 
-    @property
-    def duration(self) -> float | None:
-        """Seconds, as the file says."""
-        ...
-
-    @property
-    def equivalent_focal(self) -> float | None:
-        """Millimetres for film of 36x24 mm, from the metadata."""
-        ...
-
-    @property
-    def notes(self) -> tuple[str, ...]: ...
-
+    @abstractmethod
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         """The pictures in the order of their times; `complain` hears at the end what was wrong with them."""
-        ...
 
+    @cached_property
+    @abstractmethod
     def content_hash(self) -> str:
         """SHA-256 of all that is read."""
-        ...
 
 
 def stride(rate: float | None) -> int:

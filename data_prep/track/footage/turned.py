@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,46 +16,19 @@ TURNS = (0, 90, 180, 270)  # degrees clockwise
 
 
 @dataclass(frozen=True)
-class Turned:
-    """Implements `Footage`. Views are of the turned pictures."""
+class Turned(Footage):
+    """Views are of the turned pictures."""
 
     footage: Footage
     degrees: int  # of TURNS, not 0
-
-    @property
-    def path(self) -> Path:
-        return self.footage.path
-
-    @property
-    def width(self) -> int:
-        return self.footage.height if self.degrees % 180 else self.footage.width
-
-    @property
-    def height(self) -> int:
-        return self.footage.width if self.degrees % 180 else self.footage.height
-
-    @property
-    def rate(self) -> float | None:
-        return self.footage.rate
-
-    @property
-    def duration(self) -> float | None:
-        return self.footage.duration
-
-    @property
-    def equivalent_focal(self) -> float | None:
-        return self.footage.equivalent_focal
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.footage.notes
 
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         for picture in self.footage.read(self._before(view), span, complain):
             yield TimedPicture(picture.time, turn_image(picture.image, self.degrees))
 
+    @cached_property
     def content_hash(self) -> str:
-        return self.footage.content_hash()
+        return self.footage.content_hash
 
     def _before(self, view: View) -> View:
         """The same part of the pictures before they are turned."""
@@ -68,7 +42,12 @@ class Turned:
 
 def turned(footage: Footage, degrees: int) -> Footage:
     """The footage with its pictures turned clockwise by a multiple of 90 degrees."""
-    return Turned(footage, degrees) if degrees else footage
+    if not degrees:
+        return footage
+    values: dict[str, Any] = {field.name: getattr(footage, field.name) for field in fields(Footage)}
+    if degrees % 180:
+        values |= {"width": footage.height, "height": footage.width}
+    return Turned(**values, footage=footage, degrees=degrees)
 
 
 def turn_image(image: UInt8[np.ndarray, "H W *C"], degrees: int) -> np.ndarray:

@@ -5,13 +5,24 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from avatar.errors import UserError
 from avatar.files.opening import open_file
 from data_prep.track.footage.ffmpeg import Decoder, Shown, describe, first_picture
-from data_prep.track.footage.source import LAID_OVER_GREY, Box, Span, TimedPicture, View, check_size, opaque, stride
+from data_prep.track.footage.source import (
+    LAID_OVER_GREY,
+    Box,
+    Footage,
+    Span,
+    TimedPicture,
+    View,
+    check_size,
+    opaque,
+    stride,
+)
 from data_prep.track.footage.tone import HDR_TRANSFERS, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
@@ -28,21 +39,11 @@ _BESIDE_THE_POINT = ("Error opening input file", "Input #", "ffmpeg version", "C
 
 
 @dataclass(frozen=True)
-class Video:
-    """Implements `Footage`."""
-
-    path: Path
+class Video(Footage):
     stream: int
-    width: int
-    height: int
-    rate: float | None
-    duration: float | None
-    equivalent_focal: float | None
-    notes: tuple[str, ...]
     first: Shown
     colour: tuple[str, ...]  # range, matrix, primaries, transfer
     decoder: tuple[str, ...] = ()  # ffmpeg's option, where its own choice loses something
-    _hash: list[str] = field(default_factory=list, compare=False)
 
     def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
         """Raises UserError when the pictures change their size, or when decoding does not get on."""
@@ -103,17 +104,13 @@ class Video:
         flags = "accurate_rnd+full_chroma_int+full_chroma_inp" + ("" if fits else "+lanczos")
         return [*filters, f"scale={view.width}:{view.height}:flags={flags}", "setsar=1"]
 
+    @cached_property
     def content_hash(self) -> str:
-        if not self._hash:
-            digest = hashlib.sha256()
-            try:
-                with open_file(self.path, None) as file:
-                    while chunk := file.read(2**22):
-                        digest.update(chunk)
-            except OSError as error:
-                raise UserError(f"{self.path} cannot be read ({error.strerror})") from None
-            self._hash.append(digest.hexdigest())
-        return self._hash[0]
+        try:
+            with open_file(self.path, None) as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+        except OSError as error:
+            raise UserError(f"{self.path} cannot be read ({error.strerror})") from None
 
 
 def open_video(path: Path) -> Video:

@@ -72,7 +72,6 @@ def test_it_is_near_the_fit_of_the_clip(followed: Followed) -> None:
     assert float((live.gaze - clip.gaze).abs().max()) < 0.2
     turned = (live.R @ clip.R.transpose(1, 2)).diagonal(dim1=1, dim2=2).sum(1)
     assert float(torch.rad2deg(torch.arccos(((turned - 1) / 2).clamp(max=1))).max()) < 2.5
-    assert not live.neck.any()
 
 
 def test_a_few_steps_are_enough(followed: Followed, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in ("upright", "look"):
         monkeypatch.setattr(f"data_prep.track.{module}.FaceDetector", MarkDetector)
-    monkeypatch.setattr("data_prep.track.work.fit_tracks", fitted)
-    monkeypatch.setattr(tracking.Work, "masks", lambda *_: [1.0])
-    monkeypatch.setattr(tracking.Work, "overlay", lambda *_: None)
+    monkeypatch.setattr("data_prep.track.tracking_stages.fit_tracks", fitted)
+    monkeypatch.setattr(tracking.TrackingStages, "masks", lambda *_: [1.0])
+    monkeypatch.setattr(tracking.TrackingStages, "overlay", lambda *_: None)
     monkeypatch.setattr(tracking, "judge", lambda *_: Quality((), (), ""))

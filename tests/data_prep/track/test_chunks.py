@@ -54,15 +54,17 @@ def test_what_goes_wrong_in_a_chunk_is_raised_and_threads_come_back(two_threads:
     assert torch.get_num_threads() == 2
 
 
-@pytest.mark.parametrize(("make", "module"), [(landmark_term, landmarks), (photometric_term, pictures)])
-@pytest.mark.parametrize("shared", [0, IDENTITIES])
+@pytest.mark.parametrize(
+    ("make", "module", "shared"),
+    [(landmark_term, landmarks, 0), (landmark_term, landmarks, IDENTITIES), (photometric_term, pictures, 0)],
+)
 def test_terms_are_the_same_to_the_bit(make, module, shared: int, two_threads, monkeypatch) -> None:
     monkeypatch.setattr(module, "_FRAMES_AT_ONCE", 2)
     term, motion = make(), some_motion()
 
     def equations() -> tuple[NormalEquations, float]:
-        found = NormalEquations.zeros(T, len(COLUMNS), shared, coupled=False)
-        term.add_to(found, IDENTITY, motion, COLUMNS)
+        found = NormalEquations.zeros(T, COLUMNS, shared)
+        term.add_to(found, IDENTITY, motion)
         return found, term.cost(IDENTITY, motion)
 
     torch.set_num_threads(1)  # as side by side: two threads that share a product may round it otherwise than one

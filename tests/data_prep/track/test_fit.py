@@ -16,6 +16,7 @@ from avatar.errors import UserError
 from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.prepare.projection import project_head
+from data_prep.progress import silent
 from data_prep.track.faces.landmark_groups import LIPS
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.camera import to_camera
@@ -23,9 +24,7 @@ from data_prep.track.fit.fitting import as_tracks
 from data_prep.track.fit.landmark_fit import LandmarkFit, eye_distance, fit_landmarks
 from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.photometric_fit import fit_pictures
-from data_prep.track.fit.result import Clip
 from data_prep.track.fit.surface import SurfacePoints
-from data_prep.track.progress import silent
 
 FRAMES = 16
 
@@ -56,10 +55,7 @@ def test_the_landmarks_are_met(scene: Fitted) -> None:
     errors = scene.fit.term.errors(scene.fit.identity, scene.fit.motion)
     assert 100 * float(errors.mean()) / scene.seen.eyes < 200 * NOISE
     assert scene.error(scene.fit.motion) < 100 * DRIFT
-    for costs in scene.fit.costs:
-        assert len(costs) > 1 and list(costs) == sorted(set(costs), reverse=True)
     assert float(scene.fit.identity.abs().max()) < 4.0
-    assert not scene.fit.motion.neck.any()
 
 
 def test_the_fit_repeats_to_the_bit(scene: Fitted, demo_head_model: Path) -> None:
@@ -173,8 +169,8 @@ def test_what_the_held_out_points_gain_little_by_is_not_taken(scene: Fitted, mon
 
 
 def test_tracks_place_the_head_where_the_fit_has_it(scene: Fitted) -> None:
-    clip, fit = Clip(scene.seen.landmarks, tuple(scene.seen.camera), [], []), scene.fit
-    tracks = as_tracks(fit, fit.motion, clip, scene.seen.assets.num_expressions)
+    seen, fit = scene.seen, scene.fit
+    tracks = as_tracks(fit, fit.motion, seen.camera, seen.landmarks.size, seen.assets.num_expressions)
     assert list(tracks) == list(range(FRAMES))
     expected = scene.seen.camera.project(
         to_camera(fit.motion, fit.term.points.positions(fit.identity, fit.motion))

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from heads import grid_head
 
-from data_prep.track.fit.skin_points import by_joints, seen_weights, skin_triangles, spread_points
-from data_prep.track.fit.surface import SurfacePoints
+from data_prep.track.fit.skin_points import seen_weights, skin_triangles
 
 SIZE, FOCAL = 101, 400.0  # an odd size: the depth buffer is of half of it
 # Two squares of 0.1 m that face the camera, one 0.05 m behind a half of the other; and a steep one at their right.
@@ -55,17 +54,3 @@ def test_ears_count_as_skin_where_the_head_model_knows_them() -> None:
     alone, with_ear = vertices(face=face), vertices(face=face, left_ear=ear)
     assert alone and alone <= set(face.tolist()) - eyeballs
     assert with_ear - alone and with_ear - alone <= set(ear.tolist()) - eyeballs
-
-
-def test_points_that_the_same_joints_move_are_neighbours() -> None:
-    head = grid_head()
-    side = (torch.arange(head.num_vertices) % 9 < 4)[:, None]  # follows the jaw, the other one the neck
-    assets = replace(head, weights=torch.where(side, torch.eye(5)[2], torch.eye(5)[1]))
-    corners, barycentric = spread_points(assets, assets.faces.numpy(), count=200)
-    order = by_joints(assets, corners, barycentric)
-    assert sorted(order.tolist()) == list(range(200)) and order.tolist() != list(range(200))
-    moved_by = [tuple(row) for row in (assets.weights[corners[order]] != 0).any(1).tolist()]
-    groups = [row for row, before in zip(moved_by, [None, *moved_by], strict=False) if row != before]
-    assert len(groups) > 1
-    points = SurfacePoints(assets, corners[order], barycentric[order], 0, torch.arange(0))
-    assert all(isinstance(group.rows, slice) for group in points._groups)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.progress import silent
 from data_prep.track.frames import frame_file, mask_file
-from data_prep.track.progress import silent
 from data_prep.track.spill import despilled, spill_width
-from data_prep.track.stages import Stages
-from data_prep.track.work import DESPILLED, Work
+from data_prep.track.stage_folder import StageFolder
+from data_prep.track.tracking_stages import DESPILLED, TrackingStages
 
 SIDE, RADIUS = 256, 80
 WALL, HAIR = (40, 120, 250), (90, 70, 55)
@@ -72,7 +72,7 @@ def test_the_stage_writes_frames_only_where_they_get_better(tmp_path: Path, blur
         for number in (3, 5):
             cv2.imwrite(str(path(tmp_path / kind, number)), pixels)
     head = SimpleNamespace(faces=torch.zeros(1, 3, dtype=torch.long))
-    work = Work(Stages(tmp_path), None, None, head, silent)  # type: ignore[arg-type]
+    work = TrackingStages(StageFolder(tmp_path), None, None, head, silent)  # type: ignore[arg-type]
     landmarks = SimpleNamespace(detected=np.array([0, 0, 0, 1, 0, 1], bool))
     width = work.despill(landmarks, ["key"])  # type: ignore[arg-type]
     assert (width > 0) == (blur > 0) and work.despill(landmarks, ["key"]) == width  # type: ignore[arg-type]

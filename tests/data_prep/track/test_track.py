@@ -19,7 +19,7 @@ from avatar.head.assets import load_head_assets
 from data_prep.check.folder import check_tracked_folder
 from data_prep.formats.avatar_track import read_info
 from data_prep.prepare.open import find_head
-from data_prep.track import work
+from data_prep.track import tracking_stages
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.footage.pictures import is_footage
 from data_prep.track.footage.source import Box
@@ -113,14 +113,14 @@ def test_an_interrupted_run_goes_on(
 
     command = ["track", str(video), "--head", str(demo_head_model), "--out", str(tmp_path / "me")]
     with monkeypatch.context() as patch:
-        patch.setattr(work, "head_mask", interrupted)
+        patch.setattr(tracking_stages, "head_mask", interrupted)
         assert main(command) == 130
     assert "interrupted: the same command goes on after the last stage" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == [".me.partial"]
     with monkeypatch.context() as patch:
         patch.setattr("data_prep.track.track.look_at", never)
         for stage in ("write_frames", "open_matter", "fit_tracks"):
-            patch.setattr(work, stage, never)
+            patch.setattr(tracking_stages, stage, never)
         assert main(command) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["me"]
     for name in ("tracking.npz", "landmarks.npz", "frames/00003.jpg", "matte/00003.png", "head/00003.png"):

@@ -22,8 +22,8 @@ from data_prep.track import inputs
 from data_prep.track.faces.embedding import OFFICIAL_FILE
 from data_prep.track.footage.source import Box, Span
 from data_prep.track.inputs import head_inputs, tracking_key
-from data_prep.track.stages import Stages
-from data_prep.track.work import Choices, Work
+from data_prep.track.stage_folder import StageFolder
+from data_prep.track.tracking_stages import Choices, TrackingStages
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def head(tmp_path: Path) -> Path:
 
 
 def footage(content: str = "ab") -> Any:
-    return SimpleNamespace(content_hash=lambda: content)
+    return SimpleNamespace(content_hash=content)
 
 
 def key(head: Path, choices: Choices | None = None, video: str = "ab") -> str:
@@ -144,7 +144,7 @@ def test_another_file_of_the_head_model_makes_another(name: str, head: Path) -> 
 
 
 def test_own_mattes_make_another(head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("data_prep.track.work.open_footage", lambda path: footage(path.name))
+    monkeypatch.setattr("data_prep.track.tracking_stages.open_footage", lambda path: footage(path.name))
     keys = {key(head), key(head, Choices(matte=Path("a"))), key(head, Choices(matte=Path("b")))}
     assert len(keys) == 3
 
@@ -165,14 +165,16 @@ def test_the_fit_of_a_folder_that_is_not_finished_is_made_again_too(head: Path, 
     """What an interruption left is of the head model as it was."""
     asked: list[dict[str, Any]] = []
 
-    class Asked(Stages):
+    class Asked(StageFolder):
         def run(self, name: str, inputs: Any, make: Any) -> Any:
             asked.append(dict(inputs))
             raise StopIteration
 
     for added in (lambda _: None, add_names, add_embedding):
         added(head)
-        work = Work(Asked(tmp_path), footage(), Choices(), load_head_assets(head), lambda items, total, title: items)
+        work = TrackingStages(
+            Asked(tmp_path), footage(), Choices(), load_head_assets(head), lambda items, total, title: items
+        )
         landmarks: Any = SimpleNamespace(detected=np.ones(3, bool))
         with pytest.raises(StopIteration):
             work.fit(landmarks, (1.0, 1.0, 0.0, 0.0), head, [])

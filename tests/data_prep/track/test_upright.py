@@ -178,7 +178,7 @@ def test_another_turn_makes_the_stages_again(with_marks: None, tmp_path: Path, m
     keys = []
     for rotate in (None, 0, 180):
         with monkeypatch.context() as patch:
-            patch.setattr(tracking.Work, "fit", stop)
+            patch.setattr(tracking.TrackingStages, "fit", stop)
             with pytest.raises(KeyboardInterrupt):
                 choices = Choices(crop="none", rotate=rotate, matte=mattes)
                 track(video, tmp_path / "out", tmp_path / "head.npz", grid_head(), choices, say=lambda _: None)

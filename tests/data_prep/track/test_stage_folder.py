@@ -13,12 +13,12 @@ from heads import grid_head
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_track import FrameTrack
-from data_prep.track import work
+from data_prep.progress import silent
+from data_prep.track import tracking_stages
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.fit.result import Clip, Fit
-from data_prep.track.progress import silent
-from data_prep.track.stages import growing
-from data_prep.track.work import Work
+from data_prep.track.stage_folder import growing
+from data_prep.track.tracking_stages import Choices, TrackingStages
 
 
 def test_a_stage_is_made_once_for_its_inputs(tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_a_stage_is_made_once_for_its_inputs(tmp_path: Path) -> None:
         assert stages.run("one", {"in": 1}, make(3)) == first
         other = stages.run("one", {"in": 2}, make(4))
         assert other[0] == {"value": 4} and other[1] != first[1]
-        assert (stages.folder / "one" / "file").read_text() == "4"
+        assert (stages.path / "one" / "file").read_text() == "4"
         stages.run("helper", {}, make(5))
         stages.finish(tmp_path / "out", ("helper",))
     assert made == [1, 4, 5]
@@ -101,7 +101,7 @@ def test_a_fit_is_made_again_for_another_lens_head_or_picture(tmp_path: Path, mo
         )  # fmt: skip
         return Fit({0: track}, {})
 
-    monkeypatch.setattr(work, "fit_tracks", fitted)
+    monkeypatch.setattr(tracking_stages, "fit_tracks", fitted)
     points, scores = np.zeros((1, NUM_POINTS, 3), np.float32), np.zeros((1, len(BLENDSHAPES)), np.float32)
     landmarks = Landmarks(points, scores, np.ones(1, bool), (64, 64), 25.0)
     footage, head = SimpleNamespace(), grid_head()
@@ -109,7 +109,7 @@ def test_a_fit_is_made_again_for_another_lens_head_or_picture(tmp_path: Path, mo
     with growing(tmp_path / "out") as stages:
 
         def fit(lens: float = 500.0, which: HeadAssets = head, pictures: str = "key of the frames") -> None:
-            own = Work(stages, footage, work.Choices(), which, silent)  # type: ignore[arg-type]
+            own = TrackingStages(stages, footage, Choices(), which, silent)  # type: ignore[arg-type]
             assert (
                 own.fit(landmarks, (lens, lens, 32.0, 32.0), tmp_path / "head.npz", [pictures]).tracks[0].intrinsics[0]
                 == lens
@@ -130,7 +130,7 @@ def test_a_damaged_record_is_made_again(tmp_path: Path) -> None:
     with growing(tmp_path / "out") as stages:
         stages.run("one", {}, lambda folder: {"n": 1})
         for content in (b"", b"[1]", b'{"key": 1}', b"\xff"):
-            (stages.folder / "one" / ".stage.json").write_bytes(content)
+            (stages.path / "one" / ".stage.json").write_bytes(content)
             assert stages.run("one", {}, lambda folder: {"n": 2})[0] == {"n": 2}
 
 

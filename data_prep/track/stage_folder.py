@@ -26,11 +26,11 @@ _MAX_RECORD = 2**24
 Made = tuple[dict[str, Any], str]  # what a stage found out, and the hash of what it was made from
 
 
-class Stages:
-    """The stages of one folder. `run` them in order, then `finish`."""
+class StageFolder:
+    """`run` the stages in order, then `finish`."""
 
     def __init__(self, growing: Path) -> None:
-        self.folder = growing
+        self.path = growing
 
     def run(self, name: str, inputs: Mapping[str, Any], make: Callable[[Path], dict[str, Any]]) -> Made:
         """What `make` returned when it wrote the stage's files into the folder that it is given; now, or earlier.
@@ -38,11 +38,11 @@ class Stages:
         `inputs` and the result must be JSON. Raises UserError when the disk refuses.
         """
         key = hash_of([name, dict(inputs)])
-        place = self.folder / name
+        place = self.path / name
         known = _read_record(place / RECORD)
         if known is not None and known.get("key") == key:
             return known["result"], key
-        partial = self.folder / f"{name}.partial"
+        partial = self.path / f"{name}.partial"
         try:
             for stale in (place, partial):
                 shutil.rmtree(stale, ignore_errors=True)
@@ -67,15 +67,15 @@ class Stages:
         call `seal`, and give the folder its name."""
         try:
             for name in temporary:
-                shutil.rmtree(self.folder / name, ignore_errors=True)
+                shutil.rmtree(self.path / name, ignore_errors=True)
             for name, other in (better or {}).items():
-                shutil.rmtree(self.folder / other)
-                (self.folder / name).rename(self.folder / other)
-            for record in self.folder.glob(f"*/{RECORD}"):
+                shutil.rmtree(self.path / other)
+                (self.path / name).rename(self.path / other)
+            for record in self.path.glob(f"*/{RECORD}"):
                 record.unlink()
-            (self.folder / LOCK_FILE).unlink(missing_ok=True)
-            seal(self.folder)
-            self.folder.rename(target)
+            (self.path / LOCK_FILE).unlink(missing_ok=True)
+            seal(self.path)
+            self.path.rename(target)
         except OSError as error:
             raise UserError(
                 f"{target} cannot be written ({error.strerror or error}); the same command tries again"
@@ -83,12 +83,12 @@ class Stages:
 
 
 @contextlib.contextmanager
-def growing(target: Path) -> Iterator[Stages]:
+def growing(target: Path) -> Iterator[StageFolder]:
     """The stages of `target`, for one process at a time. Raises UserError where nothing can be written."""
     folder = target.with_name(f".{shortened(target.name)}.partial")
     with locked(folder):
         try:
-            yield Stages(folder)
+            yield StageFolder(folder)
         except BaseException:
             for unfinished in folder.glob("*.partial"):
                 shutil.rmtree(unfinished, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What shows how far a stage of tracking is."""
+"""What shows how far a long piece of work is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages of one video's tracking, each with what it is made from."""
+"""The stages of one video's tracking: what each is made from, and what it makes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from avatar.data.images import read_image, read_mask
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
+from data_prep.progress import Progress
 from data_prep.track import plate, spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
@@ -21,10 +23,10 @@ from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Box, Footage, Span, View
 from data_prep.track.frames import (
-    FrameImages,
-    FrameMattes,
     ahead,
+    frame_file,
     in_view,
+    mask_file,
     write_despilled,
     write_frames,
     write_given_mattes,
@@ -37,8 +39,7 @@ from data_prep.track.matting import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.own_mattes import OwnMattes
-from data_prep.track.progress import Progress
-from data_prep.track.stages import Stages
+from data_prep.track.stage_folder import StageFolder
 
 DESPILLED = "despilled"  # the stage that stands in for the frames
 
@@ -57,21 +58,27 @@ class Choices:
 
     def to_json(self) -> dict[str, Any]:
         crop = self.crop if isinstance(self.crop, str) else list(self.crop)
-        matte = None if self.matte is None else open_footage(self.matte).content_hash()
+        matte = None if self.matte is None else open_footage(self.matte).content_hash
         return {"crop": crop, "size": self.size, "span": list(self.span), "focal": self.focal,
                 "field_of_view": self.field_of_view, "matte": matte, "rotate": self.rotate}  # fmt: skip
 
 
-class Work:
-    """The stages of one video, each with what it was made from."""
+class TrackingStages:
+    """The stages of one video; each returns what it found, made now or by an earlier run."""
 
     def __init__(
-        self, stages: Stages, footage: Footage, choices: Choices, head: HeadAssets, progress: Progress
+        self, folder: StageFolder, footage: Footage, choices: Choices, head: HeadAssets, progress: Progress
     ) -> None:
-        self._stages, self._footage, self._choices, self._head = stages, footage, choices, head
+        self._stages, self._footage, self._choices, self._head = folder, footage, choices, head
         self._progress = progress
-        self._folder = stages.folder
+        self._folder = folder.path
         self._faces = head.faces.numpy()
+
+    def _image(self, number: int) -> np.ndarray:
+        return read_image(frame_file(self._folder / FRAMES, number))
+
+    def _mask(self, number: int, kind: str = MATTE) -> np.ndarray:
+        return read_mask(mask_file(self._folder / kind, number))
 
     def view_and_focal(self, look: Look) -> tuple[View, Focal]:
         points = look.landmarks.points[look.landmarks.detected]
@@ -97,16 +104,14 @@ class Work:
             if given is not None:
                 span = self._choices.span
                 return {"without_face": write_given_mattes(folder, given, view, span, look, self._progress)}
-            images = FrameImages(self._folder / FRAMES, numbers)
             points = in_view(look.landmarks, view).points[:, :, :2]
-            rows = {number: row for row, number in enumerate(numbers)}
             own = threading.local()  # a network is for one thread
 
             def by_network(number: int) -> tuple[np.ndarray, np.ndarray]:
                 if not hasattr(own, "matter"):
-                    own.matter, _ = open_matter()
-                image = images[rows[number]]
-                return image, own.matter(image)  # type: ignore[return-value]
+                    own.matter = open_matter()
+                image = self._image(number)
+                return image, own.matter(image)
 
             of_clip = numbers[:: -(-len(numbers) // plate.CLIP_FRAMES)]
             seen = ahead(of_clip, by_network, self._progress, "looking at the background")
@@ -126,13 +131,12 @@ class Work:
         """Writes the frames without the background's colours on the person, where they reach in so far that it can be seen;
         returns how many pixels, or 0."""
         numbers = _numbers(landmarks)
-        images, mattes = FrameImages(self._folder / FRAMES, numbers), FrameMattes(self._folder / MATTE, numbers)
 
         def make(folder: Path) -> dict[str, Any]:
-            rows = range(0, len(numbers), -(-len(numbers) // spill.CLIP_FRAMES))
-            width = spill.spill_width((images[row], mattes[row]) for row in rows)  # type: ignore[arg-type]
+            some = numbers[:: -(-len(numbers) // spill.CLIP_FRAMES)]
+            width = spill.spill_width((self._image(number), self._mask(number)) for number in some)
             if width:
-                write_despilled(folder, numbers, images, mattes, width, self._progress)
+                write_despilled(folder, numbers, self._image, self._mask, width, self._progress)
             return {"width": width}
 
         return self._stages.run(DESPILLED, {"of": inputs}, make)[0]["width"]
@@ -140,15 +144,8 @@ class Work:
     def fit(
         self, landmarks: Landmarks, intrinsics: tuple[float, float, float, float], head_path: Path, inputs: list[Any]
     ) -> Fit:
-        numbers = _numbers(landmarks)
-
         def make(folder: Path) -> dict[str, Any]:
-            clip = Clip(
-                landmarks,
-                intrinsics,
-                FrameImages(self._folder / FRAMES, numbers),
-                FrameMattes(self._folder / MATTE, numbers),
-            )
+            clip = Clip(landmarks, intrinsics, self._image, self._mask)
             fit = fit_tracks(clip, self._head, head_path, self._progress)
             fit.save(folder / TRACKS_FILE)
             return fit.figures
@@ -161,9 +158,6 @@ class Work:
     def masks(self, landmarks: Landmarks, fit: Fit) -> list[float]:
         """Writes head and mouth masks; returns how much of the mesh lies on the matte, by frame."""
         numbers = list(fit.tracks)
-        rows = {number: row for row, number in enumerate(numbers)}
-        images = FrameImages(self._folder / FRAMES, numbers)
-        mattes = FrameMattes(self._folder / MATTE, numbers)
 
         def make_heads(folder: Path) -> dict[str, Any]:
             ring = neck_ring(self._head.template.numpy(), self._faces)
@@ -171,14 +165,12 @@ class Work:
             overlaps: dict[int, float] = {}
 
             def zones(number: int) -> Zones:
-                row = rows[number]
-                return zones_of(images[row], mattes[row], project(number), self._faces, ring)  # type: ignore[arg-type]
+                return zones_of(self._image(number), self._mask(number), project(number), self._faces, ring)
 
             colours = learn_colours(map(zones, numbers[:: -(-len(numbers) // CLIP_FRAMES)]))
 
             def one(number: int) -> np.ndarray:
-                row = rows[number]
-                made = head_mask(images[row], mattes[row], zones(number), colours)  # type: ignore[arg-type]
+                made = head_mask(self._image(number), self._mask(number), zones(number), colours)
                 overlaps[number] = made.overlap
                 return made.mask
 
@@ -197,14 +189,8 @@ class Work:
         return result["overlaps"]
 
     def overlay(self, fit: Fit, look: Look) -> None:
-        numbers = list(fit.tracks)
-        rows = {number: row for row, number in enumerate(numbers)}
-        images = FrameImages(self._folder / FRAMES, numbers)
-        heads, mouths = (FrameMattes(self._folder / kind, numbers) for kind in (HEAD, MOUTH))
-
         def read(number: int) -> FrameParts:
-            row = rows[number]
-            return FrameParts(images[row], heads[row], mouths[row])  # type: ignore[arg-type]
+            return FrameParts(self._image(number), self._mask(number, HEAD), self._mask(number, MOUTH))
 
         def make(folder: Path) -> dict[str, Any]:
             write_overlay(folder, fit.model(self._head), fit.tracks, read, look.landmarks.fps, self._progress)
