@@ -10,7 +10,8 @@ from torch import Tensor
 
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import painted, uv_texels
-from avatar.head.rasterize import rasterize_mesh, sample_image
+from avatar.head.rasterize import rasterize_mesh
+from avatar.head.sample_image import sample_image
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
 from avatar.splat.sh import C0

@@ -1,13 +1,10 @@
-"""From a triangle mesh to pixels and back: which face every pixel shows, and what an image shows at points."""
+"""From a triangle mesh to pixels: which face every pixel shows. Imports no PyTorch: `avatar doctor` calls it."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from avatar import _core
 
@@ -16,18 +13,6 @@ class MeshRaster(NamedTuple):
     face_id: np.ndarray  # int32 [H, W], -1 where no triangle covers the pixel's centre
     barycentric: np.ndarray  # float32 [H, W, 3], perspective-correct
     depth: np.ndarray  # float32 [H, W], 0 where no triangle
-
-
-def sample_image(image: Float[Tensor, "H W C"], screen: Float[Tensor, "N _"], mode: str) -> Float[Tensor, "N C"]:
-    """The image's values at points (x pixel, y pixel, ...), `mode` "nearest" or "bilinear"; zero outside the image."""
-    height, width = image.shape[:2]
-    grid = screen[:, :2] * torch.tensor([2 / width, 2 / height]) - 1
-    # A point in the camera's plane is not in the image.
-    grid = grid.nan_to_num(nan=-9.0, posinf=9.0, neginf=-9.0).clamp(-9, 9)
-    picked = torch.nn.functional.grid_sample(
-        image.permute(2, 0, 1)[None], grid[None, :, None], mode=mode, padding_mode="zeros", align_corners=False
-    )
-    return picked[0, :, :, 0].T
 
 
 def rasterize_mesh(screen: np.ndarray, faces: np.ndarray, height: int, width: int) -> MeshRaster:

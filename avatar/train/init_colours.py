@@ -9,7 +9,8 @@ from torch import Tensor
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
-from avatar.head.rasterize import rasterize_mesh, sample_image
+from avatar.head.rasterize import rasterize_mesh
+from avatar.head.sample_image import sample_image
 from avatar.splat.sh import C0
 from avatar.types import Frame
 

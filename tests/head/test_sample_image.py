@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from avatar.head.rasterize import sample_image
+from avatar.head.sample_image import sample_image
 
 
 def test_nothing_is_sampled_outside_the_image_or_in_the_cameras_plane() -> None:
