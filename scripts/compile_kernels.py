@@ -33,7 +33,7 @@ from triton.compiler import ASTSource
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
-from avatar.kernels.start import watched
+from avatar.kernels.launch import watched
 from avatar.losses.photometric import dssim
 from avatar.splat import splat
 from avatar.splat.scenes import head_camera, head_shell

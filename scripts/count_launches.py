@@ -25,7 +25,7 @@ from avatar.config import load_config
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
-from avatar.kernels.start import watched
+from avatar.kernels.launch import watched
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.render import Renderer

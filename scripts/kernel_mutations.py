@@ -80,7 +80,7 @@ SPLATTER_MUTATIONS = [
         first="of_a_pose",
     ),
     Mutation(
-        "harmonics",
+        "sh",
         "a function of degree 3 has the wrong sign",
         "-x * (4 * z * z - x * x - y * y) * C31 * on, sh, 13",
         "x * (4 * z * z - x * x - y * y) * C31 * on, sh, 13",
@@ -202,7 +202,7 @@ SPLATTER_MUTATIONS = [
         first="reference[17x33",
     ),
     Mutation(
-        "harmonics",
+        "sh",
         "a colour below 0 has a gradient",
         "tl.where(value > 0.0, upstream, 0.0)",
         "upstream",
@@ -258,7 +258,7 @@ SPLATTER_MUTATIONS = [
         first="production",
     ),
     Mutation(
-        "harmonics",
+        "sh",
         "a basis function's derivative is halved",
         "dz += 2 * z * g",
         "dz += z * g",

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from avatar.commands.reenact import head_of
 from avatar.errors import UserError
-from avatar.export.landmarker_pack import PACK, make_pack
+from avatar.export.mediapipe_pack import PACK, make_pack
 from avatar.export.web_arrays import reduce_avatar
 from avatar.export.web_page import WEB, write_page, write_web_avatar
 from avatar.head.lips import lip_gap, lip_pairs

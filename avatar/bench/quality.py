@@ -18,7 +18,7 @@ from avatar.bench.results import Line, Panel, write_report
 from avatar.bench.train import Learner, make_learner, time_steps
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
-from avatar.evaluation.lpips_networks import find_lpips
+from avatar.evaluation.find_lpips import find_lpips
 from avatar.pipeline.open import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run

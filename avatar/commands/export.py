@@ -13,8 +13,8 @@ from tqdm import tqdm
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.export.glb import encode_glb
-from avatar.export.landmarker_pack import NOTICE, PACK, make_pack
 from avatar.export.licence import MESH, NOTHING, SKINNING, WHOLE, licence_of
+from avatar.export.mediapipe_pack import NOTICE, PACK, make_pack
 from avatar.export.movie import write_movie
 from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar

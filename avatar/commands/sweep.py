@@ -11,9 +11,9 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.evaluation.compare_tables import FORMATS, text, write_tables
 from avatar.pipeline import INTERRUPTED, OK
-from avatar.sweep.conduct import conduct
 from avatar.sweep.engines import EngineOptions, make_engine
 from avatar.sweep.results import fold_results
+from avatar.sweep.run_sweep import conduct
 from avatar.sweep.spec import Spec, read_spec
 from avatar.sweep.state import SWEEP_FILE, State, read_state, read_sweep, write_state, write_sweep
 from avatar.sweep.status import Progress, full_table, overview

@@ -19,7 +19,7 @@ from avatar.pipeline.track import head_for_video, is_video, tracked_once
 from avatar.pipeline.train import resume_run, train_new
 from avatar.pipeline.train_refined import begin_rounds, train_refined
 from avatar.runs.run import RUN_FILE, RunInfo, read_run_info, refuse_trained
-from data_prep.prepare.not_subjects import check_folder
+from data_prep.prepare.wrong_inputs import check_folder
 
 MAX_ROUNDS = 10
 

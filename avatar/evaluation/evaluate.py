@@ -34,8 +34,8 @@ from avatar.errors import MissingPackage, UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
+from avatar.evaluation.find_lpips import find_networks
 from avatar.evaluation.jitter import JitterMeter
-from avatar.evaluation.lpips_networks import find_networks
 from avatar.evaluation.measure import FrameMeasurer
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
 from avatar.evaluation.previous_results import in_order, protocol_of, read_earlier, read_frames, remove_others

@@ -10,7 +10,7 @@ import numpy as np
 
 from avatar.evaluation.bootstrap import BlockBootstrap, block_length, describe
 from avatar.evaluation.conditions import Conditions
-from avatar.evaluation.lpips_networks import ChosenLpips
+from avatar.evaluation.find_lpips import ChosenLpips
 from avatar.evaluation.measure import Figures
 from avatar.evaluation.protocol import Protocol
 from avatar.evaluation.tracking_source import Drive

@@ -15,7 +15,7 @@ from avatar.gaussians.skull_binding import SkullBinding
 from avatar.head.model import matrix_from_6d
 from avatar.kernels.fused import fused_gaussians
 from avatar.kernels.fused_backward import fused_gaussians_backward, gather_nodes
-from avatar.kernels.start import start
+from avatar.kernels.launch import start
 from avatar.tensors import check_shapes
 from avatar.types import Gaussians
 

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.head.model import PoseTensors
+from avatar.kernels.launch import start
 from avatar.kernels.pose import FEATURES, TRANSFORM, blend, pose
-from avatar.kernels.start import start
 from avatar.types import HeadParams
 
 LANES = 128  # vertices of a program

@@ -20,8 +20,8 @@ from avatar.kernels.hyper import (
     solve3_upper,
     solve4_upper,
 )
+from avatar.kernels.load_store import load3, load4, load10, store3, store4, store10
 from avatar.kernels.pose import matrix_of_6d, rotated
-from avatar.kernels.rows import load3, load4, load10, store3, store4, store10
 
 
 @triton.jit

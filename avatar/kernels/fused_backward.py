@@ -18,7 +18,7 @@ from avatar.kernels.hyper import (
     solve3_lower,
     solve4_lower,
 )
-from avatar.kernels.rows import load3, load4, load10, store3, store4, store10
+from avatar.kernels.load_store import load3, load4, load10, store3, store4, store10
 
 
 @triton.jit

@@ -7,7 +7,7 @@ near-ties would be drawn in another order. Zwicker et al., "EWA splatting" (2002
 import triton
 import triton.language as tl
 
-from avatar.kernels.rows import load3, load4
+from avatar.kernels.load_store import load3, load4
 
 # Where `pose` holds what, float64; `avatar.splat.pose` makes it.
 TRANSLATION = tl.constexpr(9)  # behind the nine elements of the rotation, row by row

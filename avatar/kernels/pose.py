@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from avatar.kernels.rows import store3
+from avatar.kernels.load_store import store3
 
 SMALLEST_NORM = tl.constexpr(1e-12)  # of torch.nn.functional.normalize
 TRANSFORM = tl.constexpr(12)  # values of a joint's transform: its rotation, row by row, and its translation

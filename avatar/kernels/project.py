@@ -24,8 +24,8 @@ from avatar.kernels.geometry import (
     unit_quaternion,
     view_direction,
 )
-from avatar.kernels.harmonics import colour
-from avatar.kernels.rows import load3
+from avatar.kernels.load_store import load3
+from avatar.kernels.sh import colour
 
 REACH_MARGIN = tl.constexpr(1e-4)  # in log2 of alpha; far above float rounding there
 # A count that no capacity holds: a value that is not finite makes the image NaN as too many pairs do.

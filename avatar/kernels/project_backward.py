@@ -23,8 +23,8 @@ from avatar.kernels.geometry import (
     unit_quaternion,
     view_direction,
 )
-from avatar.kernels.harmonics import colour_backward
-from avatar.kernels.rows import load3, store3, store4
+from avatar.kernels.load_store import load3, store3, store4
+from avatar.kernels.sh import colour_backward
 
 HALF_LOG2E = tl.constexpr(0.72134752044448170368)
 

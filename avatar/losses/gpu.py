@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avatar.kernels.huber import huber, huber_backward
+from avatar.kernels.launch import start
 from avatar.kernels.reduce import finish
 from avatar.kernels.ssim import WINDOW, compare, smooth_rows, spread_columns, spread_rows
-from avatar.kernels.start import start
 
 LANES = 256  # values of a program
 WARPS = 4

@@ -15,8 +15,8 @@ from avatar.motion.drive import Drive
 from avatar.motion.drive_file import read_drive
 from avatar.runs.run import Run, RunInfo, read_run_info
 from avatar.runs.trained import TrainedAvatar, load_avatar
-from data_prep.prepare.not_subjects import check_folder
 from data_prep.prepare.open import find_head, open_subject
+from data_prep.prepare.wrong_inputs import check_folder
 
 DRIVE_SUFFIXES = (".npz", ".csv")
 

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from avatar.kernels.composite_backward import MOMENTS, composite_backward
 from avatar.kernels.geometry import POSE_VALUES
+from avatar.kernels.launch import start
 from avatar.kernels.project_backward import colour_of_backward, project_backward, sum_moments
-from avatar.kernels.start import start
 from avatar.splat.gpu_draw import Drawing, Settings, programs
 from avatar.types import Gaussians
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from avatar.kernels.bin import FIELDS, expand, gather
 from avatar.kernels.composite import composite
+from avatar.kernels.launch import start
 from avatar.kernels.project import POISON, project
-from avatar.kernels.start import start
 from avatar.splat.cpu import CannotDraw
 from avatar.splat.gpu_buffers import MAX_PAIRS, Kind, capacity_of
 from avatar.splat.region import Region

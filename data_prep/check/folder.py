@@ -21,8 +21,8 @@ from data_prep.check.check_tracking import check_tracking
 from data_prep.check.clip import Clip, read_clip
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
-from data_prep.prepare.not_subjects import check_folder
 from data_prep.prepare.pairing import describe_reasons
+from data_prep.prepare.wrong_inputs import check_folder
 from data_prep.progress import Progress, silent
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status

@@ -12,8 +12,8 @@ from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.formats import avatar_track
-from data_prep.prepare.not_subjects import check_folder
 from data_prep.prepare.prepare import prepare
+from data_prep.prepare.wrong_inputs import check_folder
 
 
 def find_head(folder: Path, given: Path | None = None) -> Path:

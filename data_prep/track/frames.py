@@ -16,8 +16,8 @@ from avatar.errors import UserError
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress
 from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.first_pass import Look
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
-from data_prep.track.look import Look
 from data_prep.track.own_mattes import OPAQUE, OwnMattes, share_on
 from data_prep.track.spill import despilled
 

@@ -2,8 +2,8 @@
 
 `selfie_segmentation` gives the probability of the foreground at 256x256, of the picture and of its mirror image;
 `selfie_multiclass` is taken instead where its file is. The network knows where the person ends to a pixel of its own; it
-fills gaps, which a camera that stands still shows (`plate.py`). Within that, around the head, closed-form matting says what
-the colours say (neither a guided filter nor GrabCut did).
+fills gaps, which a camera that stands still shows (`background_plate.py`). Within that, around the head, closed-form
+matting says what the colours say (neither a guided filter nor GrabCut did).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from avatar.errors import UserError
 from avatar.files.third_party import SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find, require
+from data_prep.track.background_plate import Plate, shown
 from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
-from data_prep.track.plate import Plate, shown
 
 SIDE = 256  # of the networks' pictures
 _SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network

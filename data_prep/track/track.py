@@ -32,13 +32,13 @@ from data_prep.formats.avatar_track import (
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress, silent
 from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
+from data_prep.track.first_pass import Look, from_json, look_at, to_json
 from data_prep.track.fit.focal import Focal
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Footage, View, check_span
 from data_prep.track.footage.turned import turned
 from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, matte_network, tracking_key
-from data_prep.track.look import Look, from_json, look_at, to_json
 from data_prep.track.own_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 from data_prep.track.quality import judge
 from data_prep.track.stage_folder import StageFolder, growing

@@ -13,10 +13,11 @@ from avatar.data.images import read_image, read_mask
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.progress import Progress
-from data_prep.track import plate, spill
+from data_prep.track import background_plate, spill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.first_pass import Look
 from data_prep.track.fit.fitting import fit_tracks
 from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
@@ -33,7 +34,6 @@ from data_prep.track.frames import (
     write_masks,
 )
 from data_prep.track.inputs import head_inputs
-from data_prep.track.look import Look
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matting import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
@@ -113,9 +113,9 @@ class TrackingStages:
                 image = self._image(number)
                 return image, own.matter(image)
 
-            of_clip = numbers[:: -(-len(numbers) // plate.CLIP_FRAMES)]
+            of_clip = numbers[:: -(-len(numbers) // background_plate.CLIP_FRAMES)]
             seen = ahead(of_clip, by_network, self._progress, "looking at the background")
-            behind = plate.learn_plate(pair for _, pair in seen)
+            behind = background_plate.learn_plate(pair for _, pair in seen)
 
             def one(number: int) -> np.ndarray:
                 return sharpened(*by_network(number), points[number], behind)

@@ -13,7 +13,7 @@ from tracked_folder import write_head_model, write_tracked_folder
 
 from avatar.cli import main
 from avatar.errors import UserError
-from data_prep.prepare.not_subjects import check_folder
+from data_prep.prepare.wrong_inputs import check_folder
 
 
 def run(folder: Path) -> None:

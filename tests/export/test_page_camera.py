@@ -1,6 +1,6 @@
 """The exported page driven by a camera, in headless Chromium: a film stands for the camera, a fake for the landmarker.
 
-The fake goes the whole way that MediaPipe's own files go in test_landmarker_pack.py.
+The fake goes the whole way that MediaPipe's own files go in test_mediapipe_pack.py.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from browsers import WEB, camera_flags, chromium, chromium_path, launched, serve
 from lively import lively_avatar, psnr
 from pages import says, shown, until
 
-from avatar.export.landmarker_pack import PACK, encode_pack
+from avatar.export.mediapipe_pack import PACK, encode_pack
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.runs.trained import TrainedAvatar
 

@@ -36,7 +36,7 @@ OPEN_BY_THEMSELVES = {
     "avatar/data/tensor_file.py",
     "avatar/commands/doctor.py",
     "avatar/evaluation/verify.py",
-    "avatar/export/landmarker_pack.py",
+    "avatar/export/mediapipe_pack.py",
     "avatar/export/web_page.py",
     "avatar/files/video.py",
     "avatar/html/document.py",

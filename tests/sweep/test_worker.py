@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from avatar.errors import UserError
-from avatar.sweep import conduct as conducting
+from avatar.sweep import run_sweep as conducting
 from avatar.sweep import worker as workers
-from avatar.sweep.conduct import conduct
 from avatar.sweep.engines import EngineOptions, LocalProcesses, make_engine
 from avatar.sweep.output import BoundedLog, end_of, old_of
+from avatar.sweep.run_sweep import conduct
 from avatar.sweep.spec import Job, Resources, Spec
 from avatar.sweep.state import State, beat, progress_mark, read_state, write_state
 from avatar.sweep.status import Progress

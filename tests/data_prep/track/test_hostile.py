@@ -12,9 +12,9 @@ import pytest
 from videos import X264, encode, ffmpeg, talking
 
 from avatar.cli import main
+from data_prep.track.first_pass import look_at
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Span
-from data_prep.track.look import look_at
 
 FRAMES, SIZE = 20, 160
 
@@ -232,7 +232,7 @@ def test_taken_and_said(name: str, tmp_path: Path, tracking_models: None) -> Non
 def test_a_long_video_is_cut_at_the_limit(
     tmp_path: Path, tracking_models: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("data_prep.track.look.MAX_PICTURES", 12)
+    monkeypatch.setattr("data_prep.track.first_pass.MAX_PICTURES", 12)
     look = look_at(open_footage(encode(tmp_path / "v.mp4", person())), Span(), lambda items, total, title: items)
     assert len(look.landmarks) == 12 and not look.is_whole
     assert look.notes == [

@@ -20,8 +20,8 @@ from pages import says, until
 from videos import encode
 
 from avatar.demo.raw_video import filmed
-from avatar.export import landmarker_pack
-from avatar.export.landmarker_pack import PACK, encode_pack, make_pack
+from avatar.export import mediapipe_pack
+from avatar.export.mediapipe_pack import PACK, encode_pack, make_pack
 from avatar.export.web_page import write_page
 from avatar.files.third_party import FACE_LANDMARKER, FOLDER_VARIABLE, TASKS_VISION, find, sha256_of
 
@@ -53,13 +53,13 @@ def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     (folder / FACE_LANDMARKER.name).write_bytes(b"model")
     with tarfile.open(folder / TASKS_VISION.name, "w:gz") as archive:
-        for name in (*landmarker_pack.MEMBERS, "wasm/vision_wasm_nosimd_internal.wasm"):
+        for name in (*mediapipe_pack.MEMBERS, "wasm/vision_wasm_nosimd_internal.wasm"):
             member = tarfile.TarInfo(f"package/{name}")
             member.size = len(name)
             archive.addfile(member, io.BytesIO(name.encode()))
     for known in ("TASKS_VISION", "FACE_LANDMARKER"):
-        file = getattr(landmarker_pack, known)
-        monkeypatch.setattr(landmarker_pack, known, file._replace(sha256=sha256_of(folder / file.name)))
+        file = getattr(mediapipe_pack, known)
+        monkeypatch.setattr(mediapipe_pack, known, file._replace(sha256=sha256_of(folder / file.name)))
     monkeypatch.setenv(FOLDER_VARIABLE, str(folder))
     return folder
 
@@ -71,7 +71,7 @@ def test_the_command_takes_the_publishers_files(
     run, out = lively_run(tracked_folder, tmp_path / "run", "model.uv_size=12"), tmp_path / f"x{suffix}"
     said = avatar("export", run, "--webcam", "--out", out)
     data = (tmp_path / PACK).read_bytes()
-    assert hashlib.sha256(data).hexdigest() in said and landmarker_pack.NOTICE in said and out.is_file()
+    assert hashlib.sha256(data).hexdigest() in said and mediapipe_pack.NOTICE in said and out.is_file()
     files = json.loads(data[data.rindex(b"avatarLandmarker(") + 17 : -3])["files"]
     found = {name: gzip.decompress(base64.b64decode(text)) for name, text in files.items()}
     assert found == {

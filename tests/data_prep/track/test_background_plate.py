@@ -13,8 +13,8 @@ from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, make_room
 from avatar.demo.render import Renderer
 from data_prep.track import closed_form_matting
+from data_prep.track.background_plate import learn_plate, shown
 from data_prep.track.matting import sharpened
-from data_prep.track.plate import learn_plate, shown
 
 SIZE, NOISE = 160, 1.5
 HAIR = (40, 30, 25)
