@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from tracked_folder import write_tracked_folder
+from array_shapes import any_shapes, checked_modules  # noqa: F401 (a fixture)
+from jaxtyping import install_import_hook
+
+install_import_hook(checked_modules(), "array_shapes.check_arrays")  # before the first import of the program
+
+from tracked_folder import write_tracked_folder  # noqa: E402
 
 
 @pytest.fixture(autouse=True)

@@ -44,11 +44,11 @@ def dense_factor(factor: Float[Tensor, "T N"], size: int) -> Float[Tensor, "size
 
 
 def conditional_mean(
-    mean: Float[Tensor, "m+n N"], factor: Float[Tensor, "T N"], latents: Float[Tensor, "n N"]
+    mean: Float[Tensor, "d N"], factor: Float[Tensor, "T N"], latents: Float[Tensor, "n N"]
 ) -> Float[Tensor, "m N"]:
     """mu_a + Sigma_ab Sigma_bb^-1 (z - mu_b), differentiable once in everything.
 
-    factor  the lower triangle of L, row by row, T = (m + n)(m + n + 1) / 2
+    factor  the lower triangle of L, row by row, T = d (d + 1) / 2 with d = m + n
     """
     return _ConditionalMean.apply(mean, factor, latents)  # pyright: ignore
 
@@ -99,7 +99,7 @@ def _times_rows(matrix: Float[Tensor, "r c N"], vector: Float[Tensor, "c N"]) ->
     return _rows_times(matrix.transpose(0, 1), vector)
 
 
-def latent_root(of_latent: Float[Tensor, "n m+n N"]) -> Float[Tensor, "n n N"]:
+def latent_root(of_latent: Float[Tensor, "n d N"]) -> Float[Tensor, "n n N"]:
     """The Cholesky factor of Sigma_bb, from the rows of L that belong to the latent. Above its diagonal: anything."""
     n, columns, N = of_latent.shape
     S = of_latent.new_zeros(n, n, N)

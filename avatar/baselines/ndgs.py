@@ -85,6 +85,10 @@ class NdgsAvatar(FlashAvatar):
     is_fused = False
     unknown_to_browsers = "its opacities"
 
+    def offsets(self, latents: Float[Tensor, "N n"]) -> Slice:
+        assert self.hyper is not None
+        return self.hyper(latents)
+
     def compose(self, points: Float[Tensor, "N 3"], offsets: Slice) -> Gaussians:
         """Gaussians that move, through tanh as FlashAvatar's do, and fade; they do not turn or grow."""
         quats, log_scales, opacity_logits, sh = self.base()

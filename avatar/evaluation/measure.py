@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from avatar.compute.device import CPU, to_device
@@ -103,7 +103,7 @@ class FrameMeasurer:
         return self._lpips[key]
 
 
-def lpips_crop(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
+def lpips_crop(mask: Shaped[Tensor, "H W"]) -> tuple[slice, slice] | None:
     """The mask's bounding box, each side grown about its middle to `LPIPS_CROP` pixels where the image has them."""
     box = bounding_box(mask)
     return None if box is None else grown_box(box, (mask.shape[0], mask.shape[1]), least=LPIPS_CROP)

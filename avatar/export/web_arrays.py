@@ -54,7 +54,7 @@ class WebArrays:
     sizes: dict[str, int]  # of csrc/web/portrait.h, in its order
     arrays: dict[str, Float[np.ndarray, "..."]]  # of ARRAYS
     corners: Int[np.ndarray, "G 3"]
-    cells: Int[np.ndarray, "G 4"]  # empty where the network is evaluated at every Gaussian
+    cells: Int[np.ndarray, "C 4"]  # empty where the network is evaluated at every Gaussian
     parents: tuple[int, ...]
     kept: tuple[int, ...]
 

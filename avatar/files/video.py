@@ -114,7 +114,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: f
 
 
 def side_by_side(
-    images: Sequence[Float[Tensor, "H W 3"]], captions: Sequence[str]
+    images: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str]
 ) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
     """Pictures in [0, 1] from left to right, brought to the largest height, each under its caption."""
     height = max(image.shape[0] for image in images)

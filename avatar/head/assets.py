@@ -40,9 +40,9 @@ class HeadAssets:
 
     template: Float[Tensor, "V 3"]
     faces: Int[Tensor, "F 3"]
-    shape_dirs: Float[Tensor, "V 3 300"]
+    shape_dirs: Float[Tensor, "V 3 S"]
     expression_dirs: Float[Tensor, "V 3 E"]
-    pose_dirs: Float[Tensor, "V 3 9*(J-1)"]
+    pose_dirs: Float[Tensor, "V 3 P"]
     joint_regressor: Float[Tensor, "J V"]
     weights: Float[Tensor, "V J"]
     parents: tuple[int, ...]  # -1 for the root; joints in the order of JOINT_NAMES

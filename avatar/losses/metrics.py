@@ -14,7 +14,7 @@ Masks are weights in [0, 1]; a masked figure is the weighted mean of the squared
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
@@ -73,7 +73,7 @@ def ssim_map(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> F
     return kornia_ssim(first, second, SSIM_WINDOW, eps=0.0, padding="valid")[0].permute(1, 2, 0)
 
 
-def bounding_box(mask: Float[Tensor, "H W"]) -> tuple[slice, slice] | None:
+def bounding_box(mask: Shaped[Tensor, "H W"]) -> tuple[slice, slice] | None:
     """Rows and columns that hold every non-zero value of `mask`; None when there is none."""
     rows = mask.any(dim=1).nonzero()
     if len(rows) == 0:
@@ -100,7 +100,7 @@ def grown_box(
     return sides[0], sides[1]
 
 
-def weighted_mean(values: Float[Tensor, "H W"], mask: Float[Tensor, "H W"] | None) -> Float[Tensor, ""]:
+def weighted_mean(values: Float[Tensor, "H W"], mask: Shaped[Tensor, "H W"] | None) -> Float[Tensor, ""]:
     """Mean over the mask's weights, over all for None; NaN for a mask of zeros."""
     if mask is None:
         return values.mean()

@@ -90,7 +90,7 @@ class Drawing(NamedTuple):
     order: Int[Tensor, " N"]
     ends: Int[Tensor, " N"]
     boxes: Int[Tensor, "4 N"]
-    begins: Int[Tensor, " tiles+1"]
+    begins: Int[Tensor, " B"]
     records: Float[Tensor, "9 stride"]
     places: Int[Tensor, " capacity"]
     transmittances: Float[Tensor, "H W"]
@@ -184,12 +184,12 @@ def tile_grid(region: Region, tile: int) -> Grid:
     return Grid(first_x, first_y, (region.right - 1) // tile - first_x + 1, (region.bottom - 1) // tile - first_y + 1)
 
 
-def tile_numbers(tiles: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " tiles+1"]:
+def tile_numbers(tiles: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " B"]:
     return _numbers(tiles.bit_length(), dtype, device)[: tiles + 1]
 
 
 @cache  # for good: a CUDA graph may read them
-def _numbers(bits: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " 2^bits"]:
+def _numbers(bits: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor, " P"]:
     return torch.arange(1 << bits, dtype=dtype, device=device)
 
 

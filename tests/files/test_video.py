@@ -50,6 +50,7 @@ def test_a_failure_on_the_way_leaves_the_old_file_and_no_part(tmp_path: Path) ->
     assert [p.name for p in tmp_path.iterdir()] == ["clip.mp4"]
 
 
+@pytest.mark.usefixtures("any_shapes")
 def test_refusals(tmp_path: Path) -> None:
     path = tmp_path / "clip.mp4"
     with pytest.raises(UserError, match=r"there is no frame to write to .*clip\.mp4"):

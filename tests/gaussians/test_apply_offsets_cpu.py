@@ -157,6 +157,7 @@ def test_apply_offsets_takes_the_kernel_for_float32_only() -> None:
     assert all(torch.equal(a, b) for a, b in zip(exact[:4], plain(*doubles), strict=True))
 
 
+@pytest.mark.usefixtures("any_shapes")
 def test_sizes_that_disagree_are_named() -> None:
     points, quats, log_scales, logits, raw = parameters(8)
     with pytest.raises(ValueError, match=r"raw has N = 7, but points has N = 8"):

@@ -185,10 +185,15 @@ def test_folded_heads_do_not_follow_the_heads() -> None:
     with torch.no_grad():
         heads.packed.add_(1.0)
     assert torch.equal(folded(latents), before)
+
+
+@pytest.mark.usefixtures("any_shapes")
+def test_folded_heads_refuse_latents_of_other_gaussians() -> None:
     with pytest.raises(ValueError, match="matrix has N = 5, but latents has N = 4; they must be the same"):
-        folded(latents[:4])
+        random_heads(5, 2).fold()(torch.randn(4, 2))
 
 
+@pytest.mark.usefixtures("any_shapes")
 def test_wrong_tensors_are_named() -> None:
     heads = random_heads(5, 4)
     with pytest.raises(ValueError, match=r"latents must have shape \[N, n\], got \[4\]"):

@@ -70,6 +70,7 @@ def test_a_cell_that_nobody_mixes_has_zero_gradient() -> None:
     assert grid.grad is not None and grid.grad.tolist() == [[2, 2], [0, 0], [2, 2]]
 
 
+@pytest.mark.usefixtures("any_shapes")
 def test_wrong_arguments_are_named() -> None:
     cells, weights = mixture(5, 4)
     with pytest.raises(ValueError, match=r"weights must have shape \[N, 4\], got \[5, 3\]"):

@@ -31,7 +31,7 @@ def test_a_timed_step_is_the_gpus_and_is_not_cut(tracked_folder: Path) -> None:
     assert next(learner.frames).image.device.type == learner.avatar.device.type == DEVICE.type
     assert not torch.equal(learner.avatar.sh_dc, before)
     once = Time(1.0, 2.0, 3)
-    rows = [train.Row("default", 5, 4, 9, once, once, {})]
+    rows = [train.Row("default", 5, 4, 9, once, once, {}, {})]
     lines = train.table(rows)
     assert len(lines) == 2 and "1.0 (2.0)" in lines[1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 from typing import Any
 
@@ -33,7 +34,7 @@ def pairs_of(scene: Scene) -> int:
     from avatar.splat.gpu import pose_on, settings_of
     from avatar.splat.gpu_draw import draw
 
-    given = {**(splat.__kwdefaults__ or {}), **scene.options, "backend": "gpu"}
+    given = {**(inspect.unwrap(splat).__kwdefaults__ or {}), **scene.options, "backend": "gpu"}
     settings = settings_of(
         scene.camera, DEVICE, **_checked_options(scene.gaussians, scene.camera, scene.background, **given)
     )
@@ -86,7 +87,7 @@ def test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits(field: s
 def test_so_does_one_of_a_pose_that_is_on_the_gpu(name: str, value: float) -> None:
     from avatar.splat.gpu import splat_gpu  # `splat` looks at a pose on the CPU, where Triton interprets
 
-    options: dict[str, Any] = {**(splat.__kwdefaults__ or {}), "backend": "cpu"}
+    options: dict[str, Any] = {**(inspect.unwrap(splat).__kwdefaults__ or {}), "backend": "cpu"}
     pose = getattr(SCENE.camera, name).clone()
     pose.view(-1)[1] = value
     inputs = {name: tensor.to(DEVICE) for name, tensor in {**inputs_of(SCENE), name: pose}.items()}

@@ -138,6 +138,7 @@ def test_zero_quaternions_and_saturated_offsets_have_finite_gradients() -> None:
     assert error(found.quats, expected.quats) < 1e-6
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize(
     ("name", "shape", "message"),
     [

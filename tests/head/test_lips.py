@@ -80,6 +80,8 @@ def test_flames_own_topology(shared_dir: Path) -> None:
         grid_head(),
         template=tensors["v_template"],
         faces=torch.from_numpy(arrays["f"].astype(np.int64)),
+        uv_faces=torch.from_numpy(arrays["f"].astype(np.int64)),
+        uvs=torch.zeros(len(template), 2),
         shape_dirs=torch.zeros(len(template), 3, 300),
         expression_dirs=torch.zeros(len(template), 3, 1),
         pose_dirs=tensors["posedirs"],

@@ -107,6 +107,7 @@ def test_map_is_centred_on_its_pixel_and_differentiable() -> None:
     assert image.grad is not None and image.grad.isfinite().all()
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("function", [psnr, ssim])
 def test_sizes_that_disagree_are_named(function) -> None:
     with pytest.raises(ValueError, match="target has W = 12, but image has W = 13"):

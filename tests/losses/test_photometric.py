@@ -81,6 +81,7 @@ def test_a_hidden_mouth_gives_a_zero_gradient() -> None:
     assert image.grad is not None and not image.grad.any()
 
 
+@pytest.mark.usefixtures("any_shapes")
 def test_sizes_that_disagree_are_named() -> None:
     image, target, mouth, head = sample()
     with pytest.raises(ValueError, match=r"mouth_mask has H = 20, but image has H = 24"):

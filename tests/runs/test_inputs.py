@@ -46,6 +46,7 @@ FRAMES = {
 }
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("name", FRAMES)
 def test_a_wrong_frame_is_named_and_the_training_is_not_blamed(name: str, anna: TrainedAvatar) -> None:
     make, sentence = FRAMES[name]
@@ -64,6 +65,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_wrong_camera_is_named(name: str, anna: TrainedAvatar) -> None:
     make, sentence = CAMERAS[name]

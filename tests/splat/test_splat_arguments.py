@@ -44,6 +44,7 @@ def test_a_non_finite_value_of_a_hidden_splat_is_named_too() -> None:
         render(replace(SCENE, gaussians=SCENE.gaussians._replace(opacities=opacities, sh=sh)))
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize(
     ("name", "shape", "message"),
     [
@@ -61,6 +62,7 @@ def test_wrong_shapes(name: str, shape: tuple[int, ...], message: str) -> None:
         render(_with_field(name, torch.zeros(shape)))
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("name", [*Gaussians._fields, "background"])
 def test_wrong_types(name: str) -> None:
     with pytest.raises(TypeError, match=f'{name} must be float32 for backend "cpu", got torch.float64'):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import pytest
@@ -19,7 +20,11 @@ from avatar.types import Gaussians
 def test_skipping_does_not_change_a_bit(name: str, simd: str, monkeypatch: pytest.MonkeyPatch) -> None:
     use_simd(monkeypatch, simd)
     scene, drawn = SCENES[name], render(SCENES[name])
-    options: dict[str, Any] = {**(avatar.splat.splat.__kwdefaults__ or {}), **scene.options, "backend": "cpu"}
+    options: dict[str, Any] = {
+        **(inspect.unwrap(avatar.splat.splat).__kwdefaults__ or {}),
+        **scene.options,
+        "backend": "cpu",
+    }
     checked = avatar.splat._checked_options(scene.gaussians, scene.camera, scene.background, **options)
     gaussians, size = Gaussians(*(t.contiguous() for t in scene.gaussians)), (scene.camera.height, scene.camera.width)
     settings = {**cpu._settings(scene.camera, **checked), "everywhere": True}

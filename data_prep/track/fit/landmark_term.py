@@ -91,7 +91,7 @@ class LandmarkTerm:
 
         equations.add_chunks(rows_of, _FRAMES_AT_ONCE)
 
-    def _with_pairs(self, rows: Float[Tensor, "L 2 T C"]) -> Float[Tensor, "L+P 2 T C"]:
+    def _with_pairs(self, rows: Float[Tensor, "L 2 T C"]) -> Float[Tensor, "R 2 T C"]:
         return torch.cat((rows, rows[self.pairs[:, 0]] - rows[self.pairs[:, 1]]))
 
     def _residuals(self, projected: Float[Tensor, "T L 2"]) -> tuple[Tensor, Tensor, Tensor]:

@@ -30,8 +30,8 @@ class NormalEquations:
 
     diagonal: Float[Tensor, "T D D"]
     gradient: Float[Tensor, "T D"]
-    before: Float[Tensor, "T D D"]  # block (t, t-1), row 0 unused; T = 0 where something is shared
-    before_that: Float[Tensor, "T D D"]  # block (t, t-2)
+    before: Float[Tensor, "B D D"]  # block (t, t-1), row 0 unused; B = T, or 0 where something is shared
+    before_that: Float[Tensor, "B D D"]  # block (t, t-2)
     border: Float[Tensor, "T D G"]
     shared: Float[Tensor, "G G"]
     shared_gradient: Float[Tensor, " G"]

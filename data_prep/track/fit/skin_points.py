@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
@@ -62,7 +62,7 @@ def seen_weights(
     faces: Int[np.ndarray, "F 3"],
     corners: Int[np.ndarray, "N 3"],
     barycentric: Float[np.ndarray, "N 3"],
-    matte: Float[np.ndarray, "h w"],
+    matte: UInt8[np.ndarray, "h w"],
 ) -> Float[np.ndarray, " N"]:
     """How much each point counts in one frame, 0 to 1: visible, turned to the camera, in the matte (uint8).
 

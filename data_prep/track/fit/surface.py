@@ -31,9 +31,9 @@ class _Group(NamedTuple):
 
     joints: tuple[int, ...]  # P - 1 positions in JOINTS
     rows: Int[Tensor, " M"]
-    template: Float[Tensor, "M 3*P"]
-    identity: Float[Tensor, "M 3*P I"]
-    basis: Float[Tensor, "M 3*P E+2+F"]  # expression, eyelids, pose features
+    template: Float[Tensor, "M W"]  # W = 3 P
+    identity: Float[Tensor, "M W I"]
+    basis: Float[Tensor, "M W C"]  # expression, eyelids, pose features
 
 
 class Derivatives(NamedTuple):
@@ -42,8 +42,8 @@ class Derivatives(NamedTuple):
     One row for each direction of each point (row n Q + q), then frames, then columns: what a product over the rows wants.
     """
 
-    coefficients: Float[Tensor, "N*Q T C"]  # jaw 3, gaze 4, eyelids 2, expression: as in `Motion.coefficients`
-    identity: Float[Tensor, "N*Q T I"]  # I = 0 unless asked for
+    coefficients: Float[Tensor, "R T C"]  # jaw 3, gaze 4, eyelids 2, expression: as in `Motion.coefficients`
+    identity: Float[Tensor, "R T I"]  # I = 0 unless asked for
 
 
 class Placed(NamedTuple):
@@ -136,7 +136,7 @@ class SurfacePoints:
             torch.cat([*columns, eyelids, expression], dim=-1), by_identity.unflatten(1, (Q, T)).flatten(0, 1)
         )
 
-    def _at_rest(self, identity: Tensor) -> list[Float[Tensor, "M 3*P"]]:
+    def _at_rest(self, identity: Tensor) -> list[Float[Tensor, "M W"]]:
         """g of every group's points without expression and features. Kept: all frames share an identity."""
         kept = self._rest
         if kept is None or kept[0] is not identity:

@@ -71,6 +71,7 @@ FLAWS: dict[str, tuple[Callable[[], HeadAssets], str, str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("flaw", FLAWS)
 def test_a_flaw_is_found(flaw: str) -> None:
     make, severity, sentence = FLAWS[flaw]
@@ -78,12 +79,14 @@ def test_a_flaw_is_found(flaw: str) -> None:
     assert len(found) == 1 and found[0].severity == severity and found[0].check == "head-mesh"
 
 
+@pytest.mark.usefixtures("any_shapes")
 def test_only_the_piece_that_is_inside_out_is_named() -> None:
     half = len(two_balls().faces) // 2
     (finding,) = check_head(two_balls(turned=True))
     assert finding.problem == f"{half} faces of the head model, among them face {half}, look inwards"
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("make", [grid_head, two_balls])
 def test_good_meshes_have_no_findings(make: Callable[[], HeadAssets]) -> None:
     assert check_head(make()) == []

@@ -36,6 +36,7 @@ def test_there_are_52_different_blendshapes() -> None:
     assert len(BLENDSHAPES) == len(set(BLENDSHAPES)) == 52
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -130,7 +130,9 @@ def test_a_networks_matte_becomes_sharp_around_the_head_alone() -> None:
     moved = np.roll(picture.alpha, 1, axis=1)
     coarse = cv2.resize(cv2.resize(moved, (128, 128), interpolation=cv2.INTER_AREA), (size, size))
     mouth = np.argwhere(picture.mouth > 127)[:, ::-1]
-    points = np.stack((mouth.min(0), mouth.max(0))) + np.array([[-40, -90], [40, 30]])  # about a face's box
+    points = np.stack((mouth.min(0), mouth.max(0))).astype(float) + np.array(
+        [[-40, -90], [40, 30]]
+    )  # about a face's box
     made = mattes.sharpened(image, coarse, points)
     head = cv2.dilate(picture.head, np.ones((9, 9), np.uint8)) > 0
 

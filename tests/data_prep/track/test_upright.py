@@ -64,7 +64,7 @@ def test_a_part_of_a_turned_picture_is_that_of_the_picture_turned(turn: int, kin
 
 
 def test_clockwise_is_clockwise() -> None:
-    image = np.array([[1, 2], [3, 4]])[..., None]
+    image = np.array([[1, 2], [3, 4]], np.uint8)[..., None]
     assert turn_image(image, 90)[..., 0].tolist() == [[3, 1], [4, 2]]
 
 
