@@ -240,7 +240,7 @@ def flame(shared: Path, like: HeadAssets) -> HeadAssets:
         "template": template,
         "shape_dirs": identity,
         "expression_dirs": expression,
-        "pose_dirs": whole["posedirs"].transpose(1, 2, 0),
+        "pose_dirs": whole["posedirs"],
         "joint_regressor": whole["J_regressor"],
         "weights": whole["weights"],
         "eyelid_dirs": np.stack((whole["l_eyelid"], whole["r_eyelid"])),

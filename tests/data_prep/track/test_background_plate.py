@@ -135,7 +135,7 @@ def test_mattes_of_a_demo_person_come_nearer_to_the_truth() -> None:
         pairs.append((image, cv2.resize(small, (size, size))))
         truth.append(picture)
         mouth = np.argwhere(picture.mouth > 127)[:, ::-1]
-        points.append(np.stack((mouth.min(0), mouth.max(0))) + np.array([[-40, -90], [40, 30]]))
+        points.append(np.stack((mouth.min(0), mouth.max(0))).astype(float) + np.array([[-40, -90], [40, 30]]))
     plate = learn_plate(pairs)
     assert plate is not None
 
