@@ -246,7 +246,9 @@ def flame(shared: Path, like: HeadAssets) -> HeadAssets:
         "eyelid_dirs": np.stack((whole["l_eyelid"], whole["r_eyelid"])),
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(array, np.float32)) for name, array in arrays.items()}
-    return replace(like, **tensors, faces=torch.from_numpy(faces), regions={"lips": torch.from_numpy(lips)})
+    corners_of_faces = torch.from_numpy(faces)
+    regions = {"lips": torch.from_numpy(lips)}
+    return replace(like, **tensors, faces=corners_of_faces, uv_faces=corners_of_faces, regions=regions)
 
 
 @pytest.mark.shared
