@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from array_shapes import any_shapes, checked_modules  # noqa: F401 (a fixture)
-from jaxtyping import install_import_hook
+from array_shapes import any_shapes, install_array_checks  # noqa: F401 (a fixture)
 
-install_import_hook(checked_modules(), "array_shapes.check_arrays")  # before the first import of the program
+install_array_checks()
 
 from tracked_folder import write_tracked_folder  # noqa: E402
 

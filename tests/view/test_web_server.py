@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import inspect
 import math
 import socket
 import threading
@@ -31,9 +30,7 @@ from avatar.view.view_renderer import ViewRenderer
 def said(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """What the viewer says of its clients."""
     lines: list[str] = []
-    monkeypatch.setattr(
-        inspect.unwrap(rate_limited_log.Complaints.__init__), "__defaults__", (lines.append, time.monotonic)
-    )
+    monkeypatch.setattr(rate_limited_log.Complaints.__init__, "__defaults__", (lines.append, time.monotonic))
     yield lines
 
 

@@ -1,0 +1,26 @@
+"""The tests' own check of arrays is at work."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from avatar.files.pickles import load_pickle
+from avatar.head.assets import HeadAssets
+from avatar.losses.metrics import psnr
+from avatar.types import HeadParams
+
+
+def test_functions_and_dataclasses_are_checked_where_they_have_arrays() -> None:
+    with pytest.raises(TypeCheckError, match="target"):
+        psnr(torch.zeros(4, 4, 3), torch.zeros(5, 4, 3))
+    with pytest.raises(TypeCheckError, match="expression"):
+        HeadParams(torch.zeros(1, 10), torch.zeros(6), torch.zeros(12), torch.zeros(2), torch.zeros(6))
+    assert hasattr(HeadAssets.__init__, "__wrapped__") and not hasattr(load_pickle, "__wrapped__")
+
+
+@pytest.mark.usefixtures("any_shapes")
+def test_wrong_shapes_reach_the_programs_own_refusal() -> None:
+    with pytest.raises(ValueError, match="target"):
+        psnr(torch.zeros(4, 4, 3), torch.zeros(5, 4, 3))
