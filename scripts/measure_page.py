@@ -97,13 +97,13 @@ def quad_pixels(trained: TrainedAvatar, width: int) -> float:
 
 
 def measure_viewer(trained: TrainedAvatar) -> None:
-    stage = ViewRenderer(trained)
+    renderer = ViewRenderer(trained)
     frames = list(trained.recording.split.test)[:40]
     for width in (SIZE, 2 * SIZE):
         times = []
         for k, i in enumerate(frames):
             begin = time.perf_counter()
-            stage.draw((trained.recording.params(i), trained.recording.camera(i)), Setting(Look(0.1 * k)), width)
+            renderer.draw((trained.recording.params(i), trained.recording.camera(i)), Setting(Look(0.1 * k)), width)
             times.append(1000 * (time.perf_counter() - begin))
         print(f"viewer   {width}x{width}: {statistics.median(times):.1f} ms a picture, {thread_count()} threads")
 

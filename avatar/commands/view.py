@@ -57,13 +57,13 @@ def run_view(arguments: Namespace) -> int:
 
     motions = clips(trained, arguments.drive)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
-    stage = ViewRenderer(trained, None if run is None else truth_of(run))
+    renderer = ViewRenderer(trained, None if run is None else truth_of(run))
     live = open_live(arguments, trained, token)
     try:
         newest, name = (None, "") if live is None else (live.newest, live.name)
         player = Player(trained, motions, time.monotonic, newest, name)
         about = (None, None) if live is None else (live.status, live.calibrate)
-        viewer = Viewer(stage, player, width, arguments.host, arguments.port, token, url, *about)
+        viewer = Viewer(renderer, player, width, arguments.host, arguments.port, token, url, *about)
         try:
             print(f"Open     {address(arguments.host, viewer.port, url)}?token={token}", flush=True)
             if isinstance(live, Receiver):

@@ -94,27 +94,27 @@ class Panel:
                 self._button("Take this face as neutral", lambda _: calibrate())
 
     def _add_picture(self) -> None:
-        gui, viewer, stage = self._gui, self._viewer, self._viewer.renderer
+        gui, viewer, renderer = self._gui, self._viewer, self._viewer.renderer
         with gui.add_folder("Picture"):
-            if stage.truth is not None:
+            if renderer.truth is not None:
                 beside = gui.add_checkbox("Truth beside", initial_value=False)
                 self._input(beside, switched, lambda _: viewer.change(with_truth=beside.value))
-            overlay = gui.add_dropdown("Overlay", stage.overlays, initial_value="none")
-            self._input(overlay, one_of(stage.overlays), lambda _: viewer.change(overlay=overlay.value))
+            overlay = gui.add_dropdown("Overlay", renderer.overlays, initial_value="none")
+            self._input(overlay, one_of(renderer.overlays), lambda _: viewer.change(overlay=overlay.value))
             self._button("Save picture", viewer.save_picture)
             self._button("Save video", viewer.save_video)
 
     def _add_face(self) -> None:
-        stage, sliders = self._viewer.renderer, []
-        parts = list(dict.fromkeys(control.part for control in stage.controls))
+        renderer, sliders = self._viewer.renderer, []
+        parts = list(dict.fromkeys(control.part for control in renderer.controls))
         for part in parts:
             with self._gui.add_folder(part, expand_by_default=part == parts[0]):
-                for number, control in enumerate(stage.controls):
+                for number, control in enumerate(renderer.controls):
                     if control.part == part:
                         sliders.append(self._slider(control.name, (control.low, control.high), "expressions", number))
-        if stage.joints:
+        if renderer.joints:
             with self._gui.add_folder("Joints"):
-                for name, limits in stage.joints.items():
+                for name, limits in renderer.joints.items():
                     sliders.append(self._slider(LABELS.get(name, name.replace("_", " ")), limits, "joints", name))
 
         def reset(_: Any) -> None:

@@ -43,7 +43,7 @@ class Viewer:
 
     def __init__(
         self,
-        stage: ViewRenderer,
+        renderer: ViewRenderer,
         player: Player,
         width: int,
         host: str,
@@ -54,7 +54,7 @@ class Viewer:
         calibrate: Callable[[], None] | None = None,
     ) -> None:
         """Raises UserError when the address cannot be listened on. Port 0 takes a free one, then in `port`."""
-        self.renderer, self.player, self._width = stage, player, width
+        self.renderer, self.player, self._width = renderer, player, width
         self.setting, self._changed = Setting(), 0.0
         self._moving_width = width
         self.lock, self.wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
@@ -65,14 +65,14 @@ class Viewer:
         self.picture: np.ndarray | None = None
         self.milliseconds, self.pace = 0.0, Pace()
         self.complaints, self.door = Complaints(), Door()
-        camera = stage.trained.rest_camera()
-        self._own: Angles = seen_from(camera, stage.trained.rest_params())
+        camera = renderer.trained.rest_camera()
+        self._own: Angles = seen_from(camera, renderer.trained.rest_params())
         x, y, z = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
         self._distance = math.hypot(x, y, z)
         listening = _listen(host, port)
         self.port: int = listening.getsockname()[1]
         gate = Gate(token, host in LOCAL, url)
-        self._web = WebServer(listening, gate, self.door, self.complaints, stage.trained.name)
+        self._web = WebServer(listening, gate, self.door, self.complaints, renderer.trained.name)
         self.server = server = self._web.viser
         server.scene.world_axes.visible = False
         server.scene.set_up_direction("+y")

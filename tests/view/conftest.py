@@ -42,7 +42,7 @@ def viewer(shown_avatar: TrainedAvatar) -> Iterator[object]:
     from avatar.view.view_renderer import ViewRenderer
 
     player = Player(shown_avatar, {"train": own_clip(shown_avatar, "train")}, time.monotonic)
-    stage = ViewRenderer(shown_avatar, lambda _, width: torch.full((width, width, 3), 0.4))
-    viewer = Viewer(stage, player, WIDTH, "127.0.0.1", 0, TOKEN)
+    renderer = ViewRenderer(shown_avatar, lambda _, width: torch.full((width, width, 3), 0.4))
+    viewer = Viewer(renderer, player, WIDTH, "127.0.0.1", 0, TOKEN)
     yield viewer
     viewer.close()

@@ -27,63 +27,63 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 
 @pytest.fixture(scope="module")
-def stage(trained: TrainedAvatar) -> ViewRenderer:
+def renderer(trained: TrainedAvatar) -> ViewRenderer:
     return ViewRenderer(trained, lambda index, width: torch.full((width, width, 3), index / 100))
 
 
-def test_a_frame_is_drawn_as_the_program_draws_it(stage: ViewRenderer, trained: TrainedAvatar) -> None:
+def test_a_frame_is_drawn_as_the_program_draws_it(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     params, camera = trained.recording.params(5), trained.recording.camera(5, 48)
-    look = Look(stage.limits.yaw[1], stage.limits.pitch[0], 1.5)
-    drawn = stage.draw((params, camera), Setting(look), WIDTH, 5)
+    look = Look(renderer.limits.yaw[1], renderer.limits.pitch[0], 1.5)
+    drawn = renderer.draw((params, camera), Setting(look), WIDTH, 5)
     expected = trained.render(params, orbited(camera.resized(WIDTH, WIDTH), look.yaw, look.pitch, look.zoom)).image
     np.testing.assert_array_equal(drawn, to_bytes(expected))
-    assert not np.array_equal(drawn, stage.draw((params, camera), Setting(), WIDTH))
+    assert not np.array_equal(drawn, renderer.draw((params, camera), Setting(), WIDTH))
 
 
-def test_controls_add_and_joints_replace(stage: ViewRenderer, trained: TrainedAvatar) -> None:
+def test_controls_add_and_joints_replace(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     frame = trained.recording.params(9)
-    moved = stage.params(frame, Setting(expressions={0: 0.5, 1: -0.25}, joints={"jaw": 0.2, "left_lid": 0.7}))
-    expected = frame.expression + 0.5 * stage.controls[0].direction - 0.25 * stage.controls[1].direction
+    moved = renderer.params(frame, Setting(expressions={0: 0.5, 1: -0.25}, joints={"jaw": 0.2, "left_lid": 0.7}))
+    expected = frame.expression + 0.5 * renderer.controls[0].direction - 0.25 * renderer.controls[1].direction
     torch.testing.assert_close(moved.expression, expected)
     torch.testing.assert_close(moved.jaw, posed(frame, None, {"jaw": 0.2}).jaw)
     assert moved.eyelids[0] == 0.7 and moved.eyelids[1] == frame.eyelids[1]
     assert torch.equal(moved.eyes, frame.eyes) and torch.equal(moved.neck, frame.neck)
-    assert stage.params(frame, Setting(joints={"jaw": 0.0})).jaw.equal(frame.jaw)
+    assert renderer.params(frame, Setting(joints={"jaw": 0.0})).jaw.equal(frame.jaw)
 
 
-def test_the_camera_stays_where_the_avatar_is_known(stage: ViewRenderer) -> None:
-    kept, is_supported = stage.within(Look(500.0, -500.0, 100.0))
-    assert kept == Look(stage.limits.yaw[1] + MARGIN, stage.limits.pitch[0] - MARGIN, 4.0) and not is_supported
-    assert stage.within(Look()) == (Look(), True)
+def test_the_camera_stays_where_the_avatar_is_known(renderer: ViewRenderer) -> None:
+    kept, is_supported = renderer.within(Look(500.0, -500.0, 100.0))
+    assert kept == Look(renderer.limits.yaw[1] + MARGIN, renderer.limits.pitch[0] - MARGIN, 4.0) and not is_supported
+    assert renderer.within(Look()) == (Look(), True)
 
 
-def test_overlays(stage: ViewRenderer, trained: TrainedAvatar) -> None:
+def test_overlays(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     frame = trained.recording.params(5), trained.recording.camera(5, WIDTH)
-    plain = stage.draw(frame, Setting(), WIDTH, 5)
-    mesh = stage.draw(frame, Setting(overlay="mesh"), WIDTH, 5)
+    plain = renderer.draw(frame, Setting(), WIDTH, 5)
+    mesh = renderer.draw(frame, Setting(overlay="mesh"), WIDTH, 5)
     changed = (mesh != plain).any(axis=2)
     assert 0.02 < changed.mean() < 0.9
-    both = stage.draw(frame, Setting(overlay="error", with_truth=True), WIDTH, 5)
+    both = renderer.draw(frame, Setting(overlay="error", with_truth=True), WIDTH, 5)
     assert both.shape == (WIDTH, 3 * WIDTH, 3)
     assert (both[:, WIDTH : 2 * WIDTH] == round(255 * 0.05)).all(), "the truth of frame 5"
-    turned = stage.draw(frame, Setting(Look(5.0), overlay="error"), WIDTH, 5)
+    turned = renderer.draw(frame, Setting(Look(5.0), overlay="error"), WIDTH, 5)
     np.testing.assert_array_equal(turned[:, WIDTH:], both[:, 2 * WIDTH :], "the error is of the recorded view")
-    assert stage.draw(frame, Setting(overlay="error", with_truth=True), WIDTH).shape == plain.shape, (
+    assert renderer.draw(frame, Setting(overlay="error", with_truth=True), WIDTH).shape == plain.shape, (
         "no truth of other motion"
     )
 
 
-def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, stage: ViewRenderer) -> None:
-    assert stage.overlays == ("none", "mesh", "error")
+def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, renderer: ViewRenderer) -> None:
+    assert renderer.overlays == ("none", "mesh", "error")
     assert ViewRenderer(trained).overlays == ("none", "mesh")
 
 
-def test_the_distance_is_that_of_the_motion_statistics(stage: ViewRenderer, trained: TrainedAvatar) -> None:
+def test_the_distance_is_that_of_the_motion_statistics(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     rest = trained.rest_params()
     far = replace(rest, expression=rest.expression + 20)
     own = trained.statistics.expressions.distances([trained.recording.params(3)])
-    assert stage.distance(trained.recording.params(3)) == float(own[0])
-    assert stage.distance(far) > 2 * stage.distance(rest)
+    assert renderer.distance(trained.recording.params(3)) == float(own[0])
+    assert renderer.distance(far) > 2 * renderer.distance(rest)
 
 
 def test_a_motion_plays_pauses_and_is_scrubbed(trained: TrainedAvatar) -> None:
