@@ -88,6 +88,7 @@ def refined(subject: Subject, trained_on: tuple[int, ...] = tuple(range(TEST[0])
 # the corners of two eyeballs: with a focal length of SIZE at 1 m, pixels 18 to 30 and 42 to 54 across, 24 to 32 down
 EYES = torch.tensor([[18.0, 24.0], [30.0, 32.0], [42.0, 24.0], [54.0, 32.0]]).sub(SIZE / 2).div(SIZE)
 EYES = torch.cat((EYES, torch.zeros(4, 1)), dim=1)
+NECK = torch.tensor([[0.0, 0.5, 0.0]])  # a vertex below
 
 
 class Blob:
@@ -96,7 +97,11 @@ class Blob:
     def __init__(self, eyeballs: bool = True) -> None:
         regions = {"left_eyeball": torch.tensor([0, 1]), "right_eyeball": torch.tensor([2, 3])} if eyeballs else {}
         assets = SimpleNamespace(fingerprint="ab" * 32, regions=regions)
-        self.head = SimpleNamespace(assets=assets, vertices=lambda _: EYES)
+
+        def neck() -> tuple[torch.Tensor, torch.Tensor]:
+            return torch.zeros(3), torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0])
+
+        self.head = SimpleNamespace(assets=assets, vertices=lambda _: torch.cat((EYES, NECK)), neck=neck)
         self.seen: list[float] = []
         generator = torch.Generator().manual_seed(1)
         self.means = torch.cat((torch.rand(400, 2, generator=generator) * 0.6 - 0.3, torch.zeros(400, 1)), dim=1)

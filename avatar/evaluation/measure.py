@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from avatar.compute.device import CPU, to_device
-from avatar.evaluation.protocol import MEASURES, Levels, Look, Protocol, Region, column
+from avatar.evaluation.protocol import MEASURES, RIMS, Levels, Look, Protocol, Region, column
 from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.losses.metrics import SSIM_RADIUS, bounding_box, grown_box, squared_error, ssim_map, weighted_mean
 
@@ -92,6 +92,8 @@ class FrameMeasurer:
 
     def _lpips_of(self, protocol: Protocol, what: str) -> float:
         """LPIPS before scaling; `what` is a region, or "multiply" or "none" for the whole frame."""
+        if what in RIMS:
+            return float("nan")  # its pictures would be black but for a line
         key = (protocol.look, what, protocol.lpips_net)
         if key not in self._lpips:
             network = self._networks[protocol.lpips_net]

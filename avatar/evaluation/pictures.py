@@ -13,16 +13,11 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.evaluation.measure import Pair, to_8_bit
-from avatar.evaluation.protocol import Region
+from avatar.evaluation.protocol import REGIONS, Region
 
 RENDERS, TRACKED_RENDERS = "renders", "tracked_renders"
-FOLDERS = (RENDERS, TRACKED_RENDERS, "gt", "masks", "mouth_masks", "eyes_masks", "rest_masks")
-MASK_FOLDERS: dict[Region, str] = {
-    "head": "masks",
-    "mouth": "mouth_masks",
-    "eyes": "eyes_masks",
-    "rest": "rest_masks",
-}
+MASK_FOLDERS: dict[Region, str] = {region: "masks" if region == "head" else f"{region}_masks" for region in REGIONS}
+FOLDERS = (RENDERS, TRACKED_RENDERS, "gt", *MASK_FOLDERS.values())
 
 
 def encode_pictures(

@@ -26,7 +26,8 @@ Mask = Literal["multiply", "none", "only"]
 Levels = Literal["round", "truncate", "float"]
 
 MEASURES = ("psnr", "ssim", "lpips")
-REGIONS: tuple[Region, ...] = ("head", "mouth", "eyes", "rest")
+RIMS: tuple[Region, ...] = ("head_rim", "neck_rim")
+REGIONS: tuple[Region, ...] = ("head", "mouth", "eyes", "rest", *RIMS)
 HELD_OUT = "held-out"
 NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a protocol, and of its folder
 MAX_BYTES = 1 << 16  # of a protocol file: those that come with the program have 2 KB
@@ -36,14 +37,15 @@ SHARED_CHOICES = {
     "the render",
     "render": "drawn over the same background",
     "regions": "head: the data's head mask; mouth: the data's mouth mask; eyes: two boxes about the projected eyeballs of "
-    "the head model, times the head mask, without the mouth; rest: the head mask without mouth and eyes; all rounded to "
-    "8 bits and used as weights in [0, 1]",
+    "the head model, times the head mask, without the mouth; rest: the head mask without mouth and eyes; head_rim and "
+    "neck_rim: the pixels within 8/256 of the longer side of the outline of alpha * head mask, on both sides, nearest to "
+    "a vertex of the head or of the neck; all rounded to 8 bits and used as weights in [0, 1]",
     "psnr": "10 log10(1 / mean square error over pixels and channels) of values in [0, 1], in dB",
     "ssim": "11x11 Gaussian window, sigma 1.5, K 0.01 and 0.03, population covariance, whole windows only, mean of the "
     "channels; as scikit-image's structural_similarity with gaussian_weights=True, use_sample_covariance=False",
     "lpips": "version 0.1, images brought to [-1, 1], times the protocol's lpips_scale",
     "of_a_region": "weighted mean over the region alone of squared error and of the SSIM map; LPIPS of both images times "
-    "the mask, cropped to its bounding box grown to at least 64 pixels",
+    "the mask, cropped to its bounding box grown to at least 64 pixels; none of a rim",
     "jitter": "of the head, in levels of 8 bits: with e = render - truth, the mean over pixels and channels of "
     "|e(t-1) - 2 e(t) + e(t+1)|, weighted by the smallest of the three head masks; none where a neighbour is missing",
     "yaw": "degrees about the head's vertical axis from which the camera sees it, positive from the head's own left",

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from disc import SIZE, TEST, Blob, BlobRenderer, make_run, read_png
+from disc import EYES, NECK, SIZE, TEST, Blob, BlobRenderer, make_run, read_png
 
 from avatar.data.subject import Subject
 from avatar.evaluation.evaluate import evaluate
-from avatar.evaluation.protocol import MEASURES, choose_protocols
+from avatar.evaluation.protocol import MEASURES, RIMS, choose_protocols
+from avatar.evaluation.regions import outline_rims
 from avatar.evaluation.verify import recompute
 from avatar.losses.lpips import lpips_folder, save_lpips
 from avatar.losses.lpips_network import Lpips
@@ -61,6 +62,32 @@ def test_regions_divide_the_head(tmp_path: Path, subject: Subject) -> None:
         assert seen["psnr_eyes"] != pytest.approx(seen["psnr_rest"], abs=0.1)
         for figure, value in seen.items():
             assert float(row[figure]) == pytest.approx(value, abs=1e-6), (name, figure)
+
+
+def test_rims_lie_along_the_outline(tmp_path: Path, subject: Subject) -> None:
+    """Within 8/256 of the picture's side of the outline of matte x head mask; the neck's where its vertex is nearest."""
+    run = make_run(tmp_path / "run", subject)
+    results = json.loads(evaluate(run, ["strict"], write_frames=True, say=lambda _: None).read_text())
+    masks = {kind: read_png(run.path / "eval/strict" / f"{kind}_masks" / "00008.png") for kind in RIMS}
+    assert all(set(np.unique(mask)) == {0, 255} for mask in masks.values())
+    assert not ((masks["head_rim"] > 0) & (masks["neck_rim"] > 0)).any()
+    y, x = np.mgrid[0:SIZE, 0:SIZE]
+    outline = 26 - 0.5 * 255 / 80  # where the disc's head mask is half
+    away = abs(np.hypot(x - SIZE / 2, y - SIZE / 2) - outline)
+    either, reach = (masks["head_rim"] > 0) | (masks["neck_rim"] > 0), SIZE * 8 / 256
+    assert either[away < reach - 1.5].all() and not either[away > reach + 1.0].any()
+    corners = torch.cat((EYES, NECK))[:, :2].numpy() * SIZE + SIZE / 2
+    distance = np.hypot(x[..., None] + 0.5 - corners[:, 0], y[..., None] + 0.5 - corners[:, 1])
+    below = distance[..., 4] < distance[..., :4].min(axis=-1)
+    assert ((masks["neck_rim"] > 0) == either & below).all() and below[either].any()
+    means = results["protocols"]["strict"]["means"]
+    assert means["lpips_head_rim"] is None and means["psnr_head_rim"] != means["psnr_neck_rim"]
+
+
+def test_a_picture_that_is_all_head_has_no_rim() -> None:
+    """The picture's border is no outline."""
+    rims = outline_rims(torch.ones(20, 30), torch.zeros(1, 2), torch.tensor([True]))
+    assert not any(rim.any() for rim in rims)
 
 
 def test_a_head_model_without_eyeballs_has_no_figure_for_eyes(tmp_path: Path, subject: Subject) -> None:

@@ -22,7 +22,7 @@ def test_the_choices_of_the_protocols_that_come_with_the_program() -> None:
     assert [p.mask for p in protocols] == ["multiply", "none", "none", "none", "none"]
     assert [p.frames for p in protocols] == ["held-out", "held-out", 350, 350, "held-out"]
     assert {(p.clamp, p.levels, p.lpips_net, p.lpips_scale) for p in protocols} == {(True, "round", "vgg", 1.0)}
-    assert by_name["strict"].regions == ("head", "mouth", "eyes", "rest")
+    assert by_name["strict"].regions == ("head", "mouth", "eyes", "rest", "head_rim", "neck_rim")
     for protocol in protocols[:-1]:
         assert protocol.regions == ("head", "mouth")
         assert "Known: " in protocol.source and "Our reading: " in protocol.source
@@ -43,7 +43,7 @@ def test_frames_are_never_those_of_the_training() -> None:
 def test_a_protocol_is_read_as_an_editor_on_windows_saves_it(encoding: str, tmp_path: Path) -> None:
     text = builtin_protocols()["strict"].read_text(encoding="utf-8")
     (tmp_path / "mine.yaml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
-    assert read_protocol(tmp_path / "mine.yaml").regions == ("head", "mouth", "eyes", "rest")
+    assert read_protocol(tmp_path / "mine.yaml").regions == ("head", "mouth", "eyes", "rest", "head_rim", "neck_rim")
 
 
 def test_unknown_protocols_are_refused_and_repeated_ones_run_once(tmp_path: Path) -> None:
@@ -82,9 +82,9 @@ CHANGES = {
     "a word for a flag": (("clamp: true", "clamp: often"), "clamp is 'often', and has to be true or false"),
     "unclamped 8 bits": (("clamp: true", "clamp: false"), "clamp: false needs levels: float"),
     "unknown levels": (("levels: round", "levels: [8]"), "levels is [8], and has to be one of round, truncate, float"),
-    "an unknown region": (("[head, mouth, eyes, rest]", "[head, nose]"), "regions is ['head', 'nose']"),
-    "a region twice": (("[head, mouth, eyes, rest]", "[head, head]"), "regions is ['head', 'head']"),
-    "a region that is a list": (("[head, mouth, eyes, rest]", "[[head]]"), "regions is [['head']]"),
+    "an unknown region": (("head_rim, neck_rim]", "nose]"), "'rest', 'nose']"),
+    "a region twice": (("mouth, eyes, rest, head_rim, neck_rim]", "head]"), "regions is ['head', 'head']"),
+    "a region that is a list": (("[head, mouth, eyes, rest, head_rim, neck_rim]", "[[head]]"), "regions is [['head']]"),
     "an unknown network": (("lpips_net: vgg", "lpips_net: resnet"), "one of vgg, alex, squeeze"),
     "a negative scale": (("lpips_scale: 1.0", "lpips_scale: -1"), "lpips_scale is -1, and has to be a number above 0"),
     "an empty summary": (("summary: ", "summary: ''\n# "), "summary is '', and has to be a sentence"),
