@@ -47,10 +47,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def kill_first_worker_with_a_checkpoint(folder: Path, killed: list[str]) -> None:
+def kill_first_worker_with_a_checkpoint(folder: Path, killed: list[str], sweep_ended: threading.Event) -> None:
     """SIGKILL to the worker of the first job that has saved something."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
+    while not sweep_ended.is_set():
         for job in sorted((folder / "jobs").glob("*")):
             if list_checkpoints(job / "run" / "checkpoints"):
                 state = read_state(job)
@@ -73,11 +72,12 @@ def found_before(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_sweep_on_every_engine(engine: str, place: Path, found_before: Path, tmp_path: Path) -> None:
     if importlib.util.find_spec(ENGINES[engine]) is None:
         pytest.skip(f"{ENGINES[engine]} is not installed (extra [{engine}])")
-    folder, killed = tmp_path / "out", []
-    killer = threading.Thread(target=kill_first_worker_with_a_checkpoint, args=(folder, killed), daemon=True)
+    folder, killed, ended = tmp_path / "out", [], threading.Event()
+    killer = threading.Thread(target=kill_first_worker_with_a_checkpoint, args=(folder, killed, ended), daemon=True)
     killer.start()
     options = ("--out", folder, "--engine", engine, "--workers", 2, *OPTIONS[engine])
     output = avatar("sweep", write_spec(place), *options, status=1)
+    ended.set()
     killer.join()
     states = {path.name: read_state(path) for path in (folder / "jobs").iterdir()}
     assert len(states) == 4
