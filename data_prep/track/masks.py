@@ -12,6 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.ndimage import distance_transform_edt
 
 from avatar.data.subject import FAINTEST_MATTE
 from avatar.errors import UserError
@@ -112,12 +113,8 @@ def _continued(share: Float32[np.ndarray, "S S"], person: Bool[np.ndarray, "S S"
     """The share of every pixel of the person, and elsewhere that of the nearest of these."""
     if not person.any():
         return share
-    _, nearest = cv2.distanceTransformWithLabels(
-        (~person).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.zeros(nearest.max() + 1, np.float32)
-    of_label[nearest[person]] = share[person]
-    return of_label[nearest]
+    rows, columns = distance_transform_edt(~person, return_distances=False, return_indices=True)
+    return share[rows, columns]
 
 
 def _without_threads(head: Bool[np.ndarray, "S S"], unsure: Bool[np.ndarray, "S S"]) -> Bool[np.ndarray, "S S"]:
