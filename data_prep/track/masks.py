@@ -113,8 +113,8 @@ def _continued(share: Float32[np.ndarray, "S S"], person: Bool[np.ndarray, "S S"
     """The share of every pixel of the person, and elsewhere that of the nearest of these."""
     if not person.any():
         return share
-    rows, columns = distance_transform_edt(~person, return_distances=False, return_indices=True)
-    return share[rows, columns]
+    nearest = np.asarray(distance_transform_edt(~person, return_distances=False, return_indices=True))
+    return share[nearest[0], nearest[1]]
 
 
 def _without_threads(head: Bool[np.ndarray, "S S"], unsure: Bool[np.ndarray, "S S"]) -> Bool[np.ndarray, "S S"]:
