@@ -15,6 +15,7 @@ from data_prep.track.faces.landmark_groups import BROWS, LEFT_IRIS, LIDS, LIPS, 
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.result import Fit
+from data_prep.track.outline import Outline
 
 GRADES = ("good", "fair", "poor")
 GROUPS = {"lips": LIPS, "lids": LIDS, "brows": BROWS, "nose": NOSE, "irises": (LEFT_IRIS, RIGHT_IRIS)}
@@ -68,7 +69,7 @@ class Quality:
         return {"figures": figures, "worst_frames": list(self.worst_frames), "focal": self.focal}
 
 
-def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Focal) -> Quality:
+def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline, focal: Focal) -> Quality:
     """The figures of a finished tracking. `fit.figures` holds what `landmark_figures` made of it."""
     own = fit.figures
     shots = {name: float(value) for name, value in own["errors"].items()}
@@ -83,6 +84,11 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Foca
             "mesh above the neck on the matte", 100 * float(np.mean(overlaps)), "%", 98, 95,
             "look at overlay/: is the matte whole, and the head in its place?", True,
         ),
+        Figure(
+            "jitter of the outline, at 512", outline.jitter, "px", 0.5, 1.0,
+            "light the background evenly, or give mattes with --matte",
+        ),
+        Figure("width of the matte's edge, at 512", outline.width, "px"),
         Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
     ]  # fmt: skip
     figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
