@@ -15,11 +15,12 @@ from data_prep.track.faces.landmark_groups import IRISES
 from data_prep.track.faces.landmarks import BLENDSHAPES, CLOSED_SCORE, Landmarks
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.fitting import as_tracks
+from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg import minimise
 from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.result import Fit
-from data_prep.track.quality import landmark_figures
+from data_prep.track.quality import judge, landmark_figures
 
 FRAMES = 64
 AT_512 = 512 / SIZE
@@ -92,14 +93,14 @@ def test_eyes_that_disagree_are_not_forced_together(looked: Looked) -> None:
 def test_the_table_tells_of_irises_that_do_not_follow(looked: Looked) -> None:
     scene, fit = looked
 
-    def told(landmarks: Landmarks, motion: Motion = fit.motion) -> float | None:
+    def grades(landmarks: Landmarks, motion: Motion = fit.motion) -> list[str | None]:
         tracks = as_tracks(fit, motion, scene.camera, landmarks.size, scene.assets.num_expressions)
-        return landmark_figures(scene.assets, Fit(tracks, {}), landmarks, scene.embedding)["irises"]
+        figures = landmark_figures(scene.assets, Fit(tracks, {}), landmarks, scene.embedding)
+        quality = judge(landmarks, Fit(tracks, figures), [1.0], Focal(1.0, "given", False))
+        return [figure.grade for figure in quality.figures if "irises" in figure.name]
 
-    follows = told(scene.landmarks)
-    assert follows is not None and follows < 1.0
-    ahead = told(scene.landmarks, replace(fit.motion, gaze=torch.zeros_like(fit.motion.gaze)))
-    assert ahead is not None and ahead > 2.0
+    assert grades(scene.landmarks) == ["good"]
+    assert grades(scene.landmarks, replace(fit.motion, gaze=torch.zeros_like(fit.motion.gaze))) == ["poor"]
     closed = scene.landmarks.scores.copy()
     closed[:, BLINKS] = CLOSED_SCORE
-    assert told(replace(scene.landmarks, scores=closed)) is None
+    assert grades(replace(scene.landmarks, scores=closed)) == []
