@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter1d
 from avatar.demo.head import JOINTS, NUM_EXPRESSION, demo_head
 from avatar.types import IDENTITY_6D, Camera, HeadParams
 
-Motion = Literal["speech", "turn"]
-MOTIONS: tuple[Motion, ...] = ("speech", "turn")
+Motion = Literal["speech", "turn", "gaze"]
+MOTIONS: tuple[Motion, ...] = ("speech", "turn", "gaze")
 FPS = 25.0
 CAMERA_DISTANCE = 1.0  # metres
 FIELD_OF_VIEW_HEIGHT = 0.37  # metres that the picture covers at the head
@@ -32,6 +32,21 @@ _VISEMES: tuple[tuple[float, dict[str, float]], ...] = (
     (0.000, {"lip_press": 0.75, "lip_roll_in": 0.30}),  # m, b, p
     (0.030, {"lip_roll_in": 0.25, "upper_lip_up": 0.40, "lower_lip_thrust": -0.5}),  # f, v
     (0.070, {"upper_lip_up": 0.20, "lower_lip_down": 0.25, "frown": 0.10}),  # l, n, d
+)
+
+# What "gaze" goes through: the eyes in degrees (to the subject's left, downwards), the lids (left, right; 1 is closed).
+_LOOKS: tuple[tuple[float, float, float, float], ...] = (
+    (32, 0, 0, 0),  # into the corners
+    (-32, 0, 0, 0),
+    (0, 20, 0, 0),  # down, with open lids
+    (0, 0, 1, 0),  # winks
+    (0, 0, 0, 1),
+    (-22, 12, 0, 0),  # rolled
+    (-26, -12, 0, 0),
+    (0, -24, 0, 0),
+    (26, -12, 0, 0),
+    (22, 12, 0, 0),
+    (0, 0, 0, 0),
 )
 
 
@@ -85,6 +100,8 @@ def perform(seed: int, frames: int, motion: Motion) -> Performance:
     head = _head_turns(rng, frames, motion, talking)
     gaze, blink_with_gaze = _gaze(rng, frames, head)
     lids = _blinks(rng, frames, blink_with_gaze)
+    if motion == "gaze":
+        gaze, lids = _looks(rng, frames)
     shift = _drift(rng, frames, 3.0, 3) * np.array([0.004, 0.002, 0.006])
     return Performance(np.clip(expression, -1.2, 1.6), jaw, gaze, lids, head, shift)
 
@@ -116,7 +133,7 @@ def _speech(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, dict[str
 def _head_turns(rng: np.random.Generator, frames: int, motion: Motion, talking: np.ndarray) -> np.ndarray:
     slow = np.tanh(0.8 * _drift(rng, frames, 2.4, 3)) * np.radians([15.0, 6.5, 4.5])
     quick = _drift(rng, frames, 0.45, 3) * talking[:, None] * np.radians([1.0, 1.5, 0.8])
-    if motion == "speech":
+    if motion != "turn":
         return slow + quick
     clock = np.arange(frames) / FPS
     phase, period = rng.uniform(0, 2 * np.pi), rng.uniform(5.5, 7.5)
@@ -157,6 +174,14 @@ def _blinks(rng: np.random.Generator, frames: int, with_gaze: list[int]) -> np.n
         lids[start : start + len(shape)] = np.maximum(lids[start : start + len(shape)], shape)
     tired = np.clip(0.10 + 0.05 * _drift(rng, frames, 3.0, 2), 0.0, 0.22)
     return np.clip(lids[:frames, None] + tired * (1 - lids[:frames, None]), 0.0, 1.0)
+
+
+def _looks(rng: np.random.Generator, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gaze [T, 2] and lids [T, 2] of eyes that go through `_LOOKS`, each for 0.12 to 0.32 seconds."""
+    holds = rng.integers(3, 9, frames)
+    looks = np.repeat(np.resize(np.array(_LOOKS, float), (frames, 4)), holds, axis=0)[:frames]
+    looks = gaussian_filter1d(looks, 0.55, axis=0, mode="nearest")
+    return np.radians(looks[:, :2]), looks[:, 2:]
 
 
 def _rotation(axis: int, angle: float) -> np.ndarray:

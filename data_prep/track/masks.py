@@ -1,8 +1,8 @@
 """Head and mouth masks from the matte and the posed mesh.
 
-The matte has clothes on it; where the neck ends is found by GrabCut inside the matte (Rother, Kolmogorov, Blake 2004), with
-the mesh to say what is surely head and what is surely not, the clip's colours to begin from, and along that border
-closed-form matting. Everything is measured in heights above the mesh's neck ring.
+The matte has clothes on it. The mesh says what is surely head and what is surely clothes; between these, the clip's colours
+give each pixel a probability, which closed-form matting makes consistent with the picture's edges. Everything is measured
+in heights above the mesh's neck ring.
 """
 
 from __future__ import annotations
@@ -12,32 +12,30 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.ndimage import distance_transform_edt
 
+from avatar.data.subject import FAINTEST_MATTE
 from avatar.errors import UserError
 from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
 from data_prep.track.clothes import Colours
 from data_prep.track.faces.landmark_groups import OUTER_LIPS
-from data_prep.track.neck_zones import SIDE, Zones
+from data_prep.track.neck_zones import Zones
 
 # Heights above the neck ring; 1 is the middle of the head.
 _SURELY_CLOTHES = -0.15  # below
-_CLOTHES_BESIDE = 0.10  # below and outside the mesh
-_MAYBE_BESIDE = 0.50  # below and outside: shoulders, or hair that falls on them
+_CLOTHES_BESIDE = 0.10  # below and far outside the mesh
+_MAYBE_BESIDE = 0.50  # below and outside: shoulders, or hair that falls on them; above and beside the mesh: hair
+_REACH = 17  # pixels of SIDE across: beside the mesh, which may lie so far aside
 _SURELY_HEAD = 0.30  # above and well inside the mesh
 _ALL_HEAD = 0.75  # above, inside the matte
-_DIVIDED = 1.0  # below: the rest needs no division
-_COLLAR, _MIDDLE = (
-    0.45,
-    0.12,
-)  # below, and so far from the head's axis: clothes on the mesh reach as high, where the colours say so
+_COLLAR, _MIDDLE = 0.45, 0.12  # below, farther than _MIDDLE from the head's axis: a collar on the mesh reaches as high
 _NEAR = 1.5  # pixels of SIDE
-_HALF = 112  # of 255: pixels that are half head are head, and shares along the collar err by a little
-_ITERATIONS = 1  # of GrabCut: three gain 0.0001 of IoU on demo people and take half as long again
-_NOWHERE = (255, 0, 255)  # a colour that no person has, in the place of the background
+_THREAD = 7  # pixels of SIDE: thinner parts are shadows along a collar, not hair
+_TRUST = 0.1  # in the colours of one pixel, against its neighbours
 
 
 class HeadMask(NamedTuple):
-    mask: UInt8[np.ndarray, "H W"]  # 0 or 255, as published masks are
+    mask: UInt8[np.ndarray, "H W"]  # soft along the collar; along the person's outline the matte is
     overlap: float  # share of the mesh (above the ring) that lies on the matte
 
 
@@ -65,26 +63,24 @@ def head_mask(
     """Head and neck of the person in `matte`; `zones` are the image's, `colours` its clip's where they are known."""
     height, width = matte.shape
     person, inside, outside, level = zones.person, zones.inside, zones.outside, zones.level
-    labels = np.full((SIDE, SIDE), cv2.GC_PR_FGD, np.uint8)
-    labels[outside & (level < _MAYBE_BESIDE)] = cv2.GC_PR_BGD
-    labels[(level < _SURELY_CLOTHES) | (outside & (level < _CLOTHES_BESIDE))] = cv2.GC_BGD
-    labels[(inside & (level > _SURELY_HEAD)) | (level > _ALL_HEAD)] = cv2.GC_FGD
+    beside = cv2.dilate(zones.body.astype(np.uint8), np.ones((_REACH, _REACH), np.uint8)) > 0
+    clothes = (level < _SURELY_CLOTHES) | (~beside & (level < _CLOTHES_BESIDE))
+    sure = (inside & (level > np.where(zones.aside < _MIDDLE, _SURELY_HEAD, _COLLAR))) | (level > _ALL_HEAD)
+    sure |= beside & (level > _MAYBE_BESIDE)
+    unsure = person & ~clothes & ~sure
+    share = np.where(clothes, np.float32(0.0), np.float32(1.0))
     if colours is not None:
-        unsure = (
-            ~outside & (level >= _SURELY_CLOTHES) & (level < np.where(zones.aside < _MIDDLE, _SURELY_HEAD, _COLLAR))
-        )
-        labels[unsure] = np.where(colours.are_clothes(zones.image, unsure)[unsure], cv2.GC_PR_BGD, cv2.GC_PR_FGD)
-    labels[~person] = cv2.GC_BGD
-    small = zones.image.copy()
-    small[~person] = _NOWHERE
-    _divide(small, labels, level)
-    head = _with_face((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), inside & (level > _ALL_HEAD))
+        share[unsure] = colours.head_share(zones.image, unsure)
+    else:
+        share[(outside & (level < _MAYBE_BESIDE)) | (level < 0.0)] = 0.0
+    share = closed_form(zones.image, _continued(share, person), unsure, trust=_TRUST)
+    head = _with_face(_without_threads(person & (share > 0.5), unsure), inside & (level > _ALL_HEAD))
     above = zones.body & (level > _SURELY_HEAD)
     overlap = float(person[above].mean()) if above.any() else 0.0
     person_large = np.where(matte > 127, np.uint8(255), np.uint8(0))
-    large = np.where(_nearer_to(head, person & ~head, width, height), person_large, np.uint8(0))
+    large = np.where(_nearer_to(head, person & ~head, width, height), np.uint8(255), np.uint8(0))
     mask = within_limits(_divided_border, image, large, person_large)
-    return HeadMask(np.where(mask > _HALF, person_large, np.uint8(0)), overlap)
+    return HeadMask(np.where(matte >= FAINTEST_MATTE, mask, np.uint8(0)), overlap)
 
 
 def mouth_mask(points: Float32[np.ndarray, "478 3"], width: int, height: int) -> UInt8[np.ndarray, "H W"]:
@@ -113,20 +109,18 @@ def _divided_border(image: np.ndarray, head: np.ndarray, person: np.ndarray) -> 
     return np.rint(closed_form(image, is_head.astype(np.float32), band) * 255.0).astype(np.uint8)
 
 
-def _divide(image: np.ndarray, labels: np.ndarray, level: np.ndarray) -> None:
-    """GrabCut in place, on the rows that have something to divide."""
-    rows = np.flatnonzero((level < _DIVIDED).any(axis=1))
-    if not len(rows):
-        return
-    part = np.ascontiguousarray(labels[rows[0] : rows[-1] + 1])
-    known_head, known_other = (part == cv2.GC_FGD).any(), (part == cv2.GC_BGD).any()
-    if not (known_head and known_other and ((part == cv2.GC_PR_FGD) | (part == cv2.GC_PR_BGD)).any()):
-        return
-    cv2.setRNGSeed(0)  # its colour models start from random means
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    cut = np.ascontiguousarray(image[rows[0] : rows[-1] + 1])
-    cv2.grabCut(cut, part, (0, 0, 0, 0), *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    labels[rows[0] : rows[-1] + 1] = part
+def _continued(share: Float32[np.ndarray, "S S"], person: Bool[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
+    """The share of every pixel of the person, and elsewhere that of the nearest of these."""
+    if not person.any():
+        return share
+    nearest = np.asarray(distance_transform_edt(~person, return_distances=False, return_indices=True))
+    return share[nearest[0], nearest[1]]
+
+
+def _without_threads(head: Bool[np.ndarray, "S S"], unsure: Bool[np.ndarray, "S S"]) -> Bool[np.ndarray, "S S"]:
+    """Without the unsure parts that are thinner than `_THREAD`."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_THREAD, _THREAD))
+    return head & ~(unsure & (cv2.morphologyEx(head.astype(np.uint8), cv2.MORPH_OPEN, disc) == 0))
 
 
 def _with_face(head: Bool[np.ndarray, "S S"], face: Bool[np.ndarray, "S S"]) -> Bool[np.ndarray, "S S"]:

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from avatar.head.assets import HeadAssets
 from data_prep.track.faces.embedding import LandmarkEmbedding
-from data_prep.track.faces.landmark_groups import BROWS, LEFT_IRIS, LIDS, LIPS, NOSE, RIGHT_IRIS
+from data_prep.track.faces.landmark_groups import BROWS, IRISES, LEFT_IRIS, LIDS, LIPS, NOSE, RIGHT_IRIS
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.result import Fit
+from data_prep.track.outline import Outline
 
 GRADES = ("good", "fair", "poor")
-GROUPS = {"lips": LIPS, "lids": LIDS, "brows": BROWS, "nose": NOSE, "irises": (LEFT_IRIS, RIGHT_IRIS)}
+GROUPS = {"lips": LIPS, "lids": LIDS, "brows": BROWS, "nose": NOSE}
+_OPEN = 0.5  # of an eye whose iris is judged
 _WORST = 5  # frames that are named
 
 
@@ -68,7 +70,7 @@ class Quality:
         return {"figures": figures, "worst_frames": list(self.worst_frames), "focal": self.focal}
 
 
-def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Focal) -> Quality:
+def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline, focal: Focal) -> Quality:
     """The figures of a finished tracking. `fit.figures` holds what `landmark_figures` made of it."""
     own = fit.figures
     shots = {name: float(value) for name, value in own["errors"].items()}
@@ -78,16 +80,27 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], focal: Foca
         Figure("landmark error", shots.pop("all"), "% eyes", 1.0, 2.0, "is the head model's landmark embedding right?"),
         *(Figure(f"  of the {name}", value, "% eyes", 1.0, 2.0) for name, value in shots.items()),
         Figure("  the same in all frames, besides", own["constant"], "% eyes"),
+        *_irises(own["irises"]),
         Figure("jitter, against the landmarks' own", own["jitter"], "x", 1.0, 1.2, "a steadier camera and more light"),
         Figure(
             "mesh above the neck on the matte", 100 * float(np.mean(overlaps)), "%", 98, 95,
             "look at overlay/: is the matte whole, and the head in its place?", True,
         ),
+        Figure(
+            "jitter of the outline, at 512", outline.jitter, "px", 0.5, 1.0,
+            "light the background evenly, or give mattes with --matte",
+        ),
+        Figure("width of the matte's edge, at 512", outline.width, "px"),
         Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
     ]  # fmt: skip
     figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
     figures += coverage(fit, landmarks)
     return Quality(tuple(figures), tuple(own["worst_frames"]), focal.source)
+
+
+def _irises(value: float | None) -> list[Figure]:
+    advice = "the gaze does not follow: more light on the eyes, and a larger face"
+    return [] if value is None else [Figure("irises of open eyes, 90 %", value, "% eyes", 1.0, 2.0, advice)]
 
 
 def coverage(fit: Fit, landmarks: Landmarks) -> list[Figure]:
@@ -114,7 +127,8 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
 
     Errors are mean distances between the embedded and the detected landmarks, in per cent of the distance between the
     irises in the picture (its 90th percentile over the clip, since turned heads show it shorter). What is the same in all
-    frames is told apart: it is where the embedding lies on this face, and not an error of the tracking.
+    frames is told apart: it is where the embedding lies on this face, and not an error of the tracking. Of the irises it
+    is an error: the gaze can follow them.
     """
     rows = list(fit.tracks)
     placed = _placed(head, fit, embedding)
@@ -132,11 +146,21 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
     worst = [rows[i] for i in np.argsort(-per_frame)[:_WORST]]
     return {
         "errors": errors,
+        "irises": _iris_distance(np.linalg.norm(residual, axis=2), embedding.landmarks, landmarks.open_shares()[rows]),
         "constant": float(np.linalg.norm(constant[features], axis=1).mean()),
         "jitter": _jitter(placed[:, features]) / max(_jitter(observed[:, features]), 1e-9),
         "worst_frames": sorted(worst),
         "identity": float(np.abs(next(iter(fit.tracks.values())).shape).max()),
     }
+
+
+def _iris_distance(
+    distance: Float[np.ndarray, "T L"], of: Int[np.ndarray, " L"], open_shares: Float[np.ndarray, "T 2"]
+) -> float | None:
+    """The 90th percentile over the irises of open eyes; None without any, or without eyeballs in the head model."""
+    seen = [distance[open_shares[:, side] > _OPEN][:, of == iris].ravel() for side, iris in enumerate(IRISES)]
+    together = np.concatenate(seen)
+    return float(np.percentile(together, 90)) if len(together) else None
 
 
 def _placed(head: HeadAssets, fit: Fit, embedding: LandmarkEmbedding) -> Float[np.ndarray, "T L 2"]:

@@ -109,9 +109,9 @@ def track(
             say(f"note: {note}")
         notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
         fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
-        overlaps = work.masks(landmarks, fit)
+        overlaps, outline = work.masks(landmarks, fit)
         work.overlay(fit, look)
-        quality = judge(landmarks, fit, overlaps, focal)
+        quality = judge(landmarks, fit, overlaps, outline, focal)
         for line in quality.lines():
             say(line)
         save_landmarks(stages.path / LANDMARKS_FILE, landmarks)

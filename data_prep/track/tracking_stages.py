@@ -37,6 +37,7 @@ from data_prep.track.inputs import head_inputs
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
 from data_prep.track.matting import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
+from data_prep.track.outline import Outline, measure_outline
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.own_mattes import OwnMattes
 from data_prep.track.stage_folder import StageFolder
@@ -155,8 +156,8 @@ class TrackingStages:
         )
         return Fit.load(self._folder / "fit" / TRACKS_FILE, intrinsics, landmarks.size, figures, key)
 
-    def masks(self, landmarks: Landmarks, fit: Fit) -> list[float]:
-        """Writes head and mouth masks; returns how much of the mesh lies on the matte, by frame."""
+    def masks(self, landmarks: Landmarks, fit: Fit) -> tuple[list[float], Outline]:
+        """Writes head and mouth masks; returns how much of the mesh lies on the matte, by frame, and the outline."""
         numbers = list(fit.tracks)
 
         def make_heads(folder: Path) -> dict[str, Any]:
@@ -175,7 +176,9 @@ class TrackingStages:
                 return made.mask
 
             write_masks(folder, numbers, one, self._progress, "masking the head")
-            return {"overlaps": [overlaps[number] for number in numbers]}
+            is_head = fit.model(self._head).neck()[1].numpy() > 0.5
+            outline = measure_outline(numbers, self._mask, lambda number: project(number)[is_head, :2])
+            return {"overlaps": [overlaps[number] for number in numbers], "outline": outline}
 
         def make_mouths(folder: Path) -> dict[str, Any]:
             def one(number: int) -> np.ndarray:
@@ -186,7 +189,7 @@ class TrackingStages:
 
         result, _ = self._stages.run(HEAD, {"fit": fit.key}, make_heads)
         self._stages.run(MOUTH, {"fit": fit.key}, make_mouths)
-        return result["overlaps"]
+        return result["overlaps"], Outline(*result["outline"])
 
     def overlay(self, fit: Fit, look: Look) -> None:
         def read(number: int) -> FrameParts:

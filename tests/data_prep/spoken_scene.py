@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from avatar.demo.identity import sample_identity
+from avatar.demo.motion import Motion as Performed
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import RenderedFrame, render_frame
 from avatar.head.assets import HeadAssets, load_head_assets
@@ -47,10 +48,10 @@ class Scene:
         return 100 * float(np.linalg.norm(residual - residual.mean(0), axis=-1).mean()) / self.eyes
 
 
-def spoken_scene(head_model: Path, frames: int) -> Scene:
+def spoken_scene(head_model: Path, frames: int, motion: Performed = "speech") -> Scene:
     assets = load_head_assets(head_model)
     head = HeadModel(assets, torch.from_numpy(sample_identity(SEED).shape).float())
-    performance, rng = perform(SEED, 40, "speech"), np.random.default_rng(0)
+    performance, rng = perform(SEED, max(frames, 40), motion), np.random.default_rng(0)
     face = assets.regions["face"].numpy()
     chosen = rng.choice(face, len(FEATURES), replace=False)
     embedding = LandmarkEmbedding(

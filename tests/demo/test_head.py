@@ -180,6 +180,15 @@ def test_tracked_head_holds_no_teeth(head: DemoHead, model: HeadModel) -> None:
     assert raster.depth[size // 2, size // 2] > 1.0, "something is behind the lips and before the middle of the head"
 
 
+def test_the_eyes_go_to_their_limits() -> None:
+    p = perform(3, 80, "gaze")
+    left, down = np.degrees(p.gaze).T
+    is_open = p.eyelids.max(1) < 0.1
+    assert left.max() > 30 and left.min() < -30 and down.min() < -20, "corners and up"
+    assert ((down > 18) & (np.abs(left) < 5) & is_open).any(), "down with open lids"
+    assert ((p.eyelids > 0.95) & (p.eyelids[:, ::-1] < 0.05)).any(0).all(), "both winks"
+
+
 @pytest.mark.parametrize("motion", ["speech", "turn"])
 def test_motion_is_smooth_and_of_human_size(motion) -> None:
     p = perform(3, 500, motion)

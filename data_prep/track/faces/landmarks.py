@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
@@ -27,6 +27,7 @@ BLENDSHAPES = (
 )  # fmt: skip
 """Columns of the scores, in the order in which MediaPipe's Face Landmarker gives them."""
 
+CLOSED_SCORE = 0.6  # of eyeBlink: closed eyes have this or a little more
 _MAX_FRAMES = 1_000_000
 
 
@@ -46,6 +47,11 @@ class Landmarks:
     def score(self, name: str) -> Float32[np.ndarray, " T"]:
         """One blendshape's scores. Raises ValueError for a name that is not in `BLENDSHAPES`."""
         return self.scores[:, BLENDSHAPES.index(name)]
+
+    def open_shares(self) -> Float[np.ndarray, "T 2"]:
+        """How far the left and the right eye are open, 0 to 1, by their scores."""
+        blinks = np.stack((self.score("eyeBlinkLeft"), self.score("eyeBlinkRight")), axis=1).astype(np.float64)
+        return (1.0 - blinks / CLOSED_SCORE).clip(0, 1)
 
 
 def save_landmarks(path: Path, landmarks: Landmarks) -> None:

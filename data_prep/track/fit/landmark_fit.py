@@ -34,7 +34,7 @@ ROBUST, ROBUST_PAIRS = 4.0, 3.0  # scale of the loss, in those deviations
 FEATURE_WEIGHTS = {groups.LIPS: 1.3, groups.LIDS: 1.3, groups.BROWS: 0.6, groups.NOSE: 1.0}
 OTHER_WEIGHT = 0.12  # of landmarks between the features
 OTHER_DISTANCE = 0.16  # in distances between the eyes: nearer than that to lips, lids or brows they are biased
-IRIS_WEIGHT = 4.0
+IRIS_WEIGHT = 20.0  # enough that neither the tie between the eyes nor smoothness keeps an iris from its landmark
 PAIR_WEIGHT = 2.0
 IDENTITIES = 100  # coefficients that are fitted; the others add less than landmarks can tell
 # The clip tells as much about the identity as this many independent frames: landmarks err alike in all frames, and near
@@ -127,8 +127,7 @@ def weighted_landmarks(
 def faded(weights: Float[Tensor, " L"], landmarks: Int[np.ndarray, " L"], seen: Landmarks) -> Float[Tensor, "T L"]:
     """The weights in each frame of `seen`: an iris counts as far as its eye is open."""
     by_frame = weights.expand(len(seen), -1).clone()
-    for iris, blink in ((groups.LEFT_IRIS, "eyeBlinkLeft"), (groups.RIGHT_IRIS, "eyeBlinkRight")):
-        open_share = (1.0 - seen.score(blink).astype(np.float64)).clip(0, 1)
+    for iris, open_share in zip(groups.IRISES, seen.open_shares().T, strict=True):
         by_frame[:, landmarks == iris] *= torch.from_numpy(open_share[:, None] ** 2)
     return by_frame
 
@@ -142,7 +141,7 @@ def _landmark_weights(assets: HeadAssets, embedding: LandmarkEmbedding) -> np.nd
         weights[distance < OTHER_DISTANCE * eye_distance(assets)] = 0.0
     for group, weight in FEATURE_WEIGHTS.items():
         weights[np.isin(embedding.landmarks, group)] = weight
-    weights[np.isin(embedding.landmarks, (groups.LEFT_IRIS, groups.RIGHT_IRIS))] = IRIS_WEIGHT
+    weights[np.isin(embedding.landmarks, groups.IRISES)] = IRIS_WEIGHT
     return weights
 
 

@@ -36,7 +36,7 @@ BLURS = (3.0, 1.2)  # per cent of the distance between the eyes
 NEAR_LIPS = 0.25  # distances between the eyes
 ROUNDS, ITERATIONS = 6, 1  # textures for each blur, and steps for each texture: it lags behind the motion
 COARSE_SHARE = 2  # of the fitted points one of so many counts at the first blur, where neighbours say the same
-LANDMARK_SHARE, FEATURE_SHARE = 0.05, 0.2  # of the landmarks' weights that stay; of lips, lids, irises and distances
+LANDMARK_SHARE, FEATURE_SHARE = 0.05, 0.2  # of the landmarks' weights that stay; of lips, lids and distances
 HELD_OUT = 5  # one point of so many
 # dB that the held-out points must gain. On six demo people whose motion is known (120 frames) the error of the face's
 # vertices, without what is the same in all frames, fell to 0.39 to 0.53 of what it was, at gains from 2.0 to 3.3 dB.
@@ -154,14 +154,14 @@ def _boxes(points: SurfacePoints, identity: Tensor, motion: Motion, camera: Pinh
 
 
 def _quieter(term: LandmarkTerm) -> LandmarkTerm:
-    """The landmarks as an anchor. What the skin says little about keeps more of its weight.
+    """The landmarks as an anchor. What the skin says little about keeps more of its weight, and the irises all of it.
 
     Landmarks between the features would have a fifth of all weight and two thirds of the time: they are left out.
     """
-    irises = (groups.LEFT_IRIS, groups.RIGHT_IRIS)
-    term = term.of(torch.from_numpy(np.flatnonzero(np.isin(term.landmarks, groups.FEATURES + irises))))
-    is_feature = torch.from_numpy(np.isin(term.landmarks, groups.LIPS + groups.LIDS + irises))
-    share = torch.where(is_feature, FEATURE_SHARE, LANDMARK_SHARE)
+    term = term.of(torch.from_numpy(np.flatnonzero(np.isin(term.landmarks, groups.FEATURES + groups.IRISES))))
+    is_feature = torch.from_numpy(np.isin(term.landmarks, groups.LIPS + groups.LIDS))
+    is_iris = torch.from_numpy(np.isin(term.landmarks, groups.IRISES))
+    share = torch.where(is_iris, 1.0, torch.where(is_feature, FEATURE_SHARE, LANDMARK_SHARE))
     return replace(term, weights=term.weights * share, pair_weights=term.pair_weights * FEATURE_SHARE)
 
 

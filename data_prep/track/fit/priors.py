@@ -23,7 +23,8 @@ EYELID_DEVIATION = 0.25
 JAW_PER_SCORE = 0.3  # radians that jawOpen = 1 stands for
 JAW_DEVIATION = (0.15, 0.05, 0.03)  # radians: opening, to the sides, tilted
 GAZE_DEVIATION = 0.35  # radians
-EYES_TIED = (0.05, 0.03)  # radians between the eyes: yaw (they converge), pitch
+# Radians between the eyes, yaw and pitch. Half of it leaves the irises no way to follow but to roll and move the head.
+EYES_TIED = (0.1, 0.1)
 BOX = (-0.15, 1.25)  # of coefficients that go from 0 to 1, and of eyelids
 BOX_DEVIATION = 0.05  # how far outside
 

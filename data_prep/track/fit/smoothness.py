@@ -16,8 +16,8 @@ from data_prep.track.fit.normal_equations import NormalEquations
 
 NOMINAL_FPS = 25.0
 POSE_SECOND = (0.6e-3, 0.6e-3, 1.2e-3)  # metres, of four points on the head along the camera's axes
-EXPRESSION_BOTH, JAW_BOTH, GAZE_BOTH = 0.06, 0.02, 0.06  # of first and of second differences
-EYELIDS_FIRST = 0.3  # lids move fast: first differences only
+EXPRESSION_BOTH, JAW_BOTH = 0.06, 0.02  # of first and of second differences
+GAZE_FIRST, EYELIDS_FIRST = 0.15, 0.3  # eyes and lids move fast: first differences only
 
 
 @dataclass(frozen=True)
@@ -103,17 +103,17 @@ def make_smoothness(
     slower = NOMINAL_FPS / fps
     C = Columns.EXPRESSION.start - Columns.HEAD.start + expressions
     both = torch.empty(C, dtype=torch.float64)
-    lids = slice(Columns.EYELIDS.start - Columns.HEAD.start, Columns.EYELIDS.stop - Columns.HEAD.start)
+    fast = slice(Columns.GAZE.start - Columns.HEAD.start, Columns.EYELIDS.stop - Columns.HEAD.start)
     for columns, deviation in (
         (Columns.JAW, JAW_BOTH),
-        (Columns.GAZE, GAZE_BOTH),
+        (Columns.GAZE, GAZE_FIRST),
         (Columns.EYELIDS, EYELIDS_FIRST),
         (Columns.EXPRESSION, EXPRESSION_BOTH * (3.0 if statistical else 1.0)),
     ):
         stop = None if columns.stop is None else columns.stop - Columns.HEAD.start
         both[columns.start - Columns.HEAD.start : stop] = deviation
     first, second = both.pow(-2) / slower, both.pow(-2) / slower**3
-    second[lids] = 0.0
+    second[fast] = 0.0
     follows = torch.zeros(len(frames), dtype=torch.float64)
     follows[1:] = (frames.diff() == 1).double()
     pose = 1.0 / (torch.tensor(POSE_SECOND, dtype=torch.float64) * slower**1.5)

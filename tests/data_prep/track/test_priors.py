@@ -9,7 +9,7 @@ from heads import EXPRESSIONS, grid_head
 
 from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.landmark_groups import LEFT_IRIS, RIGHT_IRIS
-from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.faces.landmarks import BLENDSHAPES, CLOSED_SCORE, NUM_POINTS, Landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.landmark_fit import faded, point_units
 from data_prep.track.fit.motion import Columns
@@ -53,9 +53,8 @@ def test_blendshapes_stay_in_their_box(statistical: bool) -> None:
 
 def test_an_iris_counts_as_far_as_its_eye_is_open() -> None:
     landmarks = np.array([4, LEFT_IRIS, RIGHT_IRIS])
-    found = faded(
-        torch.tensor([1.0, 4.0, 4.0], dtype=torch.float64), landmarks, seen(eyeBlinkLeft=1.0, eyeBlinkRight=0.5)
-    )
+    winking = seen(eyeBlinkLeft=CLOSED_SCORE, eyeBlinkRight=CLOSED_SCORE / 2)
+    found = faded(torch.tensor([1.0, 4.0, 4.0], dtype=torch.float64), landmarks, winking)
     assert found.tolist() == [[1.0, 4.0, 4.0], [1.0, 0.0, pytest.approx(1.0)]]
 
 

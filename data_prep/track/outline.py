@@ -1,0 +1,81 @@
+"""How steady a clip's mattes are: how far the head's outline moves from frame to frame in coordinates that move with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+_FRAMES = 100  # that are looked at, at most, spread over the clip
+_SIDE = 512  # pixels of the longer side, in which distances are given
+_BESIDE, _ABOVE = 0.5, 0.5  # of the height of the mesh without its neck, beyond it: what is looked at
+_SIX = np.sqrt(6.0)  # a second difference of independent errors has six times their variance
+
+
+class Outline(NamedTuple):
+    """Pixels at a longer side of 512; NaN where no three frames follow each other."""
+
+    jitter: (
+        float  # mean over some frames: the area in which the matte's second difference lies, over the outline's length
+    )
+    width: float  # of the matte's soft edge
+
+
+def measure_outline(
+    numbers: Sequence[int],
+    matte_of: Callable[[int], UInt8[np.ndarray, "H W"]],
+    points_of: Callable[[int], Float[np.ndarray, "P 2"]],
+) -> Outline:
+    """The outline of the head above the chin.
+
+    points_of  the posed vertices of the head without the neck, pixels: their similarity transform brings a frame's
+               neighbours into its own coordinates
+    """
+    known = set(numbers)
+    middles = [number for number in numbers if {number - 1, number + 1} <= known]
+    jitter, width = [], []
+    for number in middles[:: -(-len(middles) // _FRAMES) or 1]:
+        now, at = _share(matte_of(number)), points_of(number)
+        moved = [
+            _warped(_share(matte_of(beside)), _similarity(points_of(beside), at)) for beside in (number - 1, number + 1)
+        ]
+        region = _about_head(at, *now.shape)
+        slope = np.hypot(*np.gradient(cv2.GaussianBlur(now, (0, 0), 1.0)))
+        length = max(float(slope[region].sum()), 1.0)  # of the line where the matte is half
+        scale = _SIDE / max(now.shape) / length
+        jitter.append(np.abs(moved[0] - 2.0 * now + moved[1])[region].sum() * scale / _SIX)
+        width.append(4.0 * (now * (1.0 - now))[region].sum() * scale)
+    return Outline(float(np.mean(jitter)), float(np.mean(width))) if jitter else Outline(np.nan, np.nan)
+
+
+def _share(matte: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    return matte.astype(np.float32) / 255.0
+
+
+def _similarity(points: Float[np.ndarray, "P 2"], to: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "2 3"]:
+    """The least-squares rotation, scale and shift of `points` to `to`."""
+    z, w = points @ (1.0, 1.0j), to @ (1.0, 1.0j)
+    a = np.vdot(z - z.mean(), w - w.mean()) / max(np.vdot(z - z.mean(), z - z.mean()).real, 1e-9)
+    b = w.mean() - a * z.mean()
+    return np.array([[a.real, -a.imag, b.real], [a.imag, a.real, b.imag]])
+
+
+def _warped(matte: Float32[np.ndarray, "H W"], by: Float[np.ndarray, "2 3"]) -> Float32[np.ndarray, "H W"]:
+    """Pixel centres lie at +0.5 in points, at whole numbers for OpenCV."""
+    by = by.copy()
+    by[:, 2] += 0.5 * by[:, :2].sum(axis=1) - 0.5
+    size = matte.shape[1], matte.shape[0]
+    return cv2.warpAffine(matte, by, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _about_head(points: Float[np.ndarray, "P 2"], height: int, width: int) -> Bool[np.ndarray, "H W"]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    side = high[1] - low[1]
+    inside = np.zeros((height, width), bool)
+    rows = np.clip([low[1] - _ABOVE * side, high[1]], 0, height).astype(int)
+    columns = np.clip([low[0] - _BESIDE * side, high[0] + _BESIDE * side], 0, width).astype(int)
+    inside[rows[0] : rows[1], columns[0] : columns[1]] = True
+    return inside
