@@ -62,7 +62,7 @@ class TurningSkin:
         self._mean = points.positions(torch.zeros_like(fit.identity), first)[0]  # [N, 3]
         units = torch.eye(len(fit.identity), dtype=torch.float64)
         self._directions = torch.stack([points.positions(unit, first)[0] - self._mean for unit in units], dim=-1)
-        normals = (vertex_normals(assets.template.double(), assets.faces)[self._corners] * self._barycentric[..., None])
+        normals = vertex_normals(assets.template.double(), assets.faces)[self._corners] * self._barycentric[..., None]
         self._normals = torch.nn.functional.normalize(normals.sum(1), dim=-1)
         self._fit = replace(fit, motion=constant)
         self.start = Adjusted(camera, constant.R, constant.t, fit.identity, self._mean.new_zeros(len(self._mean)))
