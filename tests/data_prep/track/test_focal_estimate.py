@@ -93,7 +93,7 @@ def test_a_turning_head_tells_the_focal_length(
 
 
 def test_a_head_that_does_not_turn_does_not_tell_it(assets: HeadAssets, embedding: LandmarkEmbedding) -> None:
-    with pytest.raises(NotTold, match="the head turns by [0-9]+ degrees, and 20 are needed"):
+    with pytest.raises(NotTold, match="the head turns by [0-9]+ degrees, and 40 are needed"):
         estimate_focal(assets, embedding, clip_of(assets, embedding, "speech")[0])
 
 
@@ -152,7 +152,7 @@ def test_the_estimate_is_taken_with_its_uncertainty_and_kept(ask: Callable[..., 
 
 def test_the_assumption_stays_where_the_clip_does_not_tell(ask: Callable[..., Focal]) -> None:
     def refuse(*_: object) -> None:
-        raise NotTold("the head turns by 7 degrees, and 20 are needed")
+        raise NotTold("the head turns by 7 degrees, and 40 are needed")
 
     focal = ask(refuse)
     assert focal.pixels == 800.0 and focal.is_assumed
