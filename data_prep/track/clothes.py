@@ -51,6 +51,7 @@ class Mixture(NamedTuple):
 class Colours(NamedTuple):
     head: tuple[Mixture, ...]  # of the face, of the neck, of hair
     clothes: Mixture
+    hair_is_long: bool  # it may fall on the neck and the shoulders
     likelier: float = 0.0  # log odds of clothes at which both are as probable
 
     def odds(self, colours: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
@@ -81,8 +82,10 @@ def learn_colours(clip: Iterable[Zones]) -> Colours | None:
     of_face, of_neck, of_clothes = (_mixture(np.concatenate(parts)) for parts in (face, neck, clothes))
     if of_face is None or of_clothes is None:
         return None
-    of_hair = _mixture(np.concatenate(hair)) if np.median(beside_neck) > _LONG_HAIR else None
-    colours = Colours(tuple(each for each in (of_face, of_neck, of_hair) if each is not None), of_clothes)
+    hair_is_long = bool(np.median(beside_neck) > _LONG_HAIR)
+    of_hair = _mixture(np.concatenate(hair)) if hair_is_long else None
+    head = tuple(each for each in (of_face, of_neck, of_hair) if each is not None)
+    colours = Colours(head, of_clothes, hair_is_long)
     of_most = np.quantile(colours.odds(np.concatenate(clothes)), 1.0 - _PURE)
     return colours._replace(likelier=float(np.clip(0.5 * of_most, *_LIKELIER)))
 

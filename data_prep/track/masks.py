@@ -64,7 +64,9 @@ def head_mask(
     height, width = matte.shape
     person, inside, outside, level = zones.person, zones.inside, zones.outside, zones.level
     beside = cv2.dilate(zones.body.astype(np.uint8), np.ones((_REACH, _REACH), np.uint8)) > 0
-    clothes = (level < _SURELY_CLOTHES) | (~beside & (level < _CLOTHES_BESIDE))
+    # Far beside the neck there is nothing of the head but long hair: hands have the colours of skin.
+    is_short = colours is not None and not colours.hair_is_long
+    clothes = (level < _SURELY_CLOTHES) | (~beside & (level < (_MAYBE_BESIDE if is_short else _CLOTHES_BESIDE)))
     sure = (inside & (level > np.where(zones.aside < _MIDDLE, _SURELY_HEAD, _COLLAR))) | (level > _ALL_HEAD)
     sure |= beside & (level > _MAYBE_BESIDE)
     unsure = person & ~clothes & ~sure
