@@ -4,7 +4,6 @@ look     by how much the pictures are turned, every picture's faces; one person,
 frames   the crop of every picture with the face
 matte    the person against the background
 despilled  the frames again, where the background's colours have run into the person
-focal    the focal length, where nothing else gives it and the clip tells it
 fit      identity, and pose and expression of every frame: by landmarks, then by pictures where that gains
 head     head and neck without clothes
 mouth    the lips and what is between them
@@ -97,7 +96,7 @@ def track(
         for note in look.notes:
             say(f"note: {note}")
         view, focal = work.view_and_focal(look)
-        say(_focal_words(focal) + _crop_words(view, footage))
+        say(f"focal length {focal.pixels:.0f} pixels of the video, {focal.source}" + _crop_words(view, footage))
         landmarks = in_view(look.landmarks, view)
         frames_key = work.frames(look, view, [seen, options])
         without, matte_key = work.mattes(look, view, mattes, network, frames_key, options)
@@ -109,9 +108,6 @@ def track(
         for note in outline_notes:
             say(f"note: {note}")
         notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
-        if focal.is_assumed:
-            focal = work.focal(landmarks, focal, _camera(focal, view, footage), head_path, [frames_key, matte_key])
-            say(_focal_words(focal))
         fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
         overlaps, outline = work.masks(landmarks, fit)
         work.overlay(fit, look)
@@ -142,9 +138,9 @@ def track(
         )
         write_tracking(stages.path, info, fit.tracks)
         if spill:
-            stages.finish(out, ("look", "focal", "fit"), {DESPILLED: FRAMES}, seal)
+            stages.finish(out, ("look", "fit"), {DESPILLED: FRAMES}, seal)
         else:
-            stages.finish(out, ("look", "focal", "fit", DESPILLED), seal=seal)
+            stages.finish(out, ("look", "fit", DESPILLED), seal=seal)
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
 
@@ -183,10 +179,6 @@ def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, f
     """fx, fy, cx, cy in pixels of the view; the principal point is the middle of the source picture."""
     centre = view.to_view(footage.width / 2, footage.height / 2)
     return focal.pixels * view.width / view.box.width, focal.pixels * view.height / view.box.height, *centre
-
-
-def _focal_words(focal: Focal) -> str:
-    return f"focal length {focal.pixels:.0f} pixels of the video, {focal.source}"
 
 
 def _left_out(look: Look) -> dict[int, str]:

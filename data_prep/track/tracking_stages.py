@@ -18,9 +18,8 @@ from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.first_pass import Look
-from data_prep.track.fit.fitting import find_embedding, fit_tracks
-from data_prep.track.fit.focal import Focal, choose_focal, estimated
-from data_prep.track.fit.focal_estimate import NotTold, estimate_focal
+from data_prep.track.fit.fitting import fit_tracks
+from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Box, Footage, Span, View
@@ -156,31 +155,6 @@ class TrackingStages:
             "fit", {"of": inputs, "head": head_inputs(head_path, self._head), "camera": list(intrinsics)}, make
         )
         return Fit.load(self._folder / "fit" / TRACKS_FILE, intrinsics, landmarks.size, figures, key)
-
-    def focal(
-        self,
-        landmarks: Landmarks,
-        assumed: Focal,
-        intrinsics: tuple[float, float, float, float],
-        head_path: Path,
-        inputs: list[Any],
-    ) -> Focal:
-        """The focal length by the clip where that tells it; `intrinsics` are those of the assumed one."""
-
-        def make(_: Path) -> dict[str, Any]:
-            clip = Clip(landmarks, intrinsics, self._image, self._mask)
-            try:
-                share, uncertainty = estimate_focal(self._head, find_embedding(head_path, self._head), clip)
-            except NotTold as why:
-                return {"why": str(why)}
-            return {"share": share, "uncertainty": uncertainty}
-
-        result, _ = self._stages.run(
-            "focal", {"of": inputs, "head": head_inputs(head_path, self._head), "camera": list(intrinsics)}, make
-        )
-        if "why" in result:
-            return assumed._replace(source=f"{assumed.source}; the clip does not tell it: {result['why']}")
-        return estimated(assumed.pixels * result["share"], result["uncertainty"])
 
     def masks(self, landmarks: Landmarks, fit: Fit) -> tuple[list[float], Outline]:
         """Writes head and mouth masks; returns how much of the mesh lies on the matte, by frame, and the outline."""

@@ -1,4 +1,4 @@
-"""The camera's focal length: given, from the video's metadata, or assumed until the clip tells it (`focal_estimate`)."""
+"""The camera's focal length: given, from the video's metadata, or assumed. Landmarks cannot tell it."""
 
 from __future__ import annotations
 
@@ -59,8 +59,3 @@ def choose_focal(
         if NEAREST * per_metre > pixels:
             pixels, words = CROPPED * per_metre, f"assumed: the face is {CROPPED:g} m away"
     return Focal(pixels, words, True)
-
-
-def estimated(pixels: float, uncertainty: float) -> Focal:
-    """A focal length that the clip told, with its relative uncertainty."""
-    return Focal(pixels, f"estimated from the turning head (± {uncertainty * pixels:.0f} pixels)", False)

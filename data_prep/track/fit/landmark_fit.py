@@ -65,7 +65,7 @@ def fit_landmarks(
     expressions, statistical = used_expressions(assets), is_statistical(assets)
     identities = min(IDENTITIES, _last_used(assets.shape_dirs) + 1)
     term = make_landmark_term(assets, embedding, seen, camera, identities, expressions)
-    R, t = rigid_poses(assets, embedding, seen.points, camera)
+    R, t = _start(assets, embedding, seen, camera)
     term = _with_unit(term, assets, camera, t)
     priors = make_priors(seen, names, expressions, statistical)
     smoothness = make_smoothness(assets, torch.from_numpy(frames), landmarks.fps, len(expressions), statistical)
@@ -151,13 +151,11 @@ def eye_distance(assets: HeadAssets) -> float:
     return float((eyes[0] - eyes[1]).norm())
 
 
-def rigid_poses(
-    assets: HeadAssets, embedding: LandmarkEmbedding, points: Float[np.ndarray, "T 478 3"], camera: Pinhole
-) -> tuple[Tensor, Tensor]:
-    """Poses by the landmarks of the generic head that the mouth does not move: R [T, 3, 3] and t [T, 3]."""
+def _start(assets: HeadAssets, embedding: LandmarkEmbedding, seen: Landmarks, camera: Pinhole) -> tuple[Tensor, Tensor]:
+    """Poses by the landmarks of the generic head that the mouth does not move."""
     rigid = is_rigid(embedding.landmarks)
     at = (assets.template.double().numpy()[embedding.corners[rigid]] * embedding.barycentric[rigid, :, None]).sum(1)
-    return start_poses(at, points[:, embedding.landmarks[rigid], :2], camera)
+    return start_poses(at, seen.points[:, embedding.landmarks[rigid], :2], camera)
 
 
 def is_rigid(landmarks: Int[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:

@@ -65,10 +65,10 @@ def fit_pictures(
     is_held = number % HELD_OUT == HELD_OUT // 2
     eyes = float(start.term.unit.mean()) / POINT_SHARE  # pixels of the frames
     points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
-    boxes = boxes_of(points, start.identity, motion, camera)
+    boxes = _boxes(points, start.identity, motion, camera)
     frames = progress(start.frames.tolist(), T, "reading faces")
     crops = cut_out(images, mattes, frames, boxes, min(1.0, EYES_IN_CROPS / eyes))
-    skin = Skin(assets, corners, barycentric, camera, crops, start)
+    skin = _Skin(assets, corners, barycentric, camera, crops, start)
     held, compared_at = skin.subset(is_held), dict.fromkeys(BLURS, ~is_held)
     compared_at[BLURS[0]] = ~is_held & (number % COARSE_SHARE == 0)
     on_mouth = _near_lips(assets, start, points)
@@ -90,7 +90,7 @@ def fit_pictures(
         own = weights[:, compared_at[blur]]
         values = seen.at(start.identity, motion)
         wanted = lit_texture(values, own, compared.basis).values(compared.basis)
-        own = own * torch.where(on_mouth[compared_at[blur]], 1.0, trust(values - wanted, own))
+        own = own * torch.where(on_mouth[compared_at[blur]], 1.0, _trust(values - wanted, own))
         term = PhotometricTerm(seen, wanted, own)
         motion = minimise((term, *terms), start.identity, motion, ITERATIONS).motion
     assert blurred is not None
@@ -100,7 +100,7 @@ def fit_pictures(
     return done if done.is_taken else replace(done, motion=start.motion)
 
 
-class Skin:
+class _Skin:
     """Points of the skin in the pictures."""
 
     def __init__(
@@ -117,9 +117,9 @@ class Skin:
         self.points = SurfacePoints(assets, corners, barycentric, len(start.identity), start.expressions)
         self.basis = light_basis(assets, corners, barycentric)
 
-    def subset(self, chosen: Tensor) -> Skin:
+    def subset(self, chosen: Tensor) -> _Skin:
         assets, camera, crops, start = self._of
-        return Skin(assets, self._corners[chosen], self._barycentric[chosen], camera, crops, start)
+        return _Skin(assets, self._corners[chosen], self._barycentric[chosen], camera, crops, start)
 
     def values(self, images: BlurredCrops, motion: Motion) -> Float[Tensor, "T N"]:
         _, camera, _, start = self._of
@@ -145,7 +145,7 @@ class Skin:
         return torch.from_numpy(np.concatenate(over_chunks(of, len(motion), _FRAMES_AT_ONCE)))
 
 
-def boxes_of(points: SurfacePoints, identity: Tensor, motion: Motion, camera: Pinhole) -> Float[np.ndarray, "T 4"]:
+def _boxes(points: SurfacePoints, identity: Tensor, motion: Motion, camera: Pinhole) -> Float[np.ndarray, "T 4"]:
     def of(chunk: slice) -> Tensor:
         at = camera.project(to_camera(motion[chunk], points.positions(identity, motion[chunk])))
         return torch.cat((at.amin(1), at.amax(1)), dim=1)
@@ -185,7 +185,7 @@ def _mean_squares(residuals: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]
     return (weights * residuals**2).sum(0) / weights.sum(0).clamp(min=1e-9)
 
 
-def trust(residuals: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]) -> Float[Tensor, " N"]:
+def _trust(residuals: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]) -> Float[Tensor, " N"]:
     """Weights of the points by how well they keep their colour: 1 for the better half, less for glasses, hair and gloss.
 
     These stand off the skin, and move otherwise than it.

@@ -8,7 +8,6 @@ from marked_face import MarkDetector
 
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.track import track as tracking
-from data_prep.track.fit.focal_estimate import NotTold
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.quality import Quality
 
@@ -23,13 +22,8 @@ def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
         made = FrameTrack(**one, R=np.eye(3), intrinsics=np.array(clip.intrinsics), size=clip.landmarks.size)
         return Fit(dict.fromkeys(np.flatnonzero(clip.landmarks.detected).tolist(), made), {})
 
-    def not_told(*_: object) -> tuple[float, float]:
-        raise NotTold("no fit")
-
     for module in ("upright", "first_pass"):
         monkeypatch.setattr(f"data_prep.track.{module}.FaceDetector", MarkDetector)
-    monkeypatch.setattr("data_prep.track.tracking_stages.find_embedding", lambda *_: None)
-    monkeypatch.setattr("data_prep.track.tracking_stages.estimate_focal", not_told)
     monkeypatch.setattr("data_prep.track.tracking_stages.fit_tracks", fitted)
     monkeypatch.setattr(tracking.TrackingStages, "masks", lambda *_: [1.0])
     monkeypatch.setattr(tracking.TrackingStages, "overlay", lambda *_: None)

@@ -104,10 +104,10 @@ def test_points_that_do_not_keep_their_colour_count_little() -> None:
     spread = torch.tensor([0.01, 0.02, 0.02, 0.2, 0.04], dtype=torch.float64)
     residuals = spread * torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=torch.float64)[:, None]
     weights = torch.ones(4, 5, dtype=torch.float64)
-    kept = photometric_fit.trust(residuals, weights)
-    torch.testing.assert_close(kept, torch.tensor([1.0, 1.0, 1.0, 0.01, 0.25], dtype=torch.float64))
+    trust = photometric_fit._trust(residuals, weights)
+    torch.testing.assert_close(trust, torch.tensor([1.0, 1.0, 1.0, 0.01, 0.25], dtype=torch.float64))
     weights[:, 4] = 0.0  # points that nobody sees do not shift the middle
-    assert photometric_fit.trust(residuals, weights)[3] == pytest.approx(0.01)
+    assert photometric_fit._trust(residuals, weights)[3] == pytest.approx(0.01)
 
 
 def test_points_at_the_mouth_are_told(scene: Fitted) -> None:
@@ -142,13 +142,13 @@ def test_one_bad_point_does_not_decide_what_is_taken() -> None:
 
 def test_points_that_judge_the_fit_are_not_fitted_to(scene: Fitted, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[torch.Tensor] = []
-    own = photometric_fit.Skin.subset
+    own = photometric_fit._Skin.subset
 
     def subset(self: object, which: torch.Tensor) -> object:
         chosen.append(which)
         return own(self, which)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(photometric_fit.Skin, "subset", subset)
+    monkeypatch.setattr(photometric_fit._Skin, "subset", subset)
     monkeypatch.setattr(photometric_fit, "ROUNDS", 1)
     monkeypatch.setattr(photometric_fit, "minimise", lambda terms, identity, motion, *_, **__: Fitting(motion))
     fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *pictures_of(scene), silent)
