@@ -12,15 +12,13 @@ from jaxtyping import Bool, Float, Float32, UInt8
 _FRAMES = 100  # that are looked at, at most, spread over the clip
 _SIDE = 512  # pixels of the longer side, in which distances are given
 _BESIDE, _ABOVE = 0.5, 0.5  # of the height of the mesh without its neck, beyond it: what is looked at
-_SIX = np.sqrt(6.0)  # a second difference of independent errors has six times their variance
+_SECOND = np.sqrt(6.0)  # deviation of a second difference of independent errors of deviation 1
 
 
 class Outline(NamedTuple):
-    """Pixels at a longer side of 512; NaN where no three frames follow each other."""
+    """Means over frames, in pixels at a longer side of 512."""
 
-    jitter: (
-        float  # mean over some frames: the area in which the matte's second difference lies, over the outline's length
-    )
+    jitter: float  # sum of the matte's absolute second difference over time, divided by the outline's length
     width: float  # of the matte's soft edge
 
 
@@ -28,8 +26,8 @@ def measure_outline(
     numbers: Sequence[int],
     matte_of: Callable[[int], UInt8[np.ndarray, "H W"]],
     points_of: Callable[[int], Float[np.ndarray, "P 2"]],
-) -> Outline:
-    """The outline of the head above the chin.
+) -> Outline | None:
+    """The outline of the head above the chin; None where no three frames follow each other.
 
     points_of  the posed vertices of the head without the neck, pixels: their similarity transform brings a frame's
                neighbours into its own coordinates
@@ -46,9 +44,9 @@ def measure_outline(
         slope = np.hypot(*np.gradient(cv2.GaussianBlur(now, (0, 0), 1.0)))
         length = max(float(slope[region].sum()), 1.0)  # of the line where the matte is half
         scale = _SIDE / max(now.shape) / length
-        jitter.append(np.abs(moved[0] - 2.0 * now + moved[1])[region].sum() * scale / _SIX)
+        jitter.append(np.abs(moved[0] - 2.0 * now + moved[1])[region].sum() * scale / _SECOND)
         width.append(4.0 * (now * (1.0 - now))[region].sum() * scale)
-    return Outline(float(np.mean(jitter)), float(np.mean(width))) if jitter else Outline(np.nan, np.nan)
+    return Outline(float(np.mean(jitter)), float(np.mean(width))) if jitter else None
 
 
 def _share(matte: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:

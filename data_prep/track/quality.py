@@ -70,7 +70,7 @@ class Quality:
         return {"figures": figures, "worst_frames": list(self.worst_frames), "focal": self.focal}
 
 
-def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline, focal: Focal) -> Quality:
+def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline | None, focal: Focal) -> Quality:
     """The figures of a finished tracking. `fit.figures` holds what `landmark_figures` made of it."""
     own = fit.figures
     shots = {name: float(value) for name, value in own["errors"].items()}
@@ -86,11 +86,7 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Ou
             "mesh above the neck on the matte", 100 * float(np.mean(overlaps)), "%", 98, 95,
             "look at overlay/: is the matte whole, and the head in its place?", True,
         ),
-        Figure(
-            "jitter of the outline, at 512", outline.jitter, "px", 0.5, 1.0,
-            "light the background evenly, or give mattes with --matte",
-        ),
-        Figure("width of the matte's edge, at 512", outline.width, "px"),
+        *_of_outline(outline),
         Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
     ]  # fmt: skip
     figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
@@ -101,6 +97,16 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Ou
 def _irises(value: float | None) -> list[Figure]:
     advice = "the gaze does not follow: more light on the eyes, and a larger face"
     return [] if value is None else [Figure("irises of open eyes, 90 %", value, "% eyes", 1.0, 2.0, advice)]
+
+
+def _of_outline(outline: Outline | None) -> list[Figure]:
+    if outline is None:
+        return []
+    advice = "light the background evenly, or give mattes with --matte"
+    return [
+        Figure("jitter of the outline, at 512", outline.jitter, "px", 0.5, 1.0, advice),
+        Figure("width of the matte's edge, at 512", outline.width, "px"),
+    ]
 
 
 def coverage(fit: Fit, landmarks: Landmarks) -> list[Figure]:

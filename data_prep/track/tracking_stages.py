@@ -156,7 +156,7 @@ class TrackingStages:
         )
         return Fit.load(self._folder / "fit" / TRACKS_FILE, intrinsics, landmarks.size, figures, key)
 
-    def masks(self, landmarks: Landmarks, fit: Fit) -> tuple[list[float], Outline]:
+    def masks(self, landmarks: Landmarks, fit: Fit) -> tuple[list[float], Outline | None]:
         """Writes head and mouth masks; returns how much of the mesh lies on the matte, by frame, and the outline."""
         numbers = list(fit.tracks)
 
@@ -189,7 +189,7 @@ class TrackingStages:
 
         result, _ = self._stages.run(HEAD, {"fit": fit.key}, make_heads)
         self._stages.run(MOUTH, {"fit": fit.key}, make_mouths)
-        return result["overlaps"], Outline(*result["outline"])
+        return result["overlaps"], result["outline"] and Outline(*result["outline"])
 
     def overlay(self, fit: Fit, look: Look) -> None:
         def read(number: int) -> FrameParts:
