@@ -233,7 +233,7 @@ def test_picture_scales_with_the_size() -> None:
         ({"size": 32}, "size must be from 64 to 1024, not 32"),
         ({"size": 4096}, "size must be from 64 to 1024, not 4096"),
         ({"seed": -1}, "seed must be from 0 to 4294967295, not -1"),
-        ({"motion": "dance"}, "motion must be one of speech, turn, not 'dance'"),
+        ({"motion": "dance"}, "motion must be one of speech, turn, gaze, not 'dance'"),
     ],
 )
 def test_values_out_of_range_are_said_before_anything_is_written(tmp_path: Path, arguments: dict, says: str) -> None:
