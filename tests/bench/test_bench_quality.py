@@ -19,6 +19,8 @@ from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
 from avatar.pipeline.open import open_run
 
+pytestmark = pytest.mark.slow
+
 ANY = Time(1.0, 1.0, 1)
 
 

@@ -15,6 +15,8 @@ from avatar.render import Renderer
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -18,6 +18,8 @@ from avatar.errors import UserError
 from avatar.splat.scenes import head_shell
 from avatar.types import Rendering
 
+pytestmark = pytest.mark.slow
+
 
 def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -11,6 +11,8 @@ from avatar.bench import Request
 from avatar.bench.stages import Stopwatch
 from avatar.bench.train import run
 
+pytestmark = pytest.mark.slow
+
 
 class Chain:
     def first(self, x: torch.Tensor) -> torch.Tensor:

@@ -6,6 +6,8 @@ import pytest
 
 from avatar.bench.splat_work import peak_memory
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark is Linux's")
 def test_peak_memory_is_that_of_the_drawing() -> None:

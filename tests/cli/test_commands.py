@@ -151,6 +151,7 @@ def test_a_csv_without_cameras_shows_the_avatars_own(trained: Path, tmp_path: Pa
     assert len(iio.imread(trained / "reenact" / "talk-relative.mp4")) == 3
 
 
+@pytest.mark.slow
 def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,6 +177,7 @@ def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
     assert all(torch.equal(a.tensors[name], b.tensors[name]) for name in a.tensors)
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_says_how_to_go_on(tracked_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     options = ["--frame-offset", "1", *SMALL, "trainer.iterations=100000", "trainer.checkpoint_every=50"]

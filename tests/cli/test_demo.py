@@ -24,6 +24,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "RECIPE", [*SMALL, "trainer.iterations=16"])
 
 
+@pytest.mark.slow
 def test_an_interrupted_demo_goes_on(tmp_path: Path) -> None:
     """Interrupted in its training, it does not present the half-trained avatar the next time."""
     for name in ("actor", "driver"):

@@ -57,6 +57,7 @@ def test_a_protocol_more_keeps_the_others_results(run: Path) -> None:
     assert all(name in compared for name in ("rgbavatar", "strict", "flashavatar"))
 
 
+@pytest.mark.slow
 def test_a_protocol_more_replaces_nobodys_curves_sheet_or_video(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plotted: list[tuple[list[str], set[str], str]] = []
     real = evaluate_module.curves
@@ -147,6 +148,7 @@ STALE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason", STALE)
 def test_results_that_are_not_true_any_more_go_with_their_files(run: Path, reason: str) -> None:
     STALE[reason](run)

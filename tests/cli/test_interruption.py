@@ -15,6 +15,8 @@ from command_line import avatar
 
 from avatar.commands import doctor
 
+pytestmark = pytest.mark.slow
+
 # What the installed script does; `main` begins when the program has taken care of signals.
 SCRIPT = """
 import avatar.cli

@@ -16,6 +16,8 @@ from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 
+pytestmark = pytest.mark.slow
+
 QUICK = [*SMALL, "trainer.iterations=4"]
 
 

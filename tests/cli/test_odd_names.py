@@ -13,6 +13,8 @@ import pytest
 from command_line import avatar
 from small_runs import SMALL
 
+pytestmark = pytest.mark.slow
+
 ODD = os.fsdecode(b"caf\xe9")
 LONG = "x" * 240
 

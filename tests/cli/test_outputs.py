@@ -14,6 +14,8 @@ from tracked_folder import write_tracked_folder
 
 from avatar.commands.parser import build_parser
 
+pytestmark = pytest.mark.slow
+
 IS_INPUT, IN_INPUT = "is an input of this command and would be overwritten", "which is an input; choose another --out"
 OF_RUN, IS_FILE, IS_FOLDER = "belongs to the run {run}; choose another --out", "is a file; name a folder", "is a folder"
 TRAIN = ("--frame-offset", "1", *SMALL, "trainer.iterations=2")

@@ -23,6 +23,8 @@ from avatar.pipeline.open import source_of
 from avatar.pose_refinement import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 
+pytestmark = pytest.mark.slow
+
 QUICK = [*SMALL, "trainer.iterations=10"]
 LEARNED = [*SMALL, "trainer.iterations=200", "trainer.checkpoint_every=50"]  # where heads are; ten steps prefer a place
 

@@ -160,6 +160,7 @@ def test_other_commands_too_use_or_refuse_a_gpu(command: str, kept: Path) -> Non
     assert sorted(kept.rglob("*")) == before and not list(kept.parent.glob(f"{kept.name}-*"))
 
 
+@pytest.mark.slow
 def test_two_trainings_into_one_folder_are_one_too_many(own_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = [sys.executable, "-m", "avatar.cli", "train", str(own_folder), "--out", str(run), *OPTIONS]

@@ -21,6 +21,8 @@ from data_prep.formats.frame_files import FrameFiles, find_frame_files
 from data_prep.formats.metrical_tracker import FrameTrack, read_tracking
 from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 
+pytestmark = pytest.mark.slow
+
 
 @lru_cache(maxsize=1)
 def read(folder: Path, head_path: Path) -> tuple[FrameFiles, dict[int, FrameTrack], HeadModel]:

@@ -137,6 +137,7 @@ def test_pictures_of_an_earlier_evaluation_do_not_stay(tmp_path: Path, subject: 
     assert sorted(path.name for path in stale.parent.iterdir()) == ["00007.png", "00008.png", "00009.png"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["step", "data", "head model"])
 def test_figures_of_something_else_do_not_stay(tmp_path: Path, subject: Subject, what: str) -> None:
     """Beside those by another protocol, of the avatar as it is now."""

@@ -21,6 +21,8 @@ from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
 
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 SIZE = 64
 MODELS = {

@@ -41,6 +41,8 @@ from avatar.runs.checkpoint import (
 from avatar.runs.run import read_run_info, write_run_info
 from data_prep.prepare.prepare import prepare
 
+pytestmark = pytest.mark.slow
+
 DONE, REFUSED, KILLED, BROKEN = 0, 3, 9, 4
 # Audit events of calls that change files.
 STEPS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.chmod")

@@ -16,6 +16,8 @@ import torch
 
 from avatar import _core
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = max(1000, int(os.environ.get("AVATAR_STRESS_EXAMPLES", "0")) // 50)
 
 

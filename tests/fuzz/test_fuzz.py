@@ -33,6 +33,8 @@ from avatar.data.images import MAX_PIXELS, decode_image, decode_mask
 from avatar.errors import UserError
 from avatar.files.pickles import load_npy, load_npz, load_pickle
 
+pytestmark = pytest.mark.slow
+
 CASES = int(os.environ.get("AVATAR_FUZZ_CASES", "600"))
 SECONDS = 5.0  # for one file of a few kilobytes, on a busy machine
 NAMES = (

@@ -25,6 +25,8 @@ from avatar.losses.metrics import squared_error
 from avatar.pipeline.open import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
 
+pytestmark = pytest.mark.slow
+
 
 def lines(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.open()))

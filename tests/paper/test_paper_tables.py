@@ -17,6 +17,8 @@ from avatar.config import flatten, load_config
 from avatar.sweep.spec import read_spec
 from avatar.sweep.state import read_state
 
+pytestmark = pytest.mark.slow
+
 MAY_DIFFER = {"model.name", "model.latent_dim", "model.mlp_width", "model.mlp_layers"}
 
 

@@ -114,6 +114,7 @@ def test_the_avatar_is_left_as_it_was(avatar: Avatar, wrong: Clip, result: Refin
     one.requires_grad_(True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", ["1", "3"])
 def test_the_number_of_threads_does_not_matter(
     avatar: Avatar, wrong: Clip, result: Refined, threads: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -152,6 +153,7 @@ def test_an_interruption_is_gone_on_from_to_the_same_bits(
     assert sorted(worked) == list(range(4, 10)) and "going on after 4 of 10 frames" in said[0]
 
 
+@pytest.mark.slow
 def test_progress_of_something_else_is_not_gone_on_from(
     avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +179,7 @@ def test_the_fingerprint_is_that_of_the_parameters(avatar: Avatar) -> None:
     assert len(before) == 64
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_head_keeps_its_tracking(avatar: Avatar, wrong: Clip, tmp_path: Path) -> None:
     hidden = list(wrong.pictures)
     hidden[4] = replace(hidden[4], head_mask=torch.zeros(SIZE, SIZE))
@@ -188,6 +191,7 @@ def test_a_frame_without_a_head_keeps_its_tracking(avatar: Avatar, wrong: Clip, 
         assert not torch.equal(found.tracks[name][3], wrong.recording.tracks[name][3])
 
 
+@pytest.mark.slow
 def test_a_frame_that_smoothing_makes_worse_keeps_its_tracking(
     avatar: Avatar, clip: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,8 @@ from stress.test_random_scenes import allowed_and_error, assert_agrees, draw_wit
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, Rendering
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(12)
 
 

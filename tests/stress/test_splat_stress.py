@@ -18,6 +18,8 @@ from splat.scenes import Scene, ambiguous_pixels, assert_gradients_close, gradie
 
 from avatar.types import Camera, Gaussians
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = max(60, int(os.environ.get("AVATAR_STRESS_EXAMPLES", "0")) // 50)
 stress = settings(
     max_examples=EXAMPLES,

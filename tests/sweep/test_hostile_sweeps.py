@@ -16,6 +16,8 @@ from avatar.files.plain_yaml import MAX_NODES, read_yaml
 from avatar.sweep.spec import MAX_VARIANTS, Job, read_spec
 from avatar.sweep.state import read_job, read_sweep
 
+pytestmark = pytest.mark.slow
+
 ALIASES = "\n".join(
     ["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12))]
 )

@@ -174,6 +174,7 @@ def until_shaped(page: Any) -> None:
     until(is_shaped)
 
 
+@pytest.mark.slow
 def test_the_command_serves_and_ends(tracked_folder: Path, tmp_path: Path) -> None:
     run = lively_run(tracked_folder, tmp_path / "run", "model.uv_size=8")
     with started(run, "--stream", 0, "--host", "0.0.0.0", "--size", 64) as viewer:

@@ -121,6 +121,7 @@ def test_a_page_of_another_site_gets_nothing(command: Started, tmp_path: Path) -
             page.until(lambda: ": 1 frames, " in str(page.values))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can act as another user")
 def test_another_user_of_this_machine_gets_nothing(command: Started) -> None:
     ports = command.listening()

@@ -16,6 +16,8 @@ from data_prep.track.first_pass import look_at
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Span
 
+pytestmark = pytest.mark.slow
+
 FRAMES, SIZE = 20, 160
 
 
