@@ -74,6 +74,15 @@ class Changed(MetaPathFinder):
         return spec_from_file_location(name, self._path) if name == self._name else None
 
 
+def check_arrays_first() -> None:
+    """Install the tests' import hook now: it would find the changed module's own file if it came later."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    import array_shapes
+
+    array_shapes.install_array_checks()
+    array_shapes.install_array_checks = lambda: None  # of conftest.py
+
+
 class Listener:
     """What pytest's tests come to."""
 
@@ -112,6 +121,7 @@ def attempt(task: Task) -> Outcome:
         if task.mutation is not None:
             path = Path(folder) / Path(task.mutation.file).name
             path.write_text(task.mutation.source(), encoding="utf-8")
+            check_arrays_first()
             sys.meta_path.insert(0, Changed(task.mutation.module, path))
         with contextlib.redirect_stderr(said):
             status = pytest.main([*QUIET, *task.tests], plugins=[listener])
