@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from avatar.compute.device import CPU, to_device
-from avatar.evaluation.protocol import MEASURES, RIMS, Levels, Look, Protocol, Region, column
+from avatar.evaluation.protocol import Levels, Look, Protocol, Region, column, columns_of
 from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.losses.metrics import SSIM_RADIUS, bounding_box, grown_box, squared_error, ssim_map, weighted_mean
 
@@ -65,15 +65,16 @@ class FrameMeasurer:
             if region is not None or protocol.mask == "only":
                 mask = self._masks.get(region or "head")
                 if mask is None:
-                    figures |= {column(name, region): float("nan") for name in MEASURES}
+                    figures |= dict.fromkeys(columns_of(region), float("nan"))
                     continue
             multiply = region is None and protocol.mask == "multiply"
             error, similarity = self._maps_of(protocol.look, multiply)
             inside = None if mask is None else mask[INSIDE, INSIDE]
             figures[column("psnr", region)] = -10.0 * torch.log10(weighted_mean(error, mask)).item()
             figures[column("ssim", region)] = weighted_mean(similarity, inside).item()
-            what = region or ("head" if protocol.mask == "only" else protocol.mask)
-            figures[column("lpips", region)] = protocol.lpips_scale * self._lpips_of(protocol, what)
+            if (lpips := column("lpips", region)) in columns_of(region):
+                what = region or ("head" if protocol.mask == "only" else protocol.mask)
+                figures[lpips] = protocol.lpips_scale * self._lpips_of(protocol, what)
         return figures
 
     def _images(self, look: Look, multiply: bool) -> tuple[Tensor, Tensor]:
@@ -92,8 +93,6 @@ class FrameMeasurer:
 
     def _lpips_of(self, protocol: Protocol, what: str) -> float:
         """LPIPS before scaling; `what` is a region, or "multiply" or "none" for the whole frame."""
-        if what in RIMS:
-            return float("nan")  # its pictures would be black but for a line
         key = (protocol.look, what, protocol.lpips_net)
         if key not in self._lpips:
             network = self._networks[protocol.lpips_net]

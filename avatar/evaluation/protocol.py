@@ -91,7 +91,7 @@ class Protocol:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the figures of each frame: `psnr`, `ssim`, `lpips`, then each with `_REGION`, then `jitter`."""
-        return (*(column(measure, region) for region in (None, *self.regions) for measure in MEASURES), "jitter")
+        return (*(name for region in (None, *self.regions) for name in columns_of(region)), "jitter")
 
     def choices(self) -> dict[str, Any]:
         """Every choice by name, for results files."""
@@ -108,6 +108,11 @@ class Protocol:
 def column(measure: str, region: Region | None) -> str:
     """The name of a figure; region None: the protocol's main figure."""
     return measure if region is None else f"{measure}_{region}"
+
+
+def columns_of(region: Region | None) -> tuple[str, ...]:
+    """The names of a region's figures; rims have no LPIPS, whose pictures would be black but for a line."""
+    return tuple(column(measure, region) for measure in MEASURES if not (measure == "lpips" and region in RIMS))
 
 
 def builtin_protocols() -> dict[str, Path]:

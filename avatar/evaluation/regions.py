@@ -25,15 +25,16 @@ def region_masks(frame: Frame, head: HeadModel, wanted: Iterable[Region]) -> dic
     """The masks of the wanted regions (`SHARED_CHOICES["regions"]`); eyes and rest only if the head model has eyeballs."""
     wanted = set(wanted)
     masks: dict[Region, Tensor] = {"head": frame.head_mask, "mouth": frame.mouth_mask}
-    if wanted.intersection((*OF_EYES, *RIMS)):
+    if not wanted <= masks.keys():
         vertices = head.vertices(frame.params)
-        if has_eyeballs(head.assets.regions):
+        if wanted.intersection(OF_EYES) and has_eyeballs(head.assets.regions):
             face = frame.head_mask * (1.0 - frame.mouth_mask)
             eyes = eye_boxes(vertices, head.assets.regions, frame.camera)
             masks |= {"eyes": face * eyes, "rest": face * ~eyes}
-        is_neck = head.neck()[1] < 0.5  # more on the root than on the neck joint
-        rims = outline_rims(frame.alpha * frame.head_mask, frame.camera.project(vertices)[:, :2], is_neck)
-        masks |= {region: rim.float() for region, rim in zip(RIMS, rims, strict=True)}
+        if wanted.intersection(RIMS):
+            is_neck = head.neck()[1] < 0.5  # more on the root than on the neck joint
+            rims = outline_rims(frame.alpha * frame.head_mask, frame.camera.project(vertices)[:, :2], is_neck)
+            masks |= {region: rim.float() for region, rim in zip(RIMS, rims, strict=True)}
     return {region: (mask * 255.0).round().to(torch.uint8) for region, mask in masks.items() if region in wanted}
 
 
