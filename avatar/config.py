@@ -31,7 +31,12 @@ class DataConfig:
     size: Annotated[int | None, Range(16, 8192), "width of the training images in pixels; null: the video's"] = None
     background: Annotated[Colour, "colour behind the head: a name, #RRGGBB or [r,g,b]"] = (1.0, 1.0, 1.0)
     test_frames: Annotated[
-        int | None, STEPS, "frames held out at the end; null: 500, or 20% of a clip under 2,500 frames"
+        int | None,
+        STEPS,
+        "frames (of several cameras: times) held out at the end; null: 500, or 20% of a clip under 2,500",
+    ] = None
+    test_cameras: Annotated[
+        str | None, "cameras held out, names between commas, or none; null: as the folder says, else none"
     ] = None
 
 
@@ -107,7 +112,6 @@ class TrainerConfig:
         float, SHARE, "noise on the network's input, as a share of each coefficient's standard deviation"
     ] = 0.2
     checkpoint_every: Annotated[int, STEPS, "steps between checkpoints, each with a preview image"] = 500
-    keep_checkpoints: Annotated[int, Range(1, 10**6), "how many of the newest checkpoints are kept"] = 3
 
 
 @dataclass

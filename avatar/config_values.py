@@ -76,6 +76,8 @@ def _of_type(key: str, value: Any, kind: Any) -> Any:
         if choices and value not in choices:
             raise UserError(f"{key}={shown(value)} is not one of {', '.join(choices)}")
         return value
+    if wanted is str and not choices and isinstance(value, int) and not isinstance(value, bool):
+        return str(value)  # a name that is a number
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         return float(max(min(value, 10**300), -(10**300)))  # beyond that there is no float; every range refuses it
     if wanted is int and isinstance(value, float) and value.is_integer():

@@ -1,6 +1,6 @@
 """A trained avatar's pictures as fast as possible: what never changes is computed once, and frames are drawn side by side.
 
-`Renderer` gives what `avatar.draw(avatar(params, None, camera.R_cam_world), camera, background)` gives, to rounding,
+`Renderer` gives what `avatar.draw(avatar(params, None, camera.head_rotation), camera, background)` gives, to rounding,
 without autograd, where the avatar is. The avatar says what is computed once (`Avatar.frozen`): the first layer's product
 with the positional code, the colours and, on a CPU, each HyperGaussian, which for inference is an affine map of its latent:
 n multiply-adds for each of ten offsets remain. On a GPU the launches count, and one does all that follows the network.
@@ -40,7 +40,7 @@ class Renderer:
     @torch.no_grad()
     def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
         """What `avatar(params)` gives, to rounding, as the head is turned before the camera where one is given."""
-        return self.avatar(params, None, None if camera is None else camera.R_cam_world)
+        return self.avatar(params, None, None if camera is None else camera.head_rotation)
 
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:

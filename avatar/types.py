@@ -5,7 +5,8 @@ Conventions
 Camera      OpenCV: x right, y down, z forward; the centre of pixel (column i, row j) is at (i + 0.5, j + 0.5).
             `T_cam_world` style names say from-to: `p_cam = R_cam_world @ p_world + t_cam_world`. Lengths in metres,
             focal lengths and principal point in pixels of this camera's own width and height.
-World       The posed head's own space: identity global rotation, head pose is in the camera.
+World       The posed head's own space: identity global rotation, head pose is in the camera. Where several cameras
+            film one head, each camera's pose holds the head's.
 Rotations   Quaternions are (w, x, y, z) and are normalised where they are used. "6D" rotations are the first two rows
             of the matrix, flattened; the third row is their cross product (metrical-tracker's files).
 Images      float32 [H, W, 3] (masks [H, W]) in [0, 1], the values of the 8-bit file / 255, unclamped until written.
@@ -41,6 +42,12 @@ class Camera:
     cy: float
     width: int
     height: int
+    R_ref_cam: Float[Tensor, "3 3"] | None = None  # to the axes of the rig's reference camera; None: it is its own
+
+    @property
+    def head_rotation(self) -> Float[Tensor, "3 3"]:
+        """How the head is turned before the reference camera, whichever camera this is."""
+        return self.R_cam_world if self.R_ref_cam is None else self.R_ref_cam @ self.R_cam_world
 
     def project(self, points: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
         """World points [..., 3] in metres -> (x pixel, y pixel, depth in metres)."""
@@ -98,6 +105,12 @@ class Frame:
     head_mask: Float[Tensor, "H W"]  # head and neck; ones where the subject has none
     mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth
     head_box: tuple[slice, slice] | None = None  # rows and columns that hold the head mask, if they are known already
+    shared_time: int | None = None  # the row of the tracks, where pictures of several cameras share it; None: `index`
+
+    @property
+    def time(self) -> int:
+        """The row of the tracks that `params` are of."""
+        return self.index if self.shared_time is None else self.shared_time
 
     def composite(self, background: Float[Tensor, 3]) -> Float[Tensor, "H W 3"]:
         """The training target: matte over the background, then the head mask over the background again.

@@ -113,7 +113,7 @@ def compare(trained: TrainedAvatar, renderer: Renderer, frames: Sequence[Input])
     """Raises UserError, with the figures, above the tolerances."""
     gaussians = mean = largest = 0.0
     for params, camera in frames:
-        truth, found = trained.avatar(params, None, camera.R_cam_world), renderer.gaussians(params, camera)
+        truth, found = trained.avatar(params, None, camera.head_rotation), renderer.gaussians(params, camera)
         gaussians = max(gaussians, *(float((a - b).norm() / b.norm()) for a, b in zip(found, truth, strict=True)))
         difference = (renderer.render(params, camera).image - draw_unfolded(trained, params, camera).image).abs()
         mean, largest = max(mean, float(difference.mean())), max(largest, float(difference.max()))
@@ -143,7 +143,7 @@ def time_steps(renderer: Renderer, frames: Sequence[Input]) -> dict[str, Time]:
 
 def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) -> Rendering:
     background = to_device(torch.tensor(trained.config.data.background), trained.avatar.device)
-    return trained.avatar.draw(trained.avatar(params, None, camera.R_cam_world), camera, background)
+    return trained.avatar.draw(trained.avatar(params, None, camera.head_rotation), camera, background)
 
 
 def settled(device: torch.device, function: Callable[..., object], *arguments: object) -> None:

@@ -19,6 +19,11 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--format", metavar="NAME", help="metrical-tracker, VHAP, INSTA or IMavatar (default: told from the files)"
     )
+    parser.add_argument(
+        "--cameras",
+        metavar="all|front|NAME,...",
+        help="of a folder with several cameras: which are used (default: all)",
+    )
     parser.add_argument("--fps", type=float, metavar="N", help="frames a second (default: the folder's, else 25)")
     parser.add_argument(
         "--max-left-out", type=float, metavar="SHARE", help="of the frames that may be unusable (default: 0.05)"

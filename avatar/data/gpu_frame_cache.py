@@ -46,18 +46,21 @@ class GpuFrameCache:
             if flat.nbytes <= self._room:
                 self._room -= flat.nbytes
                 self._kept[index] = kept
-        width, height = self._subject.image_size(size)
+        width, height = self._subject.image_size(size, index)
+        recording = self._subject.recording
+        time = recording.time(index)
         image, alpha, head_mask, mouth_mask = planes(kept[0], height, width)
         return Frame(
             index=index,
-            name=self._subject.recording.names[index],
+            name=recording.names[index],
             camera=self._subject.camera(index, size),
-            params=HeadParams(**{name: track[index] for name, track in self._tracks.items()}),
+            params=HeadParams(**{name: track[time] for name, track in self._tracks.items()}),
             image=image,
             alpha=alpha,
             head_mask=head_mask,
             mouth_mask=mouth_mask,
             head_box=kept[1],
+            shared_time=None if recording.rig is None else time,
         )
 
 

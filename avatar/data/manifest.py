@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
 from avatar.data.refinement import Refinement
+from avatar.data.rig import Rig, parse_rig
 from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.opening import MissingFile, read_json
 
-MANIFEST_VERSION = 5
+MANIFEST_VERSION = 6
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
 GIVEN = "given."  # before the names of the tracks as they were before their refinement
 MASKS = ("alpha", "head", "mouth")  # keys of `Manifest.labels`
@@ -31,7 +32,7 @@ class FrameRecord:
 
     name: str  # stem of the image
     image: str
-    tracking: int  # number of the tracking frame
+    tracking: int  # number of the tracking frame; pictures of one time share it
     alpha: str | None  # the image itself: its transparency is the matte
     head_mask: str | None
     mouth_mask: str | None
@@ -61,6 +62,7 @@ class Manifest:
     input_hash: str  # of names, sizes and times of the inputs, and the options: decides whether to prepare again
     data_hash: str  # of the contents: the same data gives the same hash on every machine
     refinement: Refinement | None = None  # of the tracking; None where it is the tracker's own
+    rig: Rig | None = None  # of several cameras; None: one. Size and intrinsics above are of its first camera
     labels: dict[str, int] = field(default_factory=dict)  # of masks that are label images: what is read as 255
 
     def to_json(self) -> str:
@@ -115,6 +117,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
         input_hash=_of(raw, "input_hash", str),
         data_hash=_of(raw, "data_hash", str),
         refinement=None if raw["refinement"] is None else _refinement(raw["refinement"]),
+        rig=None if raw["rig"] is None else parse_rig(raw["rig"], count),
     )
     if not 1 <= manifest.width < 2**16 or not 1 <= manifest.height < 2**16:
         raise ValueError(f"an image size of {manifest.width}x{manifest.height} is impossible")
@@ -160,32 +163,6 @@ def _of(raw: dict[str, Any], key: str, kind: type) -> Any:
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise TypeError(f"{key} is a {type(value).__name__}, not a {kind.__name__}")
     return value
-
-
-def parse_number(value: Any, name: str) -> float:
-    """A finite number. Raises ValueError naming it."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
-        raise ValueError(f"{name} is not a finite number")
-    return float(value)
-
-
-def parse_intrinsics(values: Any) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy. Raises TypeError or ValueError."""
-    if not isinstance(values, list):
-        raise TypeError(f"intrinsics is a {type(values).__name__}, not a list")
-    if len(values) != 4:
-        raise ValueError(f"intrinsics has {len(values)} values, not 4")
-    fx, fy, cx, cy = (parse_number(v, "intrinsics") for v in values)
-    return fx, fy, cx, cy
-
-
-def parse_positions(values: Any, key: str, count: int) -> tuple[int, ...]:
-    """A list of positions among `count` frames, not empty. Raises TypeError or ValueError naming `key`."""
-    if not isinstance(values, list):
-        raise TypeError(f"{key} is a {type(values).__name__}, not a list")
-    if not values or not all(isinstance(v, int) and not isinstance(v, bool) and 0 <= v < count for v in values):
-        raise ValueError(f"{key} is empty or names frames outside the {count} of the subject")
-    return tuple(values)
 
 
 def _relative_or_none(value: Any) -> str | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.rig import Rig, RigCamera
 from avatar.data.split import Split
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, HeadParams
@@ -26,7 +27,7 @@ TRACK_SHAPES = {
 
 @dataclass(frozen=True, repr=False)
 class Recording:
-    """N usable frames of one person. Indices are positions among them, 0-based."""
+    """The usable frames of one person, pictures of one camera or of several. Indices are positions among them, 0-based."""
 
     name: str
     fps: float
@@ -35,9 +36,10 @@ class Recording:
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels of the video
     names: tuple[str, ...]  # of the frames
     split: Split
-    tracks: Mapping[str, Tensor]  # float32, of TRACK_SHAPES
+    tracks: Mapping[str, Tensor]  # float32, of TRACK_SHAPES; a row for each frame, with a rig for each time
     data_hash: str  # of pictures and tracking
     head_fingerprint: str
+    rig: Rig | None = None  # of several cameras; size and intrinsics above are of its first one
 
     def __repr__(self) -> str:
         return f"<recording of {self.name}: {len(self)} frames of {self.width}x{self.height}, {self.fps:g} a second>"
@@ -50,29 +52,66 @@ class Recording:
         """Identity coefficients of the head model."""
         return self.tracks["shape"]
 
-    def image_size(self, size: int | None = None) -> tuple[int, int]:
-        """(width, height) of the frames when the width is resized to `size` pixels; None keeps the video's size."""
-        if size is None:
-            return self.width, self.height
-        if size < 1:
-            raise ValueError(f"size must be at least 1 pixel, got {size}")
-        if size != int(size):
-            raise ValueError(f"size must be a whole number of pixels, got {size}")
-        return size, max(1, round(size * self.height / self.width))
+    @property
+    def cameras(self) -> tuple[RigCamera, ...]:
+        """Every camera; the first is the one before which the tracks place the head."""
+        if self.rig is not None:
+            return self.rig.cameras
+        return (RigCamera("camera", self.width, self.height, self.intrinsics),)
+
+    def time(self, index: int) -> int:
+        """The row of the tracks that a frame is of."""
+        index = self.checked(index)
+        return index if self.rig is None else self.rig.times[index]
+
+    def view(self, index: int) -> int:
+        """Which of the cameras filmed a frame."""
+        index = self.checked(index)
+        return 0 if self.rig is None else self.rig.views[index]
+
+    def moments(self, indices: Sequence[int]) -> tuple[int, ...]:
+        """One frame of each time that these are of, in the order of time: by the first camera that there is. With one
+        camera the frames as they are."""
+        return tuple(indices) if self.rig is None else self.rig.moments(indices)
+
+    def image_size(self, size: int | None = None, index: int | None = None) -> tuple[int, int]:
+        """(width, height) when the width is resized to `size` pixels; None keeps the files' size.
+
+        index  of the frame; None: the largest of the cameras' sizes
+        """
+        if index is not None:
+            return self.cameras[self.view(index)].image_size(size)
+        return max((one.image_size(size) for one in self.cameras), key=lambda both: both[0] * both[1])
 
     def camera(self, index: int, size: int | None = None) -> Camera:
         """The camera of a frame; it holds the head's pose."""
-        index = self.checked(index)
-        fx, fy, cx, cy = self.intrinsics
-        camera = Camera(self.tracks["R"][index], self.tracks["t"][index], fx, fy, cx, cy, self.width, self.height)
-        return camera if size is None else camera.resized(*self.image_size(size))
+        if self.rig is None:
+            return self.reference_camera(index, size)
+        row = self.time(index)
+        camera = self.rig.cameras[self.rig.views[index]].sees(self.tracks["R"][row], self.tracks["t"][row])
+        return camera if size is None else camera.resized(*self.image_size(size, index))
+
+    def reference_camera(self, index: int, size: int | None = None) -> Camera:
+        """The first camera at a frame's time, whether it filmed the frame or not."""
+        row = self.time(index)
+        R, t = self.tracks["R"][row], self.tracks["t"][row]
+        if self.rig is None:
+            camera = Camera(R, t, *self.intrinsics, width=self.width, height=self.height)
+        else:
+            camera = self.rig.cameras[0].sees(R, t)
+        return camera if size is None else camera.resized(*self.cameras[0].image_size(size))
 
     def params(self, index: int) -> HeadParams:
-        index = self.checked(index)
-        return HeadParams(**{name: self.tracks[name][index] for name in HeadParams.__dataclass_fields__})
+        row = self.time(index)
+        return HeadParams(**{name: self.tracks[name][row] for name in HeadParams.__dataclass_fields__})
 
     def motion(self, indices: Sequence[int]) -> list[HeadParams]:
-        return [self.params(index) for index in indices]
+        """The head's parameters at each of the frames' `moments`."""
+        return [self.params(index) for index in self.moments(indices)]
+
+    def times(self, indices: Sequence[int]) -> list[int]:
+        """The rows of the tracks of the frames' `moments`."""
+        return [self.time(index) for index in self.moments(indices)]
 
     def checked(self, index: int) -> int:
         """`index`, if there is such a frame; IndexError otherwise."""

@@ -26,6 +26,7 @@ class Source:
     fps: float | None = None  # of the video
     max_left_out: float = DEFAULT_LEFT_OUT  # share of the frames that may be unusable
     ignore_misfit: bool = False  # go on where the projected head does not lie on the masks
+    cameras: str | None = None  # of a folder with several: "all", "front" or names between commas; None: all
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file: absolute paths as text."""
@@ -44,6 +45,7 @@ class Source:
             "fps": (int, float, type(None)),
             "max_left_out": (int, float),
             "ignore_misfit": (bool,),
+            "cameras": (str, type(None)),
         }
         if not isinstance(values, dict):
             raise UserError("source is missing or not an object")

@@ -70,6 +70,7 @@ class Subject:
             tracks=tracks,
             data_hash=manifest.data_hash,
             head_fingerprint=manifest.head_fingerprint,
+            rig=manifest.rig,
         )
         return cls(prepared, manifest, recording, None if given is None else replace(recording, tracks=given))
 
@@ -113,9 +114,9 @@ class Subject:
         """With what the tracker left, where the tracking has been refined since."""
         return self if self.given is None else replace(self, recording=self.given, given=None)
 
-    def image_size(self, size: int | None = None) -> tuple[int, int]:
-        """(width, height) of the frames when the width is resized to `size` pixels; None keeps the files' size."""
-        return self.recording.image_size(size)
+    def image_size(self, size: int | None = None, index: int | None = None) -> tuple[int, int]:
+        """As `Recording.image_size`."""
+        return self.recording.image_size(size, index)
 
     def camera(self, index: int, size: int | None = None) -> Camera:
         """The camera of a frame; it holds the head's pose."""
@@ -135,15 +136,16 @@ class Subject:
         """The frame's images, uint8; what a cache holds. Raises as `frame` does."""
         record = self.manifest.frames[self.recording.checked(index)]
         source = Path(self.manifest.source)
-        shape = (self.height, self.width)
+        width, height = self.image_size(index=index)
+        shape = (height, width)
         if not os.path.isdir(source):  # noqa: PTH112 (Path.is_dir raises where a name is too long for the system)
             shown = str(source) if len(str(source)) <= _LONGEST_SHOWN else f"...{str(source)[-_LONGEST_SHOWN:]}"
             raise UserError(f"the subject's frames are gone: {shown} does not exist; prepare the subject again")
-        image = self._same_size(read_image(source / record.image), source / record.image)
+        image = _same_size(read_image(source / record.image), source / record.image, shape)
         alpha = np.full(shape, 255, np.uint8)
         if record.alpha is not None:
             path = source / record.alpha
-            alpha = self._same_size(read_matte(path, source / record.image, self.manifest.labels.get("alpha")), path)
+            alpha = _same_size(read_matte(path, source / record.image, self.manifest.labels.get("alpha")), path, shape)
         if record.head_mask is None:
             head_mask = head_of_matte(alpha)
         else:
@@ -152,9 +154,9 @@ class Subject:
         root = self.folder if self.manifest.mouth_masks == "derived" else source
         mouth_mask = self._mask(root, record.mouth_mask, shape, "mouth", default=0)
         pixels = FramePixels(image, alpha, head_mask, mouth_mask)
-        if size is None or size == self.width:
+        if size is None or size == width:
             return pixels
-        return FramePixels(*(cv2.resize(p, self.image_size(size), interpolation=cv2.INTER_AREA) for p in pixels))
+        return FramePixels(*(cv2.resize(p, self.image_size(size, index), interpolation=cv2.INTER_AREA) for p in pixels))
 
     def assemble(self, index: int, pixels: FramePixels, size: int | None = None) -> Frame:
         """The frame of pixels that were decoded at `size`."""
@@ -169,21 +171,22 @@ class Subject:
             alpha=alpha,
             head_mask=head_mask,
             mouth_mask=mouth_mask,
+            shared_time=None if self.recording.rig is None else self.recording.time(index),
         )
 
     def _mask(self, root: Path, path: str | None, shape: tuple[int, int], kind: str, default: int) -> np.ndarray:
         if path is None:
             return np.full(shape, default, np.uint8)
-        return self._same_size(read_mask(root / path, self.manifest.labels.get(kind)), root / path)
+        return _same_size(read_mask(root / path, self.manifest.labels.get(kind)), root / path, shape)
 
-    def _same_size(self, pixels: np.ndarray, path: Path) -> np.ndarray:
-        height, width = pixels.shape[:2]
-        if (width, height) != (self.width, self.height):
-            raise UserError(
-                f"{path} is {width}x{height} pixels, but the subject was prepared at {self.width}x{self.height}; "
-                "prepare it again"
-            )
-        return pixels
+
+def _same_size(pixels: np.ndarray, path: Path, shape: tuple[int, int]) -> np.ndarray:
+    if pixels.shape[:2] != shape:
+        (height, width), (rows, columns) = pixels.shape[:2], shape
+        raise UserError(
+            f"{path} is {width}x{height} pixels, but the subject was prepared at {columns}x{rows}; prepare it again"
+        )
+    return pixels
 
 
 def _read_tracks(file: Path, manifest: Manifest) -> tuple[dict[str, Tensor], dict[str, Tensor] | None]:
@@ -192,7 +195,7 @@ def _read_tracks(file: Path, manifest: Manifest) -> tuple[dict[str, Tensor], dic
         tracks = read_tensors(file, _MAX_TRACKS)
     except UserError as error:
         raise UserError(f"{error}; prepare the subject again") from None
-    count = len(manifest.frames)
+    count = len(manifest.frames) if manifest.rig is None else max(manifest.rig.times) + 1
     given = {name.removeprefix(GIVEN): value for name, value in tracks.items() if name.startswith(GIVEN)}
     try:
         return checked_tracks(tracks, count), None if manifest.refinement is None else checked_tracks(given, count)

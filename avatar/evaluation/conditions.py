@@ -27,7 +27,7 @@ class Conditions(NamedTuple):
 def conditions(head: HeadModel, recording: Recording, indices: Sequence[int]) -> dict[int, Conditions]:
     """The conditions of these frames; distances are to the nearest of the training frames."""
     distances = expression_distances(
-        head, [recording.params(i) for i in indices], [recording.params(i) for i in recording.split.train]
+        head, [recording.params(i) for i in indices], recording.motion(recording.split.train)
     )
     return {
         index: Conditions(seen_from(recording.camera(index), recording.params(index)).yaw, distance)

@@ -44,7 +44,7 @@ def face_map(trained: TrainedAvatar, kept: list[int]) -> dict[str, Any]:
 
 def departures(trained: TrainedAvatar, kept: list[int]) -> np.ndarray:
     """How far the training frames are from the neutral face, [T, E + 11], in the order of `face_map`."""
-    tracks, train = trained.recording.tracks, list(trained.recording.split.train)
+    tracks, train = trained.recording.tracks, trained.recording.times(trained.recording.split.train)
     neutral = trained.neutral
     jaw = neutral.jaw.T @ matrix_from_6d(tracks["jaw"][train])
     eyes = matrix_from_6d(tracks["eyes"][train].reshape(-1, 2, 6))

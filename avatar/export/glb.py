@@ -82,7 +82,9 @@ def shapes(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tensor
     train = list(trained.recording.split.train)
     head, rest = trained.avatar.head, trained.rest_params()
     moved: dict[str, HeadParams] = {}
-    for control in expression_controls(trained.recording.tracks["expression"][train], rest.expression, head):
+    for control in expression_controls(
+        trained.recording.tracks["expression"][trained.recording.times(train)], rest.expression, head
+    ):
         far = max(control.low, control.high, key=abs)
         name = f"{control.part}: {control.name}"
         moved[name] = replace(params, expression=params.expression + far * control.direction)

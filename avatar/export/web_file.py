@@ -113,7 +113,7 @@ def quantised(values: np.ndarray, kind: str, column: str) -> tuple[np.ndarray, n
 def motion_arrays(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, np.ndarray]:
     """The held-out frames' parameters [T, P] and head poses [T, 12], what the page plays."""
     recording = trained.recording
-    chosen = list(recording.split.test)[:MAX_MOTION]
+    chosen = recording.times(recording.split.test)[:MAX_MOTION]
     kept = list(drawing.kept)
     tracks = recording.tracks
     columns = [tracks["expression"][:, kept], *(tracks[name] for name in ("jaw", "eyes", "eyelids", "neck"))]
@@ -127,7 +127,7 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
     recording, kept = trained.recording, list(drawing.kept)
     train = list(recording.split.train)
     frames = [(recording.camera(i), recording.params(i)) for i in train]
-    expressions = recording.tracks["expression"][train]
+    expressions = recording.tracks["expression"][recording.times(train)]
     rest, camera = trained.rest_params(), trained.rest_camera()
     names, turning = trained.assets.names.names, trained.avatar.turning
     controls = expression_controls(expressions, rest.expression, trained.avatar.head)

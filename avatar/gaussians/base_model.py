@@ -70,7 +70,7 @@ class Avatar(nn.Module):
         """The Gaussians of one frame, world space.
 
         vertices  the head posed by `params` already, metres
-        rotation  R_cam_world of the camera that sees it; None: the head is turned as on average in training
+        rotation  `head_rotation` of the camera that sees it; None: the head is turned as on average in training
         """
         raise NotImplementedError
 
@@ -185,7 +185,7 @@ class Avatar(nn.Module):
         return to_device(torch.cat(parts), self.device)
 
     def head_rotation(self, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
-        """The network's input for the head's rotation before a camera with this R_cam_world (`model.head_rotation`).
+        """The network's input for this rotation of the head before the reference camera (`model.head_rotation`).
 
         Where `rotation` is, so that a camera on the CPU costs a GPU one copy.
         """
@@ -194,7 +194,7 @@ class Avatar(nn.Module):
         return head_rotation_input(beside, rotation)
 
     def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:
-        """Before training: how heads are turned in its frames, whose R_cam_world these are."""
+        """Before training: how heads are turned before the reference camera at its times."""
         if self.turning is not None:
             self.turning.copy_(learned_turning(rotations))
             self._turning_on_cpu = self.turning.cpu()

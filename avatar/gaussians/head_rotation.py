@@ -18,9 +18,9 @@ LIMIT = 1.5  # root mean squares
 
 
 def learned_turning(rotations: Float[Tensor, "T 3 3"]) -> Float[Tensor, "3 9"]:
-    """What takes the nine entries of a frame's R_cam_world to how its head is turned; zeros where no head ever turns.
+    """What takes the nine entries of a camera's `head_rotation` to how its head is turned; zeros where no head ever turns.
 
-    rotations  R_cam_world of the training frames
+    rotations  of the head before the reference camera, at the times of training
     The skew part of mean^T R holds the sines; it is linear in R.
     """
     U, _, Vh = torch.linalg.svd(rotations.double().mean(dim=0))
@@ -35,5 +35,5 @@ def learned_turning(rotations: Float[Tensor, "T 3 3"]) -> Float[Tensor, "3 9"]:
 
 
 def head_rotation_input(turning: Float[Tensor, "3 9"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, 3]:
-    """How the head is turned where R_cam_world is `rotation`; differentiable."""
+    """How the head is turned where the camera's `head_rotation` is `rotation`; differentiable."""
     return (turning @ rotation.reshape(9).to(turning.dtype)).clamp(-LIMIT, LIMIT)

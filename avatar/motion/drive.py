@@ -35,16 +35,21 @@ class Drive:
 
 
 def subject_drive(subject: Subject, size: int | None) -> Drive:
-    """All frames of a tracked subject, seen `size` pixels wide."""
-    frames = range(len(subject))
+    """All frames of a tracked subject, seen `size` pixels wide; one of each time, where there are several cameras."""
+    frames = all_moments(subject)
     return Drive(
         subject.name,
         subject.fps,
-        tuple(record.name for record in subject.manifest.frames),
+        tuple(subject.recording.names[i] for i in frames),
         [subject.params(i) for i in frames],
         [subject.camera(i, size) for i in frames],
         subject.identity,
     )
+
+
+def all_moments(subject: Subject) -> tuple[int, ...]:
+    """The frames that a drive of the subject is made of."""
+    return subject.recording.moments(range(len(subject)))
 
 
 def smoothed(drive: Drive, sigma: float) -> Drive:

@@ -41,13 +41,16 @@ def seen_from(camera: Camera, params: HeadParams) -> Angles:
 
 def orbited(camera: Camera, yaw: float = 0.0, pitch: float = 0.0, zoom: float = 1.0) -> Camera:
     """The camera after the head has been turned by `yaw` degrees about its vertical axis and by `pitch` about the sideways
-    axis (positive shows more of its top); `zoom` enlarges about the middle of the picture.
+    axis (positive shows more of its top); `zoom` enlarges about the middle of the picture. A camera of a rig moves around
+    the head instead, which stays as it is before the reference camera.
     """
     turn = _about_x(math.radians(pitch)) @ _about_y(math.radians(yaw))
+    R = camera.R_cam_world @ turn.to(camera.R_cam_world)
     middle_x, middle_y = camera.width / 2, camera.height / 2
     return replace(
         camera,
-        R_cam_world=camera.R_cam_world @ turn.to(camera.R_cam_world),
+        R_cam_world=R,
+        R_ref_cam=None if camera.R_ref_cam is None else camera.head_rotation @ R.T,
         fx=camera.fx * zoom,
         fy=camera.fy * zoom,
         cx=middle_x + (camera.cx - middle_x) * zoom,

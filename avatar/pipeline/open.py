@@ -38,6 +38,7 @@ def source_options(arguments: Namespace, tracking: Path | None) -> dict[str, Any
         "format": arguments.format,
         "fps": arguments.fps,
         "ignore_misfit": arguments.ignore_misfit,
+        "cameras": arguments.cameras,
     }
     left_out = arguments.max_left_out
     return options if left_out is None else {**options, "max_left_out": left_out}
@@ -50,7 +51,9 @@ def open_run(
     info = read_run_info(path)
     source = moved_source(path, info, head, folder)
     trained = load_avatar(path, head, recorded_head=source.head)
-    subject, _ = open_subject(source, trained.config.data.test_frames, say, trained.assets)
+    subject, _ = open_subject(
+        source, trained.config.data.test_frames, say, trained.assets, trained.config.data.test_cameras
+    )
     check_data(path, info, subject)
     return Run(path, trained, subject)
 

@@ -28,7 +28,7 @@ from avatar.files.names import shortened
 from avatar.files.video import side_by_side, write_video
 from avatar.head.model import HeadModel
 from avatar.motion.distance_strip import DistanceStrip, distances_csv
-from avatar.motion.drive import Drive, Whose, choose_cameras, smoothed, subject_drive
+from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
 from avatar.motion.rest import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
 from avatar.motion.transfer import NEUTRAL_MODES, Transfer, transfer_motion
 from avatar.runs.run import versions
@@ -97,7 +97,7 @@ def reenact(
     renders = (rendering.image for rendering in trained.stream(zip(moved, cameras, strict=True)))
     loader = FrameLoader(driver, data.size) if isinstance(driver, Subject) else None
     with loader or nullcontext():
-        pictures = (frame.image for frame in loader.frames(range(len(drive)))) if loader else None
+        pictures = (frame.image for frame in loader.frames(all_moments(loader.subject))) if loader else None
         frames = panels(renders, pictures, trained.name, distances.tolist())
         write_video(out, tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True), drive.fps)
     table, record = sidecars(out)
@@ -140,7 +140,7 @@ def choose_neutrals(trained: TrainedAvatar, drive: Drive, choices: Choices) -> t
 
 
 def training_names(trained: TrainedAvatar) -> list[str]:
-    return [trained.recording.names[i] for i in trained.recording.split.train]
+    return [trained.recording.names[i] for i in trained.recording.moments(trained.recording.split.train)]
 
 
 def say_open_lips(rest: RestPose | None, head: HeadModel, name: str, option: str, say: Callable[[str], None]) -> None:

@@ -12,7 +12,7 @@ import torch
 
 from avatar.compute.device import CPU
 from avatar.config import load_config
-from avatar.data.manifest import parse_number
+from avatar.data.json_values import parse_number
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically

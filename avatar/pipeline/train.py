@@ -40,7 +40,7 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
     with locked(run):
         refuse_trained(run)
         chosen = choose_device(device or config.device, print)
-        subject, assets = open_subject(source, config.data.test_frames)
+        subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
         check_divided(subject.split)
         config = on_subject(config, subject)
         size = subject.image_size(config.data.size)
@@ -63,7 +63,8 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, 
     with locked(run):
         info, checkpoint = read_run_info(run), newest_checkpoint(run)
         source = moved_source(run, info, head, folder)
-        subject, assets = open_subject(source, info.config.data.test_frames)
+        held_out = info.config.data
+        subject, assets = open_subject(source, held_out.test_frames, test_cameras=held_out.test_cameras)
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
         return go_on(run, info, checkpoint, subject, assets, device)

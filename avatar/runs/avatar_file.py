@@ -20,8 +20,9 @@ from torch import Tensor
 
 from avatar.compute.memory import check_memory
 from avatar.config import Config, config_from_dict
-from avatar.data.manifest import parse_intrinsics, parse_number, parse_positions
+from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
 from avatar.data.recording import TRACK_SHAPES, Recording, checked_tracks
+from avatar.data.rig import parse_rig
 from avatar.data.split import Split
 from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
@@ -104,6 +105,7 @@ def write_avatar_file(path: Path, content: AvatarFile, licence: str | None = Non
         "head_fingerprint": recording.head_fingerprint,
         "expression_names": content.names.to_dict(),
         "head_licence": licence,
+        **({} if recording.rig is None else {"rig": recording.rig.to_dict()}),
     }
     write_atomically(path, serialize(tensors, metadata={"avatar": json.dumps(header, allow_nan=False)}))
 
@@ -159,6 +161,8 @@ def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> AvatarFile:
     for key, kind in (("name", str), ("data_hash", str), ("head_fingerprint", str), ("perceptual", str), ("step", int)):
         if not isinstance(header[key], kind):
             raise TypeError(f"{key} is a {type(header[key]).__name__}, not a {kind.__name__}")
+    rig = parse_rig(header["rig"], count) if "rig" in header else None
+    rows = count if rig is None else max(rig.times) + 1
     recording = Recording(
         name=safe_name(header["name"]),
         fps=fps,
@@ -167,9 +171,10 @@ def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> AvatarFile:
         intrinsics=intrinsics,
         names=tuple(names),
         split=Split(parse_positions(header["train"], "train", count), parse_positions(header["test"], "test", count)),
-        tracks=checked_tracks(_under(_RECORDING, tensors), count),
+        tracks=checked_tracks(_under(_RECORDING, tensors), rows),
         data_hash=header["data_hash"],
         head_fingerprint=header["head_fingerprint"],
+        rig=rig,
     )
     coefficients = recording.tracks["expression"].shape[1]
     head = _under(_HEAD, tensors)
@@ -191,7 +196,9 @@ def _parse_neutral(frame: Any, tensors: Mapping[str, Tensor], recording: Recordi
         raise ValueError(f"the neutral face has shapes {list(expression.shape)} and {list(jaw.shape)}")
     if not bool(torch.isfinite(expression).all() and torch.isfinite(jaw).all()):
         raise ValueError("the neutral face is not finite")
-    if frame is not None and (not isinstance(frame, int) or not 0 <= frame < len(recording.split.train)):
+    if frame is not None and (
+        not isinstance(frame, int) or not 0 <= frame < len(recording.moments(recording.split.train))
+    ):
         raise ValueError(f"neutral_frame is {frame!r}")
     return RestPose(expression, jaw, frame)
 

@@ -26,6 +26,7 @@ from avatar.files.atomic import write_atomically
 from avatar.tensors import describe_non_finite
 
 CHECKPOINT_FORMAT = 1
+KEPT = 3  # checkpoints of a run, the newest
 _MAX_BYTES = 2**34  # an avatar and the optimizer's two moments of it
 _MODEL = "model."  # begins the names of parameters
 _NAME = re.compile(r"step_(\d{8})\.safetensors")
@@ -40,7 +41,7 @@ class Checkpoint:
     meta: Mapping[str, Any]  # head_fingerprint, data_hash, config
 
 
-def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
+def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int = KEPT) -> Path:
     """Write RUN/checkpoints/step_N.safetensors and delete all but the newest `keep`.
 
     Raises UserError, and writes nothing, when a tensor holds a value that is not finite.

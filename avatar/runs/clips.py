@@ -31,7 +31,7 @@ class Clip:
 
 
 def own_clip(trained: TrainedAvatar, which: str, size: int | None = None) -> Clip:
-    """The held-out frames, those of training, or all of them (`which` of OWN); `size` pixels wide.
+    """The held-out frames, those of training, or all of them (`which` of OWN), one of each time; `size` pixels wide.
 
     Raises UserError where there are none.
     """
@@ -40,8 +40,9 @@ def own_clip(trained: TrainedAvatar, which: str, size: int | None = None) -> Cli
     indices: Sequence[int] = {"test": split.test, "train": split.train, "all": range(len(recording))}[which]
     if len(indices) == 0:
         raise UserError(f"the video of {recording.name} has no {which} frames")
-    frames = [(recording.params(i), recording.camera(i, size)) for i in indices]
-    return Clip(which, recording.fps, frames, tuple(indices))
+    shown = recording.moments(indices)
+    frames = [(recording.params(i), recording.camera(i, size)) for i in shown]
+    return Clip(which, recording.fps, frames, shown)
 
 
 def driven_clip(trained: TrainedAvatar, drive: Drive, size: int | None = None) -> Clip:

@@ -72,8 +72,10 @@ class TrainedAvatar:
 
     def rest_camera(self, size: int | None = None) -> Camera:
         """The camera of the neutral face, `size` pixels wide; by default as in training."""
-        train = self.recording.split.train
-        return self.recording.camera(train[self.neutral.frame or 0], self.config.data.size if size is None else size)
+        train = self.recording.moments(self.recording.split.train)
+        return self.recording.reference_camera(
+            train[self.neutral.frame or 0], self.config.data.size if size is None else size
+        )
 
     def rest_params(self) -> HeadParams:
         """The neutral face, looking ahead with open eyes."""

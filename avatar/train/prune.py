@@ -51,7 +51,7 @@ def coverage(avatar: Avatar, frame: Frame, step: int) -> Float[Tensor, "N 2"]:
     A pixel's colour is a sum of the Gaussians' colours by their weights, so that the gradient in the colours is the cover.
     """
     with torch.no_grad():
-        gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
+        gaussians = avatar(frame.params, None, frame.camera.head_rotation)
     flat = gaussians.means.new_zeros(len(gaussians.means), 1, 3).requires_grad_()
     black = flat.new_zeros(3)
     try:

@@ -43,12 +43,15 @@ class StepInputs(NamedTuple):
         frame, camera = self.frame, self.frame.camera
         named = {name: getattr(frame, name) for name in _IMAGES} | {"R": camera.R_cam_world, "t": camera.t_cam_world}
         named |= {name: getattr(frame.params, name) for name in _PARAMS}
+        named |= {} if camera.R_ref_cam is None else {"R_ref_cam": camera.R_ref_cam}
         optional = {name: getattr(self, name) for name in _OPTIONAL}
         return named | {"vertices": self.vertices} | {n: value for n, value in optional.items() if value is not None}
 
     def with_tensors(self, named: Mapping[str, Tensor]) -> StepInputs:
         """The same with other `tensors`."""
-        camera = replace(self.frame.camera, R_cam_world=named["R"], t_cam_world=named["t"])
+        camera = replace(
+            self.frame.camera, R_cam_world=named["R"], t_cam_world=named["t"], R_ref_cam=named.get("R_ref_cam")
+        )
         params = HeadParams(**{name: named[name] for name in _PARAMS})
         frame = replace(self.frame, camera=camera, params=params, **{name: named[name] for name in _IMAGES})
         return StepInputs(frame, named["vertices"], **{name: named.get(name) for name in _OPTIONAL})
@@ -92,7 +95,7 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
     if state.pose_corrections is not None:
         camera = state.pose_corrections(camera, inputs.row, inputs.pose_jacobian)
     try:
-        gaussians = avatar(params, inputs.vertices, camera.R_cam_world.detach())
+        gaussians = avatar(params, inputs.vertices, camera.head_rotation.detach())
         image = objective.draw(step, gaussians, camera, avatar)
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error

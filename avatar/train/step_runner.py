@@ -50,7 +50,7 @@ class StepRunner:
         self._state, self._noise, self._say = state, noise, say
         avatar = state.avatar
         self._device = avatar.device
-        self._meshes: dict[int, Tensor] = {}  # of the frames: they do not change while the avatar does
+        self._meshes: dict[int, Tensor] = {}  # by time: they do not change while the avatar does
         self._mesh_bytes = MESH_BYTES
         self._jacobians: dict[int, Tensor] = {}  # of the frames' cameras in their corrections
         self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_fused
@@ -59,13 +59,13 @@ class StepRunner:
         self.replayed = 0  # steps so far
 
     def vertices(self, frame: Frame) -> Float[Tensor, "V 3"]:
-        """The frame's posed mesh, metres; kept from its first use on while there is room."""
-        mesh = self._meshes.get(frame.index)
+        """The posed mesh of the frame's time, metres; kept from its first use on while there is room."""
+        mesh = self._meshes.get(frame.time)
         if mesh is None:
             mesh = self._state.avatar.vertices(frame.params)
             if mesh.nbytes <= self._mesh_bytes:
                 self._mesh_bytes -= mesh.nbytes
-                self._meshes[frame.index] = mesh
+                self._meshes[frame.time] = mesh
         return mesh
 
     def make(self, step: int, frame: Frame, judge: Judge | None) -> StepOutputs:
@@ -91,13 +91,15 @@ class StepRunner:
         noise = None if self._noise is None else to_device(self._noise.of(step), self._device)
         corrections, row, jacobian = self._state.pose_corrections, None, None
         if corrections is not None:
-            row = torch.full((1,), corrections.rows[frame.index], device=self._device)
+            row = torch.full((1,), corrections.rows[frame.time], device=self._device)
             if frame.index not in self._jacobians:
-                self._jacobians[frame.index] = to_device(corrections.jacobian(camera.R_cam_world), self._device)
+                self._jacobians[frame.index] = to_device(corrections.jacobian(camera), self._device)
             jacobian = self._jacobians[frame.index]
         if on_gpu(vertices):
             R, t = gpu_function("upload a camera's pose")(camera, self._device).float().split((9, 3))
-            frame = replace(frame, camera=replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t))
+            turn = None if camera.R_ref_cam is None else to_device(camera.R_ref_cam, self._device)
+            camera = replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t, R_ref_cam=turn)
+            frame = replace(frame, camera=camera)
         return StepInputs(frame, vertices, noise, row, jacobian)
 
     def _kind(self, step: int, frame: Frame) -> Kind | None:

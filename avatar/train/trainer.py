@@ -59,10 +59,10 @@ def train(
         colour_from_frames(avatar, subject, config.data.size)
     recording = subject.recording
     if resume is None:
-        avatar.learn_head_rotation(recording.tracks["R"][list(recording.split.train)])
+        avatar.learn_head_rotation(recording.tracks["R"][recording.times(recording.split.train)])
     neutral = find_neutral(recording.motion(recording.split.train), avatar.head)
     avatar.to(device)
-    corrections = make_pose_corrections(avatar, recording.split.train, trainer)
+    corrections = make_pose_corrections(avatar, recording.times(recording.split.train), trainer)
     optimizer = make_optimizer(avatar, trainer, corrections)
     background = torch.tensor(config.data.background).to(device)
     state = TrainState(avatar, optimizer, Objective(trainer, background, perceptual), corrections)
@@ -84,7 +84,7 @@ def train(
         tensors = module_tensors(avatar) | optimizer_tensors(optimizer, state.named_parameters())
         if corrections is not None:
             tensors[f"{PREFIX}moves"] = corrections.moves.detach()
-        save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta), trainer.keep_checkpoints)
+        save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta))
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
     frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None
@@ -143,7 +143,7 @@ def render_held_out(
     """Truth and render of the first held-out frame after `step` steps. Raises UserError when it cannot be drawn."""
     frame = next(iter(loader.frames([subject.split.test[0]])))
     try:
-        gaussians = avatar(frame.params, None, frame.camera.R_cam_world)
+        gaussians = avatar(frame.params, None, frame.camera.head_rotation)
         with checked_drawings():
             drawn = avatar.draw(gaussians, frame.camera, background)
     except CannotDraw as error:

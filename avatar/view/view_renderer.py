@@ -58,13 +58,12 @@ class ViewRenderer:
         self.trained, self.truth = trained, truth
         recording = trained.recording
         train = list(recording.split.train)
-        motion = recording.motion(train)
         rest = trained.rest_params()
         self.controls: list[ExpressionControl] = expression_controls(
-            recording.tracks["expression"][train], rest.expression, trained.avatar.head
+            recording.tracks["expression"][recording.times(train)], rest.expression, trained.avatar.head
         )
-        self.joints = joint_ranges(motion)
-        frames = list(zip((recording.camera(i) for i in train), motion, strict=True))
+        self.joints = joint_ranges(recording.motion(train))
+        frames = [(recording.camera(i), recording.params(i)) for i in train]
         self.limits: OrbitLimits = orbit_limits((trained.rest_camera(), rest), frames)
 
     @property

@@ -100,7 +100,7 @@ class Clip:
                 bad[image] = f"its {empty[0]} is empty"
         digests = {image: view.digest for image, view in self.views.items()}
         centre = None if self.head is None else self.head.neutral_vertices().mean(0).numpy()
-        return unusable(self.pairs(), self.tracking, bad, digests, centre)
+        return unusable(self.pairs(), self.tracking, bad, digests, centre, self.source.shots)
 
     def pairs(self) -> list[tuple[int, int]]:
         """(image number, tracking number) of everything that has a partner, usable or not."""
@@ -215,7 +215,7 @@ def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View],
 
 def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, Fit]:
     tracks = {image: track for image, track in clip.tracked() if clip.is_whole(image)}
-    project = MeshProjector(head, next(iter(clip.tracking.frames.values())).intrinsics)
+    project = MeshProjector(head)
 
     def measure(number: int) -> Fit | None:
         return fit_of_masks(project, tracks[number], *read_masks(clip.files, number))

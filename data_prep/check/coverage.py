@@ -12,7 +12,7 @@ from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.motion import HeadAngles, head_angles
-from data_prep.formats.tracked_folder import divide
+from data_prep.formats.division import divide
 
 MIN_TEST_FRAMES = 2
 SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120
@@ -39,7 +39,7 @@ class Coverage:
 def measure_coverage(clip: Clip, usable: list[int], test_frames: int | None) -> Coverage | Finding:
     """`usable` are image numbers. A Finding where they cannot be split."""
     try:
-        split, _ = divide(clip.source.division, usable, test_frames)
+        split, _ = divide(clip.source, usable, test_frames)
         check_divided(split)
     except UserError as error:
         return from_sentence("too-few-frames", str(error))

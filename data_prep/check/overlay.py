@@ -54,7 +54,7 @@ def draw_overlays(clip: Clip) -> list[Overlay]:
     tracks = dict(clip.tracked())
     if clip.head is None or not tracks:
         return []
-    project = MeshProjector(clip.head, next(iter(clip.tracking.frames.values())).intrinsics)
+    project = MeshProjector(clip.head)
     overlays = []
     for number in choose_frames(clip):
         try:

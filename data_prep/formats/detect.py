@@ -22,8 +22,11 @@ def open_tracked_folder(
     tracking: Path | None = None,
     format: str | None = None,
     complain: Callable[[str], object] = refuse,
+    cameras: str | None = None,
 ) -> TrackedFolder:
     """The folder in the form that `prepare` works on; `format` is one of FORMATS, or None to tell it from the files.
+
+    cameras  of a folder with several: "all", "front" or names between commas
 
     Raises UserError when the folder is in none of the formats, or in several, or not in the one that was asked for.
     What is wrong with the files of a metrical-tracker folder goes to `complain`, as in `find_frame_files`.
@@ -33,9 +36,13 @@ def open_tracked_folder(
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
+        if cameras is not None:
+            raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
         return refined.open_folder(folder)
     frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
     name = format or detect_format(folder, frames)
+    if cameras is not None and name != vhap.NAME:
+        raise UserError(f"--cameras is for folders of several cameras, and {folder} is {name}'s, of one")
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)
         return TrackedFolder(
@@ -50,6 +57,8 @@ def open_tracked_folder(
         return insta.open_folder(folder, frames, tracking)
     if tracking is not None:
         raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking is named by the listing")
+    if name == vhap.NAME:
+        return vhap.open_folder(folder, frames, cameras or vhap.ALL)
     return _LISTED[name].open_folder(folder, frames)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -56,8 +56,12 @@ def checked_tracking(
     bad: dict[int, str],
     paths: dict[int, Path],
     complain: Callable[[str], object] = refuse,
+    cameras: Mapping[int, str] | None = None,
 ) -> Tracking:
-    """Move frames with another number of coefficients to `bad`; `complain` of a camera that changes."""
+    """Move frames with another number of coefficients to `bad`; `complain` of a camera that changes.
+
+    cameras  which camera each frame is of, where there are several
+    """
     frames, bad, flaws = dict(frames), dict(bad), []
     if frames:
         first = next(iter(frames))
@@ -67,7 +71,14 @@ def checked_tracking(
                 if here != there:
                     bad[number] = f"{here} {field} coefficients where {paths[first].name} has {there}"
                     frames.pop(number, None)
-        _check_camera(frames, paths, flaws, complain)
+        of_camera: dict[str, dict[int, FrameTrack]] = {}
+        for number, frame in frames.items():
+            of_camera.setdefault("" if cameras is None else cameras[number], {})[number] = frame
+        for own in of_camera.values():
+            _check_camera(own, paths, flaws, complain)
+            lens = next(iter(own.values())).intrinsics
+            frames |= {number: replace(frame, intrinsics=lens) for number, frame in own.items()}
+        frames = dict(sorted(frames.items()))
     return Tracking(frames, dict(sorted(bad.items())), [], paths, flaws)
 
 

@@ -32,13 +32,22 @@ class RootJoint:
     def __init__(self, head: HeadAssets) -> None:
         regressor = head.joint_regressor[0].double()
         self._rest = (regressor @ head.template.double()).numpy()
+        self._regressor = regressor.numpy()
         self._identity = np.einsum("v,vcs->cs", regressor.numpy(), head.shape_dirs.double().numpy())
         self._expression = np.einsum("v,vce->ce", regressor.numpy(), head.expression_dirs.double().numpy())
 
-    def position(self, identity: np.ndarray, expression: np.ndarray) -> np.ndarray:
-        """[3] for coefficients of any number; those beyond the model's directions do not count."""
+    def position(
+        self, identity: np.ndarray, expression: np.ndarray, static_offset: np.ndarray | None = None
+    ) -> np.ndarray:
+        """[3] for coefficients of any number; those beyond the model's directions do not count.
+
+        static_offset  [at least V, 3] metres, added to the vertices of the identity, where the tracker has one
+        """
         S, E = (min(a.shape[1], len(b)) for a, b in ((self._identity, identity), (self._expression, expression)))
-        return self._rest + self._identity[:, :S] @ identity[:S] + self._expression[:, :E] @ expression[:E]
+        joint = self._rest + self._identity[:, :S] @ identity[:S] + self._expression[:, :E] @ expression[:E]
+        if static_offset is not None:
+            joint = joint + self._regressor @ static_offset[: len(self._regressor)]
+        return joint
 
 
 def camera_of_head(

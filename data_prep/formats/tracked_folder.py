@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from avatar.data.refinement import Refinement
-from avatar.data.split import Split, split_frames
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.frame_track import Tracking
 from data_prep.formats.transforms import ListedFrame
+
+
+class Shot(NamedTuple):
+    """What an image of a folder with several cameras shows."""
+
+    camera: str
+    time: int  # numbers of successive moments follow each other; between two sequences one is missing
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,7 @@ class TrackedFolder:
     notes: tuple[str, ...] = ()
     fps: float | None = None  # of the video, where the layout records it
     refinement: Refinement | None = None  # where the tracking is no longer what the tracker left
+    shots: Mapping[int, Shot] = field(default_factory=dict)  # by image number; empty where there is one camera
     read_given: Callable[[Callable[[str], object]], Tracking] | None = None  # what it left, for the same frames
 
     @property
@@ -41,28 +49,6 @@ class TrackedFolder:
                 f"--frame-offset {given}: {self.files.listings[0].name} itself says which image belongs to which "
                 "tracking; leave it out"
             )
-
-
-def divide(
-    division: Mapping[int, str | None], numbers: Sequence[int], test_frames: int | None
-) -> tuple[Split, list[str]]:
-    """Positions in `numbers` by the folder's own division, where it has one and no number of test frames is asked for, else
-    by the rule of `split_frames`; and notes on it. A single frame is all there is to drive with, and not divided
-    (`check_divided`). Raises UserError where there are too few frames."""
-    if len(numbers) == 1 and test_frames is None:
-        return Split((0,), ()), ["there is a single frame: it can drive an avatar, and none can be trained on it"]
-    parts = [division.get(number) for number in numbers]
-    listed = Split(*(tuple(i for i, part in enumerate(parts) if part == name) for name in ("train", "test")))
-    if not any(parts) or test_frames is not None:
-        return split_frames(len(numbers), test_frames), []
-    if not listed.train or not listed.test:
-        lacking = "test" if listed.train else "training"
-        return split_frames(len(numbers), test_frames), [
-            f"the folder names no {lacking} frames: its last ones are tested"
-        ]
-    left = len(parts) - len(listed.train) - len(listed.test)
-    unused = f" ({left} of validation are not used)" if left else ""
-    return listed, [f"the folder's own division into training and test frames is kept{unused}"]
 
 
 def matte_notes(files: FrameFiles) -> tuple[str, ...]:

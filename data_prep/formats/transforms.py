@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -74,14 +74,21 @@ class ListedFrame:
         if not is_path(value):
             raise UserError(f"{where} is not a path; export the folder again")
         forms = PurePosixPath(value), PureWindowsPath(value)
-        if any(form.root or form.drive or ".." in form.parts for form in forms):
+        # A UNION set of GaussianAvatars' lists frames of the sequences beside it: ../SEQUENCE/images/00000_00.png
+        beside = 1 if is_union(self.listing.parent) and forms[0].parts[0] == ".." and len(forms[0].parts) > 2 else 0
+        if any(form.root or form.drive or ".." in form.parts[beside:] for form in forms):
             raise UserError(
                 f"{where} is {value!r}, which leaves {self.listing.parent}; give a folder that holds its own frames"
             )
-        place = self.listing.parent / value
+        place = self.listing.parent.parent.joinpath(*forms[0].parts[1:]) if beside else self.listing.parent / value
         if "\\" in value and not os.path.exists(place):  # noqa: PTH110 (Path.exists raises for a name that is too long)
             place = self.listing.parent / forms[1].as_posix()  # written on Windows
         return place
+
+
+def is_union(folder: Path) -> bool:
+    """Whether a folder joins the sequences beside it, as UNION10_306_... of GaussianAvatars' data set does."""
+    return folder.name.upper().startswith("UNION")
 
 
 def is_path(value: Any) -> bool:
@@ -174,8 +181,9 @@ def read_frames(
     paths: dict[int, Path],
     read: Callable[[ListedFrame], FrameTrack],
     complain: Callable[[str], object] = refuse,
+    cameras: Mapping[int, str] | None = None,
 ) -> Tracking:
-    """`read` every frame; the BadFrames among them end up in `bad`. `complain` as in `checked_tracking`."""
+    """`read` every frame; the BadFrames among them end up in `bad`. `complain` and `cameras` as in `checked_tracking`."""
     frames: dict[int, FrameTrack] = {}
     bad: dict[int, str] = {}
     for number, frame in listed.items():
@@ -183,7 +191,7 @@ def read_frames(
             frames[number] = read(frame)
         except BadFrame as error:
             bad[number] = str(error)
-    return checked_tracking(frames, bad, paths, complain)
+    return checked_tracking(frames, bad, paths, complain, cameras)
 
 
 def frame_rate(frames: Sequence[ListedFrame]) -> tuple[float | None, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""VHAP's export, the data format of GaussianAvatars.
+"""VHAP's export, the data format of GaussianAvatars: one person, one or several cameras.
 
     FOLDER/transforms_{train,val,test}.json   or one transforms.json
     FOLDER/images/00000_00.png                `file_path`: timestep and camera
@@ -6,15 +6,19 @@
     FOLDER/flame_param/00000.npz              `flame_param_path`: one timestep's FLAME parameters
 
 An entry has `transform_matrix` (the camera in the world, OpenGL axes) and intrinsics, its own or shared (`fl_x`, `fl_y`,
-`cx`, `cy`, `w`, `h`, or `camera_angle_x`); `cy` is counted from the bottom of the picture. A parameter file has
-`translation`, `rotation`, `neck_pose`, `jaw_pose` [3], `eyes_pose` [6] as rotation vectors, `expr`, `shape` and perhaps
-`static_offset` [V, 3], whatever further axes of length 1. There are no eyelids: they are zero. The static offset is not
-used: the Gaussians learn where they belong.
+`cx`, `cy`, `w`, `h`, or `camera_angle_x`); `cy` is counted from the bottom of the picture. `camera_id` or `camera_index`
+says which camera. A parameter file has `translation`, `rotation`, `neck_pose`, `jaw_pose` [3], `eyes_pose` [6] as rotation
+vectors, `expr`, `shape` and perhaps `static_offset` [V, 3], whatever further axes of length 1. There are no eyelids: they
+are zero. The static offset moves the root joint; else it is not used: the Gaussians learn where they belong.
+
+A UNION folder holds listings alone, of frames in the sequences' folders beside it (`../SEQUENCE/images/...`). Each of these
+has a world of its own and may have an identity of its own; that of the first frame is used for all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,36 +26,43 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
+from data_prep.formats.division import named_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, vector
 from data_prep.formats.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
-from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
+from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.formats.transforms import (
     OPENCV_FROM_OPENGL,
     ListedFrame,
     camera_pose,
     frame_rate,
+    is_union,
     pinhole,
     read_frames,
 )
 
 NAME = "VHAP"
 NAMES = KindNames("fg_masks/", "head masks", "mouth masks", images="images/", tracking="flame_param/")
+ALL, FRONT = "all", "front"  # what --cameras may say beside names
 
 
 def recognise(frames: list[ListedFrame]) -> bool:
     return any("flame_param_path" in frame.values for frame in frames[:1])
 
 
-def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
-    """Raises UserError for paths outside the folder and for frames without parameters."""
-    frames, notes = _one_camera(frames)
+def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> TrackedFolder:
+    """`cameras` is "all", "front" or names between commas.
+
+    Raises UserError for paths outside the folder, frames without parameters, and cameras that there are not.
+    """
+    frames, notes = _chosen(frames, cameras, folder)
     listed = numbered(frames)
     parameters = {number: _parameter_file(frame) for number, frame in listed.items()}
     images = {number: frame.image for number, frame in listed.items()}
+    shots = _shots(listed, parameters)
     mattes = existing({number: frame.path("fg_mask_path") for number, frame in listed.items()})
     files = FrameFiles(
-        folder=folder,
+        folder=folder.parent if is_union(folder) else folder,
         images=images,
         alphas=mattes or transparent(images),
         head_masks={},
@@ -62,12 +73,16 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
     )
 
     def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        root = RootJoint(head)
-        return read_frames(listed, parameters, lambda frame: _read_frame(frame, root, size), complain)
+        root, read_file = RootJoint(head), _OnceRead()
+        of = {number: shot.camera for number, shot in shots.items()} or None
+        tracking = read_frames(
+            listed, parameters, lambda frame: _read_frame(frame, read_file(frame), root, size), complain, of
+        )
+        return _one_identity(tracking) if is_union(folder) else tracking
 
     fps, fps_notes = frame_rate(frames)
     notes = (*notes, *matte_notes(files), *fps_notes)
-    return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()}, notes, fps)
+    return TrackedFolder(NAME, files, read, {n: frame.split for n, frame in listed.items()}, notes, fps, shots=shots)
 
 
 def _parameter_file(frame: ListedFrame) -> Path:
@@ -77,22 +92,36 @@ def _parameter_file(frame: ListedFrame) -> Path:
     return path
 
 
-def _read_frame(frame: ListedFrame, root: RootJoint, size: tuple[int, int]) -> FrameTrack:
-    raw = _parameters(frame)
+class _OnceRead:
+    """Parameter files, which the cameras' frames of one time share."""
 
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._content: dict[str, np.ndarray] = {}
+
+    def __call__(self, frame: ListedFrame) -> dict[str, np.ndarray]:
+        path = _parameter_file(frame)
+        if path != self._path:
+            self._path, self._content = None, _parameters(frame)
+            self._path = path
+        return self._content
+
+
+def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint, size: tuple[int, int]) -> FrameTrack:
     def values(key: str, count: int | None = None) -> np.ndarray:
         if key not in raw:
             raise BadFrame(f"{key} is missing in {_parameter_file(frame).name}")
         return vector(raw[key], key, count)
 
     expression, shape = values("expr"), values("shape")
+    offset = values("static_offset").reshape(-1, 3) if _has_offset(raw) else None
     R_cam_world, t_cam_world = _opencv_pose(frame)
     R, t = camera_of_head(
         R_cam_world,
         t_cam_world,
         rotation_matrix(values("rotation", 3)),
         values("translation", 3),
-        root.position(shape, expression),
+        root.position(shape, expression, offset),
     )
     intrinsics, tracked_size = pinhole(frame, size)
     intrinsics[3] = tracked_size[1] - intrinsics[3]
@@ -110,6 +139,14 @@ def _read_frame(frame: ListedFrame, root: RootJoint, size: tuple[int, int]) -> F
     )
 
 
+def _has_offset(raw: dict[str, np.ndarray]) -> bool:
+    if "static_offset" not in raw or raw["static_offset"].size == 0:
+        return False
+    if raw["static_offset"].size % 3:
+        raise BadFrame(f"static_offset has {raw['static_offset'].size} values, not three for each vertex")
+    return True
+
+
 def _parameters(frame: ListedFrame) -> dict[str, np.ndarray]:
     file = _parameter_file(frame)
     try:
@@ -123,18 +160,77 @@ def _opencv_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:
     return OPENCV_FROM_OPENGL @ R, OPENCV_FROM_OPENGL @ t
 
 
-def _one_camera(frames: list[ListedFrame]) -> tuple[list[ListedFrame], tuple[str, ...]]:
-    """The frames of the camera that sees the face most from the front: the method is for one moving picture."""
+def _by_camera(frames: list[ListedFrame]) -> dict[str, list[ListedFrame]]:
+    """The frames of each camera, by its name, in the order in which the cameras come."""
     by_camera: dict[str, list[ListedFrame]] = {}
     for frame in frames:
-        by_camera.setdefault(str(frame.values.get("camera_id", frame.values.get("camera_index"))), []).append(frame)
-    if len(by_camera) == 1:
+        by_camera.setdefault(_camera(frame), []).append(frame)
+    return by_camera
+
+
+def _chosen(frames: list[ListedFrame], cameras: str, folder: Path) -> tuple[list[ListedFrame], tuple[str, ...]]:
+    """The frames of the chosen cameras, and a note where these are not all."""
+    by_camera = _by_camera(frames)
+    if cameras == ALL:
         return frames, ()
+    try:
+        chosen = {_front(by_camera)} if cameras == FRONT else named_cameras(cameras, by_camera)
+    except UserError as error:
+        raise UserError(f"--cameras: {error} in {folder} (or say {ALL} or {FRONT})") from None
+    if chosen is None or chosen == by_camera.keys():
+        return frames, ()
+    names, are = ", ".join(sorted(chosen)), "is" if len(chosen) == 1 else "are"
+    note = f"of the folder's {len(by_camera)} cameras {names} {are} used"
+    return [frame for frame in frames if _camera(frame) in chosen], (note,)
+
+
+def _camera(frame: ListedFrame) -> str:
+    return str(frame.values.get("camera_id", frame.values.get("camera_index")))
+
+
+def _shots(listed: dict[int, ListedFrame], parameters: dict[int, Path]) -> dict[int, Shot]:
+    """Camera and time of each frame; empty where there is one camera. The frames of one parameter file are of one time.
+
+    Raises UserError for two frames of one camera at one time.
+    """
+    if len({_camera(frame) for frame in listed.values()}) == 1:
+        return {}
+    time, times, seen = -1, {}, {}
+    shots: dict[int, Shot] = {}
+    before: Path | None = None
+    for number, frame in listed.items():
+        path = parameters[number]
+        if path not in times:
+            time += 1 if before is None or path.parent == before.parent else 2  # another sequence
+            times[path] = time
+            before = path
+        shot = Shot(_camera(frame), times[path])
+        if shot in seen:
+            raise UserError(
+                f"{frame.listing}: frames {listed[seen[shot]].position} and {frame.position} are both of camera "
+                f"{shot.camera} with {path.name}; each needs a camera_id or camera_index, or a parameter file, of its own"
+            )
+        seen[shot] = number
+        shots[number] = shot
+    return shots
+
+
+def _one_identity(tracking: Tracking) -> Tracking:
+    """With the identity of the first frame in all: each sequence of a UNION set was tracked by itself."""
+    if not tracking.frames:
+        return tracking
+    first = next(iter(tracking.frames.values())).shape
+    same = {number: replace(track, shape=first) for number, track in tracking.frames.items()}
+    changed = any(not np.array_equal(track.shape, first) for track in tracking.frames.values())
+    notes = ["the sequences have an identity each: that of the first is used for all"] if changed else []
+    return replace(tracking, frames=same, notes=[*tracking.notes, *notes])
+
+
+def _front(by_camera: dict[str, list[ListedFrame]]) -> str:
+    """The camera that sees the face most from the front, among those with training frames."""
     trained = {name: own for name, own in by_camera.items() if any(frame.split in ("train", None) for frame in own)}
     candidates = trained or by_camera
-    best = max(candidates, key=lambda name: _frontality(candidates[name][0]))
-    note = f"the folder has {len(by_camera)} cameras; camera {best}, which sees the face most from the front, is used"
-    return by_camera[best], (note,)
+    return max(candidates, key=lambda name: _frontality(candidates[name][0]))
 
 
 def _frontality(frame: ListedFrame) -> float:

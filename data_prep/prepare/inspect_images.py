@@ -13,6 +13,7 @@ import numpy as np
 from avatar.data.images import decode_image, read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
+from data_prep.formats.tracked_folder import Shot
 from data_prep.prepare.mask_values import judge_values, mask_kinds, refuse_colours
 
 _SAMPLES = 16
@@ -24,8 +25,9 @@ _MIN_BACKGROUND = 0.02  # of the image; with less there is nothing to judge by
 
 @dataclass(frozen=True)
 class Inspection:
-    width: int
+    width: int  # of the first image
     height: int
+    sizes: dict[int, tuple[int, int]]  # image number -> width, height
     digests: dict[int, bytes]  # image number -> hash of the contents of image and masks
     image_digests: dict[int, bytes]
     bad: dict[int, str]  # image number -> why it cannot be used
@@ -41,8 +43,8 @@ class _Seen:
     problem: str | None
 
 
-def inspect_images(files: FrameFiles) -> Inspection:
-    """Decode everything once. Raises UserError when sizes differ or masks are not 0 to 255, naming both sides."""
+def inspect_images(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -> Inspection:
+    """Decode everything once. Raises UserError when sizes differ within a camera or masks are not 0 to 255, naming both."""
     refuse_colours(files)
     images = _look_at(files.images, decode_image)
     bad = {n: seen.problem for n, seen in images.items() if seen.problem is not None}
@@ -52,12 +54,13 @@ def inspect_images(files: FrameFiles) -> Inspection:
             f"none of the {len(images)} images in {next(iter(files.images.values())).parent} can be read: "
             f"{next(iter(bad.values()))}"
         )
-    first = next(iter(sizes))
+    first_of: dict[str, int] = {}
     for number, size in sizes.items():
+        first = first_of.setdefault(shots[number].camera if shots else "", number)
         if size != sizes[first]:
             raise UserError(
                 f"{files.images[number]} is {_x(size)} pixels but {files.images[first].name} is {_x(sizes[first])}; "
-                "all frames must have one size"
+                f"all frames{' of a camera' if shots else ''} must have one size"
             )
     digests = {n: [seen.digest] for n, seen in images.items()}
     notes: list[str] = []
@@ -70,9 +73,9 @@ def inspect_images(files: FrameFiles) -> Inspection:
             digests[number].append(seen.digest)
             if seen.problem is not None:
                 bad.setdefault(number, seen.problem)
-            elif seen.size != sizes[first]:
+            elif seen.size != sizes.get(number, seen.size):
                 raise UserError(
-                    f"{paths[number]} is {_x(seen.size)} pixels but the images are {_x(sizes[first])}; "
+                    f"{paths[number]} is {_x(seen.size)} pixels but the images are {_x(sizes[number])}; "
                     "make the masks at the size of the images"
                 )
             elif kind != MOUTH and seen.brightest == 0:
@@ -86,10 +89,11 @@ def inspect_images(files: FrameFiles) -> Inspection:
             notes += [note] if note else []
         for number in files.images.keys() - masks.keys():
             bad.setdefault(number, f"it has no {_ONE[kind]}")
-    width, height = sizes[first]
+    width, height = next(iter(sizes.values()))
     return Inspection(
         width=width,
         height=height,
+        sizes=sizes,
         digests={n: hashlib.blake2b(b"".join(parts), digest_size=16).digest() for n, parts in digests.items()},
         image_digests={n: seen.digest for n, seen in images.items()},
         bad=dict(sorted(bad.items())),

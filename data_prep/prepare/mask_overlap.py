@@ -46,10 +46,10 @@ class Fit:
 class MeshProjector:
     """Tracked frames -> Mesh at the measured size. The faces of skin and lips are found once."""
 
-    def __init__(self, head: HeadModel, intrinsics: np.ndarray) -> None:
+    def __init__(self, head: HeadModel) -> None:
         regions = head.assets.regions
         neck = np.concatenate([regions[name].numpy() for name in _NECK if name in regions] or [np.zeros(0, np.int64)])
-        self._head, self._intrinsics = head, intrinsics
+        self._head = head
         self._faces = head.faces.numpy()
         self._skin = self._faces[~np.isin(self._faces, neck).any(axis=1)]
         self._lips = region_faces(head, "lips")
@@ -58,7 +58,7 @@ class MeshProjector:
         self._vertices = np.flatnonzero(~on_neck)
 
     def __call__(self, track: FrameTrack, width: int, height: int) -> Mesh:
-        screen = project_head(self._head, track, self._intrinsics, width, height)
+        screen = project_head(self._head, track, track.intrinsics, width, height)
         return Mesh(screen, self._faces, self._skin, self._lips, self._vertices)
 
 

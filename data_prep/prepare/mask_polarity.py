@@ -99,7 +99,7 @@ def _frames(
     if not usable or not tracks:
         return
     tracked = list(tracks.values())
-    project = MeshProjector(head, tracked[0].intrinsics)
+    project = MeshProjector(head)
     decoders = files.decoders()
     places = np.linspace(0, len(tracked) - 1, len(usable)).round().astype(int).tolist()
     for number, place in sample(list(zip(usable, places, strict=True))):
@@ -110,5 +110,6 @@ def _frames(
                 size = measured_size(pixels.shape[1], pixels.shape[0])
                 masks[kind] = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         if size is not None:
-            mesh = project(tracked[place], *size)
+            own = tracks.get(number) if files.listings else None  # a listing pairs them; else a head hardly moves
+            mesh = project(own or tracked[place], *size)
             yield _Frame(number, masks, silhouette(mesh.screen, mesh.skin_faces, *size) > 0)

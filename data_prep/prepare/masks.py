@@ -49,15 +49,15 @@ def derive_masks(
             if kind == "derived":
                 (building / str(path)).parent.mkdir()
     lips = region_faces(model, "lips")
-    size = manifest.width, manifest.height
     for record, (image, number) in zip(manifest.frames, pairs, strict=True):
         head, mouth = read_masks(files, image) if image in files.parsing else (None, None)
         if manifest.head_masks == "derived" and head is not None:
             _write(building / str(record.head_mask), head)
         if manifest.mouth_masks == "derived":
             if mouth is None:
-                screen = project_head(model, tracks.frames[number], np.array(manifest.intrinsics), *size)
-                mouth = filled_lips(screen, lips, *size).astype(np.uint8) * 255
+                track = tracks.frames[number]
+                screen = project_head(model, track, track.intrinsics, *track.size)
+                mouth = filled_lips(screen, lips, *track.size).astype(np.uint8) * 255
             _write(building / str(record.mouth_mask), mouth)
 
 

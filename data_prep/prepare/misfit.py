@@ -26,6 +26,7 @@ from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.frame_track import FrameTrack
+from data_prep.formats.tracked_folder import Shot
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.masks import read_masks
 
@@ -37,6 +38,7 @@ MIN_PIXELS_AWAY = 1.5  # masks of tiny pictures are no better than that
 MAX_OUTSIDE = 0.01  # of the head's vertices
 CUT_OFF = "what is cut off cannot be learned"
 SAMPLED_FRAMES = 24
+SAMPLED_OF_A_CAMERA = 6  # of several
 NO_MASKS = "there are no masks to confirm it with"
 ADVICE = (
     "is the head model the one that the tracking was made with, and the tracking of this video? Give the right one "
@@ -64,14 +66,34 @@ def judge_sample(
     """The judgement on a few frames spread over `pairs` of image number and tracking number, all of which can be read."""
     if not pairs:
         return judge([], files)
-    project = MeshProjector(head, next(iter(tracks.values())).intrinsics)
+    project = MeshProjector(head)
     fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in sample(pairs)]
     return judge([fit for fit in fits if fit is not None], files)
 
 
-def sample(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """At most `SAMPLED_FRAMES` of them, from the first to the last."""
-    return [pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), SAMPLED_FRAMES))]
+def refuse_misplaced_cameras(
+    head: HeadModel,
+    tracks: Mapping[int, FrameTrack],
+    files: FrameFiles,
+    pairs: Sequence[tuple[int, int]],
+    shots: Mapping[int, Shot],
+) -> None:
+    """Raise UserError for a camera of several in whose pictures the head is not where its pose puts it."""
+    project = MeshProjector(head)
+    for camera in dict.fromkeys(shot.camera for shot in shots.values()):
+        own = sample([pair for pair in pairs if shots[pair[0]].camera == camera], SAMPLED_OF_A_CAMERA)
+        fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in own]
+        problem = judge([fit for fit in fits if fit is not None], files).problem
+        if problem is not None:
+            raise UserError(
+                f"camera {camera}: {problem}; is its calibration right? Leave it out (--cameras), or --ignore-misfit to go "
+                "on regardless"
+            )
+
+
+def sample(pairs: Sequence[tuple[int, int]], most: int = SAMPLED_FRAMES) -> list[tuple[int, int]]:
+    """At most so many of them, from the first to the last."""
+    return [pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), most))]
 
 
 def judge(fits: Sequence[Fit], files: FrameFiles) -> Judgement:

@@ -47,14 +47,16 @@ def open_subject(
     test_frames: int | None = None,
     say: Callable[[str], object] = print,
     assets: HeadAssets | None = None,
+    test_cameras: str | None = None,
 ) -> tuple[Subject, HeadAssets]:
     """Prepare the subject (from the cache when nothing changed) and open it with its head model.
 
-    `assets` spares reading the head model where it is known. Raises UserError as `prepare` does.
+    `assets` spares reading the head model where it is known. What is held out as in `prepare`, which also says what is
+    raised.
     """
     check_folder(source.folder)
     if assets is None:
         assets = load_head_assets(source.head)
         for note in assets.notes:
             say(f"note: {note}")
-    return Subject.open(prepare(source, assets, test_frames=test_frames, say=say)), assets
+    return Subject.open(prepare(source, assets, test_frames=test_frames, test_cameras=test_cameras, say=say)), assets

@@ -10,6 +10,7 @@ import numpy as np
 from avatar.errors import UserError
 from data_prep.formats.frame_files import FrameFiles, describe_numbers, gaps
 from data_prep.formats.frame_track import Tracking
+from data_prep.formats.tracked_folder import Shot
 from data_prep.prepare.frame_offset import RADIUS
 from data_prep.prepare.inspect_images import Inspection
 
@@ -51,6 +52,7 @@ def pair_frames(
     offset: int,
     head_centre: np.ndarray,
     max_left_out: float,
+    shots: Mapping[int, Shot] | None = None,
 ) -> Pairing:
     """Pair image n + offset with tracking n; leave out what is bad on either side or repeats its neighbour's tracking.
 
@@ -64,7 +66,7 @@ def pair_frames(
             f"tracking is {_range(files.tracking)}; give another --frame-offset"
         )
     _refuse_if_unpaired(files, len(numbered), offset, max_left_out)
-    left_out = unusable(numbered, tracking, inspection.bad, inspection.image_digests, head_centre)
+    left_out = unusable(numbered, tracking, inspection.bad, inspection.image_digests, head_centre, shots)
     refuse_if_many(left_out, len(numbered), "frames", max_left_out)
     return Pairing(tuple(pair for pair in numbered if pair[0] not in left_out), left_out, notes)
 
@@ -75,27 +77,31 @@ def unusable(
     bad: Mapping[int, str],
     digests: Mapping[int, bytes],
     head_centre: np.ndarray | None,
+    shots: Mapping[int, Shot] | None = None,
 ) -> dict[int, str]:
     """Image number -> why the frame cannot be used, for pairs of image number and tracking number.
 
     `bad` says which images cannot be used, `digests` are of all of them; without a head model, none lies behind the camera.
+    With `shots` of several cameras each picture is compared with the one before of the same camera.
     """
     left_out: dict[int, str] = {}
-    previous: tuple[int, np.ndarray] | None = None
+    previous: dict[str, tuple[int, int, np.ndarray]] = {}  # by camera: time, image, tracking
     for image, number in pairs:
         if number in tracking.bad:
             left_out[image] = tracking.bad[number]
             continue
         track = tracking.frames[number]
         values = track.moving_values()
-        repeats = previous is not None and previous[0] == number - 1 and np.array_equal(previous[1], values)
+        camera, time = shots[image] if shots else ("", number)
+        before = previous.get(camera)
+        repeats = before is not None and before[0] == time - 1 and np.array_equal(before[2], values)
         if image in bad:
             left_out[image] = bad[image]
         elif head_centre is not None and (track.R @ head_centre + track.t)[2] <= 0:
             left_out[image] = BEHIND_CAMERA
-        elif repeats and digests[image] != digests.get(image - 1):
+        elif before is not None and repeats and digests[image] != digests[before[1]]:
             left_out[image] = REPEATS
-        previous = number, values
+        previous[camera] = time, image, values
     return left_out
 
 

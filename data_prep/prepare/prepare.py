@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,18 +18,20 @@ from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.formats.detect import open_tracked_folder
+from data_prep.formats.division import divide
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
-from data_prep.formats.frame_track import Tracking, fit_coefficients
-from data_prep.formats.tracked_folder import TrackedFolder, divide
+from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
+from data_prep.formats.tracked_folder import Shot, TrackedFolder
 from data_prep.prepare.cache import default_location, input_hash
 from data_prep.prepare.frame_offset import detect_offset
 from data_prep.prepare.inspect_images import Inspection, composited_background, inspect_images
 from data_prep.prepare.mask_polarity import polarity_problems
 from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.masks import derive_masks
-from data_prep.prepare.misfit import judge_sample
+from data_prep.prepare.misfit import judge_sample, refuse_misplaced_cameras
 from data_prep.prepare.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from data_prep.prepare.projection import region_faces
+from data_prep.prepare.rig import FoundRig, Pose, find_rig
 from data_prep.prepare.still_parts import still_parts
 from data_prep.prepare.write_prepared import is_current, write_prepared
 
@@ -41,13 +44,14 @@ def prepare(
     *,
     out: Path | str | None = None,
     test_frames: int | None = None,
+    test_cameras: str | None = None,
     say: Callable[[str], object] = print,
 ) -> Path:
     """Prepare a tracked folder and return the prepared subject's folder; nothing is done when it is up to date.
 
     `head` is the head model that `source.head` names; `out` defaults to a folder in the cache (see `cache_folder`). `say`
-    receives one sentence per finding. Raises UserError with the file or frame and what to do when the folder cannot be
-    used.
+    receives one sentence per finding. `test_frames` and `test_cameras` say what is held out, as in `divide`. Raises
+    UserError with the file or frame and what to do when the folder cannot be used.
     """
     folder = Path(source.folder).resolve()
     if source.fps is not None and not 0 < source.fps <= MAX_FPS:  # a NaN is refused too
@@ -55,12 +59,14 @@ def prepare(
     if not 0 <= source.max_left_out <= 1:
         raise UserError(f"--max-left-out must be from 0 to 1, not {source.max_left_out:g}")
     tracking = None if source.tracking is None else Path(source.tracking).resolve()
-    tracked = open_tracked_folder(folder, tracking, source.format)
+    tracked = open_tracked_folder(folder, tracking, source.format, cameras=source.cameras)
     files = tracked.files
     options = {
         "offset": source.frame_offset,
         "format": tracked.format,
         "test_frames": test_frames,
+        "cameras": source.cameras,
+        "test_cameras": test_cameras,
         "fps": source.fps,
         "max_left_out": source.max_left_out,
         "ignore_misfit": source.ignore_misfit,
@@ -75,7 +81,7 @@ def prepare(
 
     say(f"format: {tracked.format}")
     files, label_notes = with_labels(files)
-    inspection = inspect_images(files)
+    inspection = inspect_images(files, tracked.shots)
     refuse_if_many(inspection.bad, len(files.images), "images", source.max_left_out)
     tracks = tracked.read(head, (inspection.width, inspection.height), refuse)
     refuse_if_many(tracks.bad, len(files.tracking), "tracking files", source.max_left_out)
@@ -85,28 +91,24 @@ def prepare(
         )
     tracks = fit_coefficients(tracks, head)
     first = next(iter(tracks.frames.values()))
-    if first.size != (inspection.width, inspection.height):
-        raise UserError(
-            f"the tracking was made on {first.size[0]}x{first.size[1]} images, but those in "
-            f"{next(iter(files.images.values())).parent} are {inspection.width}x{inspection.height}; resize the images "
-            "or track them again"
-        )
+    _check_sizes(files, tracks, inspection, bool(tracked.shots))
     model = HeadModel(head, torch.from_numpy(first.shape))
     if not source.ignore_misfit:
         for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, inspection.bad):
             refuse(problem)
     offset, evidence = _find_offset(replace(tracked, files=files), model, tracks, inspection, source)
     centre = model.neutral_vertices().mean(0).numpy()
-    pairing = pair_frames(files, inspection, tracks, offset, centre, source.max_left_out)
+    pairing = pair_frames(files, inspection, tracks, offset, centre, source.max_left_out, tracked.shots)
     judgement = judge_sample(model, tracks.frames, files, pairing.pairs)
     if not source.ignore_misfit:
         judgement.refuse()
+        refuse_misplaced_cameras(model, tracks.frames, files, pairing.pairs, tracked.shots)
     evidence = f"{evidence}: {judgement.evidence}"
     say(evidence)
     has_lips = len(region_faces(model, "lips")) > 0
-    frames_split, split_notes = divide(tracked.division, [number for _, number in pairing.pairs], test_frames)
+    frames_split, split_notes = divide(tracked, [number for _, number in pairing.pairs], test_frames, test_cameras)
     ignored = [f"{judgement.problem}: taken regardless, as --ignore-misfit says"] if judgement.problem else []
-    parts = still_parts([tracks.frames[n] for _, n in pairing.pairs], head)
+    parts = still_parts(_of_one_camera(tracks, pairing, tracked.shots), head)
     still = [part.sentence for part in parts if not part.is_absent]
     assumed = _assumptions(files, inspection, has_lips)
     notes = [
@@ -127,9 +129,13 @@ def prepare(
     if pairing.left_out:
         total = len(pairing.pairs) + len(pairing.left_out)
         say(f"warning: left out {len(pairing.left_out)} of {total} frames: {describe_reasons(pairing.left_out)}")
-    arrays = _stack_tracks(tracks, pairing)
+    used = [tracks.frames[number] for _, number in pairing.pairs]
+    shots = [tracked.shots[image] for image, _ in pairing.pairs if tracked.shots]
+    found = find_rig(shots, used) if shots else None
+    arrays = _stack_tracks(used) if found is None else _stack_tracks(found.rows, found.heads)
     if tracked.read_given is not None:
-        given = _stack_tracks(fit_coefficients(tracked.read_given(refuse), head), pairing)
+        given_tracks = fit_coefficients(tracked.read_given(refuse), head)
+        given = _stack_tracks([given_tracks.frames[number] for _, number in pairing.pairs])
         arrays |= {f"{GIVEN}{name}": array for name, array in given.items()}
     names = files.frame_names()
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
@@ -137,15 +143,15 @@ def prepare(
     manifest = Manifest(
         name=safe_name(folder.name),
         format=tracked.format,
-        source=str(folder),
+        source=str(files.folder),
         tracking=str(next(iter(files.tracking.values())).parent),
-        width=inspection.width,
-        height=inspection.height,
+        width=first.size[0] if found is None else found.rig.cameras[0].width,
+        height=first.size[1] if found is None else found.rig.cameras[0].height,
         fps=float(source.fps or tracked.fps or DEFAULT_FPS),
-        intrinsics=tuple(first.intrinsics.tolist()),
+        intrinsics=tuple(first.intrinsics.tolist()) if found is None else found.rig.cameras[0].intrinsics,
         frame_offset=offset,
         offset_evidence=evidence,
-        frames=_records(files, names, pairing, head_kind, mouth_kind),
+        frames=_records(files, names, pairing, head_kind, mouth_kind, tracked.shots),
         train=frames_split.train,
         test=frames_split.test,
         left_out={names[n]: reason for n, reason in pairing.left_out.items()},
@@ -155,8 +161,9 @@ def prepare(
         head_path=head_path,
         head_fingerprint=head.fingerprint,
         input_hash=inputs,
-        data_hash=_data_hash(inspection, pairing, arrays, first.intrinsics),
+        data_hash=_data_hash(inspection, pairing, arrays, first.intrinsics, found),
         refinement=tracked.refinement,
+        rig=None if found is None else found.rig,
         labels={
             mask: files.labels[kind]
             for mask, kind in zip(MASKS, (ALPHA, HEAD, MOUTH), strict=True)
@@ -209,16 +216,37 @@ def _assumptions(files: FrameFiles, inspection: Inspection, has_lips: bool) -> l
     return notes
 
 
-def _stack_tracks(tracks: Tracking, pairing: Pairing) -> dict[str, np.ndarray]:
-    used = [tracks.frames[number] for _, number in pairing.pairs]
+def _check_sizes(files: FrameFiles, tracks: Tracking, inspection: Inspection, is_rig: bool) -> None:
+    """Raise UserError where the tracking is not of the images' size."""
+    for number, track in tracks.frames.items():
+        size = inspection.sizes.get(number) if is_rig else (inspection.width, inspection.height)
+        if size not in (None, track.size):
+            seen = (
+                f"{files.images[number]} is" if is_rig else f"those in {next(iter(files.images.values())).parent} are"
+            )
+            raise UserError(
+                f"the tracking was made on {track.size[0]}x{track.size[1]} images, but {seen} {size[0]}x{size[1]}; resize "
+                "the images or track them again"
+            )
+
+
+def _stack_tracks(used: Sequence[FrameTrack], heads: Sequence[Pose] | None = None) -> dict[str, np.ndarray]:
+    """The tracks of a recording: `heads` in place of the frames' own poses, where they are given."""
     moving = ("expression", "jaw", "eyes", "eyelids", "neck", "R", "t")
     arrays = {name: np.stack([getattr(track, name) for track in used]) for name in moving}
+    if heads is not None:
+        arrays |= {"R": np.stack([head.R for head in heads]), "t": np.stack([head.t for head in heads])}
     arrays["shape"] = used[0].shape
     return {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in sorted(arrays.items())}
 
 
 def _records(
-    files: FrameFiles, names: dict[int, str], pairing: Pairing, head_kind: str, mouth_kind: str
+    files: FrameFiles,
+    names: dict[int, str],
+    pairing: Pairing,
+    head_kind: str,
+    mouth_kind: str,
+    shots: Mapping[int, Shot],
 ) -> tuple[FrameRecord, ...]:
     def inside(paths: dict[int, Path], number: int) -> str | None:
         return paths[number].relative_to(files.folder).as_posix() if paths else None
@@ -230,7 +258,7 @@ def _records(
         FrameRecord(
             name=names[image],
             image=files.images[image].relative_to(files.folder).as_posix(),
-            tracking=number,
+            tracking=shots[image].time if shots else number,
             alpha=inside(files.alphas, image),
             head_mask=mask(head_kind, HEAD_FOLDER, files.head_masks, image),
             mouth_mask=mask(mouth_kind, MOUTH_FOLDER, files.mouth_masks, image),
@@ -239,8 +267,22 @@ def _records(
     )
 
 
-def _data_hash(inspection: Inspection, pairing: Pairing, arrays: dict[str, np.ndarray], intrinsics: np.ndarray) -> str:
+def _of_one_camera(tracks: Tracking, pairing: Pairing, shots: Mapping[int, Shot]) -> list[FrameTrack]:
+    """The tracks of all frames; with several cameras of those of the first one."""
+    first = next(iter(shots.values())).camera if shots else None
+    return [tracks.frames[n] for image, n in pairing.pairs if first is None or shots[image].camera == first]
+
+
+def _data_hash(
+    inspection: Inspection,
+    pairing: Pairing,
+    arrays: dict[str, np.ndarray],
+    intrinsics: np.ndarray,
+    found: FoundRig | None,
+) -> str:
     digest = hashlib.sha256(intrinsics.tobytes())
+    if found is not None:
+        digest.update(json.dumps(found.rig.to_dict()).encode())
     for name, array in arrays.items():
         digest.update(f"{name} {array.shape}".encode() + array.tobytes())
     for image, _ in pairing.pairs:

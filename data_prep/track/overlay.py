@@ -38,7 +38,7 @@ def write_overlay(
 ) -> None:
     """FOLDER/overlay.mp4 of all frames, and FOLDER/overlay.jpg of some that are spread over the clip."""
     first = next(iter(tracks.values()))
-    project = MeshProjector(head, first.intrinsics)
+    project = MeshProjector(head)
     scale = min(1.0, _WIDEST / max(first.size))
     width, height = round(first.size[0] * scale), round(first.size[1] * scale)
     numbers = list(tracks)

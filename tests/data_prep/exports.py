@@ -23,6 +23,7 @@ from avatar.head.assets import HeadAssets, load_head_assets
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes <-> OpenGL camera axes
 R_CAM_WORLD = cv2.Rodrigues(np.array([0.3, -0.2, 0.1]))[0] @ OPENGL  # any camera that is not at the origin
 T_CAM_WORLD = np.array([0.05, -0.1, 0.9])
+STATIC_OFFSET = 2e-3  # metres, of every vertex of VHAP's head
 SPLIT = {"train": slice(0, 16), "val": slice(16, 18), "test": slice(18, None)}
 INSTA_RED = {1: 250, 13: 120, 16: 90}  # skin, lower lip, cloth
 
@@ -106,7 +107,8 @@ def write_vhap(
         write_image(folder / "images" / f"{name}.png", shot.image)
         if masks:
             write_image(folder / "fg_masks" / f"{name}.png", shot.head)
-        root = root_joint(head, shot)
+        # Joints come from the shape with the static offset, and the regressor's weights sum to 1.
+        root = root_joint(head, shot) + STATIC_OFFSET
         rotation = R_CAM_WORLD.T @ shot.R
         values = {
             "translation": (R_CAM_WORLD.T @ (shot.t - T_CAM_WORLD) - root + rotation @ root)[None],
@@ -116,7 +118,7 @@ def write_vhap(
             "eyes_pose": axis_angle(shot.flame["eyes"])[None],
             "shape": shot.flame["shape"],
             "expr": np.pad(shot.flame["exp"], (0, 90))[None],
-            "static_offset": np.full((1, head.num_vertices, 3), 1e-4),
+            "static_offset": np.full((1, head.num_vertices + 5, 3), STATIC_OFFSET),  # its head has teeth as well
         }
         edit(step, values)
         (folder / "flame_param").mkdir(exist_ok=True)

@@ -1,0 +1,92 @@
+"""Which frames of a tracked folder are trained on, and which are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+from avatar.data.split import Split, split_frames
+from avatar.errors import UserError
+from data_prep.formats.tracked_folder import Shot, TrackedFolder
+
+NO_CAMERA = "none"
+
+
+def divide(
+    tracked: TrackedFolder, numbers: Sequence[int], test_frames: int | None = None, test_cameras: str | None = None
+) -> tuple[Split, list[str]]:
+    """Positions in `numbers` by the folder's own division, where it has one and no number of test frames is asked for, else
+    by the rule of `split_frames`; and notes on it. A single frame is all there is to drive with, and not divided
+    (`check_divided`). With several cameras, times are divided, and cameras may be held out as well.
+
+    test_frames   frames held out at the end; with several cameras, times
+    test_cameras  names between commas, or "none"; None: as the folder says
+    Raises UserError where there are too few frames, and for cameras that there are not.
+    """
+    division, shots = tracked.division, tracked.shots
+    if shots:
+        return _divide_shots(division, [shots[number] for number in numbers], numbers, test_frames, test_cameras)
+    if test_cameras not in (None, NO_CAMERA):
+        raise UserError(f"data.test_cameras={test_cameras}: the frames are all of one camera")
+    if len(numbers) == 1 and test_frames is None:
+        return Split((0,), ()), ["there is a single frame: it can drive an avatar, and none can be trained on it"]
+    parts = [division.get(number) for number in numbers]
+    listed = Split(*(tuple(i for i, part in enumerate(parts) if part == name) for name in ("train", "test")))
+    if not any(parts) or test_frames is not None:
+        return split_frames(len(numbers), test_frames), []
+    if not listed.train or not listed.test:
+        lacking = "test" if listed.train else "training"
+        return split_frames(len(numbers), test_frames), [
+            f"the folder names no {lacking} frames: its last ones are tested"
+        ]
+    left = len(parts) - len(listed.train) - len(listed.test)
+    unused = f" ({left} of validation are not used)" if left else ""
+    return listed, [f"the folder's own division into training and test frames is kept{unused}"]
+
+
+def _divide_shots(
+    division: Mapping[int, str | None],
+    shots: Sequence[Shot],
+    numbers: Sequence[int],
+    test_frames: int | None,
+    test_cameras: str | None,
+) -> tuple[Split, list[str]]:
+    parts = [division.get(number) for number in numbers]
+    held_out = named_cameras(test_cameras, {shot.camera for shot in shots})
+    times = sorted({shot.time for shot in shots})
+    tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test"}
+    is_own = test_frames is None and bool(tested) and "train" in parts
+    notes = ["the folder's own division into training and test times is kept"] if is_own else []
+    if not is_own:
+        tested = {times[place] for place in split_frames(len(times), test_frames).test}
+    if held_out is None and is_own:
+        trained = {shot.camera for shot, part in zip(shots, parts, strict=True) if part == "train"}
+        held_out = {shot.camera for shot in shots} - trained
+    held_out = held_out or set()
+    if held_out == {shot.camera for shot in shots}:
+        raise UserError("every camera is held out, and none is left to train on: name fewer in data.test_cameras")
+    if held_out:
+        names = ", ".join(sorted(held_out))
+        notes.append(
+            f"{'camera' if len(held_out) == 1 else 'cameras'} {names} {'is' if len(held_out) == 1 else 'are'} held out"
+        )
+    train = [i for i, shot in enumerate(shots) if shot.time not in tested and shot.camera not in held_out]
+    seen = set(train)
+    if not train:
+        raise UserError("no picture is left to train on: every time or camera is held out")
+    return Split(tuple(train), tuple(i for i in range(len(shots)) if i not in seen)), notes
+
+
+def named_cameras(names: str | None, cameras: Collection[str]) -> set[str] | None:
+    """The cameras of a list between commas; None for None. A number may lack the zeros before it.
+
+    Raises UserError for a name that no camera has.
+    """
+    if names is None:
+        return None
+    found = set()
+    for name in [] if names == NO_CAMERA else [word.strip() for word in names.split(",")]:
+        same = [one for one in cameras if one == name or (one.isdigit() and name.isdigit() and int(one) == int(name))]
+        if not same:
+            raise UserError(f"there is no camera {name!r} among {', '.join(sorted(cameras))}")
+        found.add(same[0])
+    return found
