@@ -51,10 +51,17 @@ def panel(pair: Pair, captions: tuple[str, str] = ("truth", "render")) -> UInt8[
     return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"))
 
 
+def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
+    """With white below and at the right."""
+    rows, columns = height - panel.shape[0], width - panel.shape[1]
+    return np.pad(panel, ((0, rows), (0, columns), (0, 0)), constant_values=255)
+
+
 def contact_sheet(panels: Sequence[UInt8[np.ndarray, "H W 3"]]) -> bytes:
     """Panels in two columns, row by row, as a PNG file."""
-    blank = np.full_like(panels[0], 255)
-    filled = [*panels, *[blank] * (-len(panels) % SHEET_COLUMNS)]
+    height, width = (max(panel.shape[axis] for panel in panels) for axis in (0, 1))
+    filled = [padded(panel, height, width) for panel in panels]
+    filled += [np.full_like(filled[0], 255)] * (-len(panels) % SHEET_COLUMNS)
     rows = [np.concatenate(filled[i : i + SHEET_COLUMNS], axis=1) for i in range(0, len(filled), SHEET_COLUMNS)]
     sheet = np.concatenate(rows)
     if sheet.shape[1] > SHEET_WIDTH:

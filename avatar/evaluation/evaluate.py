@@ -30,11 +30,13 @@ from tqdm import tqdm
 
 from avatar.data.background import colour_name
 from avatar.data.loader import FrameLoader
+from avatar.data.subject import Subject
 from avatar.errors import MissingPackage, UserError
 from avatar.evaluation.conditions import conditions
 from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
 from avatar.evaluation.find_lpips import find_networks
+from avatar.evaluation.held_out import views
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import FrameMeasurer
 from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
@@ -92,11 +94,12 @@ def evaluate(
         results = measure(run, renderer, chosen, indices, lpips, write_frames, {shown: add_to_video})
 
     entries: dict[str, Any] = {}
+    seen = views(subject.recording, numbers_of(subject), sorted(set().union(*indices.values())))
     for protocol in chosen:
         by_drive: dict[Drive, list[FrameResult]] = {drive: found[protocol.name] for drive, found in results.items()}
-        entry = summarise(protocol, by_drive, networks[protocol.lpips_net], subject.fps)
+        entry = summarise(protocol, by_drive, networks[protocol.lpips_net], subject.fps, seen)
         for drive, part in parts(entry).items():
-            rows = frames_csv(protocol.columns, by_drive[drive]).encode()
+            rows = frames_csv(protocol.columns, by_drive[drive], seen).encode()
             write_atomically(folder / protocol.name / part.table, rows)
             part.figures["frames_sha256"] = hashlib.sha256(rows).hexdigest()
         entries[protocol.name] = entry
@@ -181,7 +184,9 @@ def measure(
     first = next(iter(recordings))
     known = {drive: conditions(run.avatar.head, recording, order) for drive, recording in recordings.items()}
     results: Measured = {drive: {protocol.name: [] for protocol in protocols} for drive in recordings}
+    numbers, own = numbers_of(subject), subject.recording
     jitter = {(drive, protocol.look): JitterMeter() for drive in recordings for protocol in protocols}
+    filmed = {name: min((own.view(i) for i in found), default=0) for name, found in indices.items()}  # one camera's
     with FrameLoader(subject, data.size) as loader:
         for frame in tqdm(loader.frames(order), total=len(order), desc="eval", unit="frame", disable=None):
             wanted = [protocol for protocol in protocols if frame.index in indices[protocol.name]]
@@ -190,13 +195,14 @@ def measure(
                 camera, params = recording.camera(frame.index, data.size), recording.params(frame.index)
                 pairs = draw(renderer, replace(frame, camera=camera, params=params), [p.look for p in wanted])
                 for look, pair in pairs.items():
-                    jitter[drive, look].add(subject.manifest.frames[frame.index].tracking, pair, masks["head"])
+                    jitter[drive, look].add(own.view(frame.index), numbers[frame.index], pair, masks["head"])
                 measurer = FrameMeasurer(pairs, masks, networks)
                 for protocol in wanted:
                     figures, pair = measurer.measure(protocol), pairs[protocol.look]
                     row = FrameResult(frame.index, frame.name, figures, known[drive][frame.index])
                     results[drive][protocol.name].append(row)
-                    if drive == first and (add_to_film := films.get(protocol.name)) is not None:
+                    add_to_film = films.get(protocol.name) if own.view(frame.index) == filmed[protocol.name] else None
+                    if drive == first and add_to_film is not None:
                         add_to_film(panel(pair))
                     if write_frames:
                         regions = {region: masks[region] for region in masks if region in ("head", *protocol.regions)}
@@ -228,12 +234,19 @@ def without_frames(protocols: Sequence[Protocol], indices: Mapping[str, Sequence
     return reasons
 
 
+def numbers_of(subject: Subject) -> dict[int, int]:
+    """The number of each frame's tracking, in which successive frames follow each other."""
+    return {index: record.tracking for index, record in enumerate(subject.manifest.frames)}
+
+
 def add_jitter(results: Sequence[FrameResult], meter: JitterMeter, run: Run) -> None:
     """Give each frame whose neighbours belong to the protocol too its jitter, the others NaN."""
-    own = {result.index for result in results}
+    numbers, recording = numbers_of(run.subject), run.subject.recording
+    own = {(recording.view(result.index), numbers[result.index]) for result in results}
     for result in results:
-        found = meter.of.get(run.subject.manifest.frames[result.index].tracking, float("nan"))
-        result.figures["jitter"] = found if {result.index - 1, result.index + 1} <= own else float("nan")
+        camera, number = recording.view(result.index), numbers[result.index]
+        is_between = {(camera, number - 1), (camera, number + 1)} <= own
+        result.figures["jitter"] = meter.of.get((camera, number), float("nan")) if is_between else float("nan")
 
 
 def worst_sheet(run: Run, renderer: Renderer, protocol: Protocol, worst: Sequence[Mapping[str, Any]]) -> bytes:

@@ -29,18 +29,19 @@ class JitterMeter:
     """
 
     def __init__(self) -> None:
-        self.of: dict[int, float] = {}  # time of the middle frame -> jitter; NaN where no pixel is in all three masks
-        self._recent: deque[_Moment] = deque(maxlen=3)
+        self.of: dict[tuple[int, int], float] = {}  # camera, time of the middle frame; NaN: no pixel in all three masks
+        self._recent: dict[int, deque[_Moment]] = {}
 
-    def add(self, time: int, pair: Pair, head_mask: UInt8[Tensor, "H W"]) -> None:
-        """The next picture in the order of time; three of successive `time` give the middle one its figure."""
+    def add(self, camera: int, time: int, pair: Pair, head_mask: UInt8[Tensor, "H W"]) -> None:
+        """A camera's next picture in the order of time; three of successive `time` give the middle one its figure."""
         error = pair.render.float() - pair.truth.float()
         error = error if pair.render.dtype == torch.uint8 else error * 255.0
-        self._recent.append(_Moment(time, error, to_device(head_mask, error.device)))
-        if len(self._recent) < 3:
+        recent = self._recent.setdefault(camera, deque(maxlen=3))
+        recent.append(_Moment(time, error, to_device(head_mask, error.device)))
+        if len(recent) < 3:
             return
-        before, middle, after = self._recent
+        before, middle, after = recent
         if (before.time, after.time) == (middle.time - 1, middle.time + 1):
             change = (before.error - 2.0 * middle.error + after.error).abs().mean(dim=-1, dtype=torch.float64)
             weight = torch.minimum(torch.minimum(before.mask, middle.mask), after.mask)
-            self.of[middle.time] = weighted_mean(change, weight).item()
+            self.of[camera, middle.time] = weighted_mean(change, weight).item()

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from avatar.evaluation.conditions import Conditions
+from avatar.evaluation.held_out import View
 from avatar.evaluation.protocol import MEASURES, REGIONS, column
 from avatar.evaluation.results import FrameResult
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
@@ -157,6 +158,12 @@ def _details(name: str, part: Figures) -> list[str]:
             f"{_bounds(one)}: {_cell('psnr', one['means'][figure]).strip()} ({one['frames']})" for one in part[key]
         ]
         lines += _items(title, cells)
+    for title, key in (("by what is held out", "by_held_out"), ("by camera and what is held out", "by_camera")):
+        cells = [
+            f"{one['name']}: {_cell('psnr', one['means'][figure]).strip()} ({one['frames']})"
+            for one in part.get(key, ())
+        ]
+        lines += _items(title, cells) if cells else []
     worst = [f"{one['name']} ({one['psnr']:.2f})" for one in part["worst"]]
     return [*lines, *_items("worst frames, main PSNR", worst or ["-"])]
 
@@ -176,14 +183,16 @@ def _speed(rendering: Mapping[str, Any]) -> str:
     ).format_map(rendering)
 
 
-def frames_csv(columns: Sequence[str], rows: Iterable[FrameResult]) -> str:
-    """One line per frame: its index (the number of its PNG files), the name of its image, figures, conditions."""
+def frames_csv(columns: Sequence[str], rows: Iterable[FrameResult], seen: Mapping[int, View] | None = None) -> str:
+    """One line per frame: its index (the number of its PNG files), the name of its image, figures, conditions; with several
+    cameras what it is of."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("frame", "name", *columns, *Conditions._fields))
+    writer.writerow(("frame", "name", *columns, *Conditions._fields, *(View._fields if seen else ())))
     for row in rows:
         values = (*(row.figures[key] for key in columns), *row.conditions)
-        writer.writerow((row.index, row.name, *(f"{value:.6f}" for value in values)))
+        of = seen[row.index] if seen else ()
+        writer.writerow((row.index, row.name, *(f"{value:.6f}" for value in values), *of))
     return text.getvalue()
 
 

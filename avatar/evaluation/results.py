@@ -11,6 +11,7 @@ import numpy as np
 from avatar.evaluation.bootstrap import BlockBootstrap, block_length, describe
 from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.find_lpips import ChosenLpips
+from avatar.evaluation.held_out import View
 from avatar.evaluation.measure import Figures
 from avatar.evaluation.protocol import Protocol
 from avatar.evaluation.tracking_source import Drive
@@ -28,25 +29,40 @@ class FrameResult(NamedTuple):
 
 
 def summarise(
-    protocol: Protocol, results: Mapping[Drive, Sequence[FrameResult]], lpips: ChosenLpips, fps: float
+    protocol: Protocol,
+    results: Mapping[Drive, Sequence[FrameResult]],
+    lpips: ChosenLpips,
+    fps: float,
+    seen: Mapping[int, View] | None = None,
 ) -> dict[str, Any]:
-    """One protocol's entry of results.json, which `parts` reads; `results` are in the order of `drives`."""
+    """One protocol's entry of results.json, which `parts` reads; `results` are in the order of `drives`.
+
+    seen  what each frame is of, with several cameras
+    """
     *before, own = results
     frames = [result.name for result in results[own]]
-    block = block_length(len(frames), fps)
+    at_once = len(frames) / max(1, len({seen[result.index].time for result in results[own]})) if seen else 1
+    block = block_length(len(frames), fps * at_once)
     return {
         "choices": protocol.choices(),
         "lpips": lpips.as_json(),
         "bootstrap": describe(block),
         "frames": frames,
-        **{drive: _figures(protocol, results[drive], block) for drive in before},
+        **{drive: _figures(protocol, results[drive], block, seen) for drive in before},
         "driven_by": own,
-        **_figures(protocol, results[own], block),
+        **_figures(protocol, results[own], block, seen),
     }
 
 
-def _figures(protocol: Protocol, results: Sequence[FrameResult], block: int) -> dict[str, Any]:
+def _figures(
+    protocol: Protocol, results: Sequence[FrameResult], block: int, seen: Mapping[int, View] | None
+) -> dict[str, Any]:
     """Means are over the frames that have a finite figure."""
+    of = [seen[result.index] for result in results] if seen else []
+    groups = {
+        "by_held_out": [view.held_out for view in of],
+        "by_camera": [f"{view.camera}, {view.held_out}" for view in of],
+    }
     figures = {name: np.array([result.figures[name] for result in results]) for name in protocol.columns}
     bootstrap = BlockBootstrap(len(results), block)
     yaws = np.array([result.conditions.yaw for result in results])
@@ -57,6 +73,7 @@ def _figures(protocol: Protocol, results: Sequence[FrameResult], block: int) -> 
         "frames_with_a_figure": {name: int(np.isfinite(values).sum()) for name, values in figures.items()},
         "by_yaw": binned(yaws, YAW_EDGES, figures),
         "by_expression_distance": binned(distances, np.quantile(distances, DISTANCE_QUANTILES), figures),
+        **({name: grouped(keys, figures) for name, keys in groups.items()} if of else {}),
         "worst": [
             {"frame": result.index, "name": result.name, "psnr": result.figures["psnr"]}
             for result in worst_frames(results)
@@ -87,6 +104,16 @@ def binned(
         }
         for number in np.unique(bins).tolist()
     ]
+
+
+def grouped(keys: Sequence[str], figures: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Means of the figures over the frames of each key."""
+    found = []
+    for key in sorted(set(keys)):
+        own = np.array([one == key for one in keys])
+        own_means = means({name: values[own] for name, values in figures.items()})
+        found.append({"name": key, "frames": int(own.sum()), "means": own_means})
+    return found
 
 
 def worst_frames(results: Sequence[FrameResult]) -> list[FrameResult]:

@@ -86,14 +86,17 @@ def verify_part(folder: Path, choices: Mapping[str, Any], part: Part) -> tuple[D
     if hashlib.sha256(content).hexdigest() != part.figures["frames_sha256"]:
         raise UserError(f"{table} is not the table that results.json was made from; evaluate again")
     rows = list(csv.DictReader(content.decode().splitlines()))
+    place = {_place(row): int(row["frame"]) for row in rows}
     seen: list[Figures] = []
     worst = Difference(0.0, "psnr", f"frame {rows[0]['name']}")
     for row in tqdm(rows, desc=f"verify {folder.name}", unit="frame", leave=False, disable=None):
         figures = recompute(folder, int(row["frame"]), choices, part.renders)
         # Which frames follow each other in time is not in the pictures, so the table says which have a jitter.
         has_jitter = not math.isnan(float(row["jitter"]))
-        jitter = recompute_jitter(folder, int(row["frame"]), part.renders) if has_jitter else math.nan
-        figures["jitter"] = jitter
+        camera, time = _place(row)
+        around = [place.get((camera, time + step)) for step in (-1, 0, 1)] if has_jitter else []
+        known = [number for number in around if number is not None]
+        figures["jitter"] = recompute_jitter(folder, known, part.renders) if len(known) == 3 else math.nan
         seen.append(figures)
         for found in differences({name: float(row[name]) for name in figures}, figures, f"frame {row['name']}", table):
             worst = max(worst, found)
@@ -136,10 +139,16 @@ def recompute(folder: Path, index: int, choices: Mapping[str, Any], renders: str
     return figures | _weighted_figures(render, truth, masks)
 
 
-def recompute_jitter(folder: Path, index: int, renders: str = RENDERS) -> float:
-    """Jitter of a frame with pictures before and after it, levels of 8 bits; NaN where no pixel is in all three masks."""
+def _place(row: Mapping[str, str]) -> tuple[str, int]:
+    """Camera and time of a line of frames.csv; with one camera the frames follow each other in time."""
+    return row.get("camera", ""), int(row.get("time", row["frame"]))
+
+
+def recompute_jitter(folder: Path, indices: Sequence[int], renders: str = RENDERS) -> float:
+    """Jitter of a frame, from its index between those before and after it, levels of 8 bits; NaN where no pixel is in all
+    three masks."""
     errors, masks = [], []
-    for number in (index - 1, index, index + 1):
+    for number in indices:
         render, truth, head = (_read(folder / kind / f"{number:05d}.png") for kind in (renders, "gt", "masks"))
         errors.append(render - truth)
         masks.append(head)

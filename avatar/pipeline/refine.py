@@ -25,6 +25,7 @@ MANY_PASSES = 2 * FIRST_PASSES
 def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     """Write the run's subject with refined tracking to `target`; `device` stands in for the configuration's."""
     check_target(target)
+    run.subject.refuse_several_cameras("the refinement of a tracking")
     run.avatar.to(choose_device(device or run.config.device, print))
     subject, config = run.subject, run.config
     background = torch.tensor(config.data.background)

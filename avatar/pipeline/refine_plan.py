@@ -152,6 +152,7 @@ def steps_in_time(
     """
     config = load_config([*WITH_REFINEMENT, *overrides])
     subject, assets = open_subject(source, config.data.test_frames, print)
+    subject.refuse_several_cameras("--refine")
     frames = len(subject.split.train)
     asked = within_passes(config.trainer, frames).iterations
     if minutes is None:

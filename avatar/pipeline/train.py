@@ -115,8 +115,10 @@ def finish_training(
     checkpoint: Checkpoint | None = None,
 ) -> int:
     split = subject.split
+    rig = subject.recording.rig
+    by = "" if rig is None else f" by {len({rig.views[i] for i in split.train})} cameras"
     print(
-        f"Training {len(avatar):,} Gaussians ({config.model.name}) on {len(split.train)} frames of {subject.name}, "
+        f"Training {len(avatar):,} Gaussians ({config.model.name}) on {len(split.train)} frames of {subject.name}{by}, "
         f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
     )
     begin = time.monotonic()

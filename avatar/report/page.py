@@ -21,6 +21,8 @@ from avatar.runs.run import Run, versions
 
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
 BINNINGS = (  # key of results.json, what it is binned by, decimals of the edges and their column's name
+    ("by_held_out", "what is held out", 0, "held out"),  # of several cameras, as the next
+    ("by_camera", "camera", 0, "camera, and what is held out"),
     ("by_yaw", "yaw", 0, "degrees of yaw"),
     ("by_expression_distance", "distance from the training expressions", 2, "mm"),
 )
@@ -105,6 +107,8 @@ def _by_drive(
 
 
 def _interval(one: Mapping[str, Any], decimals: int) -> str:
+    if "name" in one:
+        return str(one["name"])
     low, high = (None if one[side] is None else f"{one[side]:.{decimals}f}" for side in ("from", "to"))
     return f"below {high}" if low is None else f"{low} or more" if high is None else f"{low} to {high}"
 

@@ -22,6 +22,7 @@ from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, TRACKING, FrameFil
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder
+from data_prep.formats.vhap import ALL, FRONT
 from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
@@ -130,13 +131,15 @@ def read_clip(
     assets: HeadAssets | None,
     progress: Progress = silent,
 ) -> Clip:
-    """Read everything; `assets` are those of the head model, where there is one.
+    """Read everything; `assets` are those of the head model, where there is one. Of several cameras the first of those
+    chosen is read, else the front one.
 
     Raises UserError only when the folder's files cannot be listed.
     """
     complaints: list[tuple[str, str]] = []
+    one_camera = given.cameras.split(",")[0] if given.cameras not in (None, ALL) else FRONT
     source = open_tracked_folder(
-        given.folder, given.tracking, given.format, lambda message: complaints.append(("layout", message))
+        given.folder, given.tracking, given.format, lambda message: complaints.append(("layout", message)), one_camera
     )
     files, label_notes = with_labels(source.files)
     source = replace(source, files=files)

@@ -36,12 +36,12 @@ def open_tracked_folder(
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
-        if cameras is not None:
+        if cameras not in (None, vhap.ALL, vhap.FRONT):
             raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
         return refined.open_folder(folder)
     frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
     name = format or detect_format(folder, frames)
-    if cameras is not None and name != vhap.NAME:
+    if cameras not in (None, vhap.ALL, vhap.FRONT) and name != vhap.NAME:
         raise UserError(f"--cameras is for folders of several cameras, and {folder} is {name}'s, of one")
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)

@@ -13,12 +13,10 @@ from avatar.files.places import cache_folder
 from data_prep.formats.frame_files import FrameFiles
 
 
-def default_location(files: FrameFiles, options: dict[str, object]) -> Path:
+def default_location(folder: Path, files: FrameFiles, options: dict[str, object]) -> Path:
     tracking = next(iter(files.tracking.values())).parent
-    key = hashlib.sha256(json.dumps([str(files.folder), str(tracking), options], allow_nan=False).encode()).hexdigest()[
-        :12
-    ]
-    return cache_folder() / "subjects" / f"{safe_name(files.folder.name)}-{key}"
+    key = hashlib.sha256(json.dumps([str(folder), str(tracking), options], allow_nan=False).encode()).hexdigest()[:12]
+    return cache_folder() / "subjects" / f"{safe_name(folder.name)}-{key}"
 
 
 def input_hash(files: FrameFiles, options: Mapping[str, object]) -> str:

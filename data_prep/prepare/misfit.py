@@ -86,8 +86,8 @@ def refuse_misplaced_cameras(
         problem = judge([fit for fit in fits if fit is not None], files).problem
         if problem is not None:
             raise UserError(
-                f"camera {camera}: {problem}; is its calibration right? Leave it out (--cameras), or --ignore-misfit to go "
-                "on regardless"
+                f"camera {camera}: {problem}; is its calibration right? Leave it out with --cameras, or say "
+                "--ignore-misfit to go on regardless"
             )
 
 

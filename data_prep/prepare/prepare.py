@@ -74,7 +74,7 @@ def prepare(
     }
     head_path = str(Path(source.head).resolve())
     inputs = input_hash(files, options | {"head_path": head_path})
-    target = Path(out).resolve() if out is not None else default_location(files, options)
+    target = Path(out).resolve() if out is not None else default_location(folder, files, options)
     if is_current(target, inputs, is_chosen=out is not None, say=say):
         say(f"using the prepared subject {target}")
         return target

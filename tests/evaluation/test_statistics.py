@@ -33,8 +33,8 @@ def jitters(
         truth = torch.full((4, 4, 3), 100 + 7 * number, dtype=torch.uint8)
         pair = Pair((truth.int() + error).to(torch.uint8), truth)
         mask = torch.full((4, 4), 255, dtype=torch.uint8) if masks is None else masks[number]
-        meter.add(number if times is None else times[number], pair, mask)
-    return meter.of
+        meter.add(0, number if times is None else times[number], pair, mask)
+    return {time: value for (_, time), value in meter.of.items()}
 
 
 def test_jitter_is_the_second_difference_of_the_error() -> None:
@@ -49,6 +49,16 @@ def test_jitter_needs_three_successive_frames() -> None:
     assert jitters([0, 2, 0, 0, 0], times=[10, 11, 13, 14, 15]) == {14: 0.0}
 
 
+def test_the_pictures_of_each_camera_follow_each_other() -> None:
+    """What two cameras see at the same times has nothing to do with each other."""
+    meter = JitterMeter()
+    truth, mask = torch.full((4, 4, 3), 100, dtype=torch.uint8), torch.full((4, 4), 255, dtype=torch.uint8)
+    for time, errors in enumerate(((0, 5), (0, 6), (2, 5))):
+        for camera, error in enumerate(errors):
+            meter.add(camera, time, Pair(truth + error, truth), mask)
+    assert meter.of == {(0, 1): 2.0, (1, 1): 2.0}
+
+
 def test_jitter_counts_pixels_that_all_three_masks_hold() -> None:
     masks = [torch.full((4, 4), 255, dtype=torch.uint8) for _ in range(3)]
     masks[1][0] = 0
@@ -57,8 +67,8 @@ def test_jitter_counts_pixels_that_all_three_masks_hold() -> None:
     for number, mask in enumerate(masks):
         render = torch.zeros(4, 4, 3)
         render[:2] = number % 2 / 255.0  # floats: two rows flicker by a level, and one of them is masked in one frame
-        meter.add(number, Pair(render, torch.zeros(4, 4, 3)), mask)
-    assert meter.of[1] == pytest.approx(2.0 / 3.0, rel=1e-6)
+        meter.add(0, number, Pair(render, torch.zeros(4, 4, 3)), mask)
+    assert meter.of[0, 1] == pytest.approx(2.0 / 3.0, rel=1e-6)
     masks[2][:] = 0
     assert math.isnan(jitters([0, 0, 0], masks=masks)[1])
 
@@ -103,7 +113,10 @@ def test_conditions_compare_with_training_frames() -> None:
     """The held-out frames are the same as others, and not as those of the training."""
     head, motion = HeadModel(grid_head(), torch.zeros(3)), [random_params(seed) for seed in (0, 1, 2, 3, 3, 2)]
     subject: Any = SimpleNamespace(
-        split=Split((0, 1), (2, 3)), params=motion.__getitem__, camera=lambda _: camera_at(20.0)
+        split=Split((0, 1), (2, 3)),
+        params=motion.__getitem__,
+        motion=lambda indices: [motion[i] for i in indices],
+        camera=lambda _: camera_at(20.0),
     )
     found = conditions(head, subject, [4, 5])
     distances = expression_distances(head, motion[4:], motion[:2])
