@@ -26,7 +26,7 @@ def check_rig(given: Source, assets: HeadAssets, size: tuple[int, int]) -> list[
 
     size  of the images, where the listing does not say it
     """
-    source = open_tracked_folder(given.folder, given.tracking, given.format, cameras=given.cameras)
+    source = open_tracked_folder(given.folder, given.tracking, given.format, lambda _: None, given.cameras)
     if not source.shots:
         return []
     try:

@@ -282,7 +282,7 @@ def _data_hash(
 ) -> str:
     digest = hashlib.sha256(intrinsics.tobytes())
     if found is not None:
-        digest.update(json.dumps(found.rig.to_dict()).encode())
+        digest.update(json.dumps(found.rig.to_dict(), allow_nan=False).encode())
     for name, array in arrays.items():
         digest.update(f"{name} {array.shape}".encode() + array.tobytes())
     for image, _ in pairing.pairs:

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, screen_errors, wrongly_tracked
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from small_runs import small_config, train_small
 
+from avatar.data.rig import RigCamera
 from avatar.errors import UserError
 from avatar.model import Avatar
 from avatar.pose_refinement.motion import HeadPose, moved_pose
@@ -52,7 +54,7 @@ def corrected(avatar: Avatar, clip: Clip) -> tuple[PoseCorrections, Clip]:
     tracks = {name: value.clone() for name, value in clip.recording.tracks.items()}
     for index, row in corrections.rows.items():
         given = clip.recording.camera(index)
-        camera = corrections(given, torch.tensor([row]), corrections.jacobian(given.R_cam_world))
+        camera = corrections(given, torch.tensor([row]), corrections.jacobian(given))
         tracks["R"][index], tracks["t"][index] = camera.R_cam_world.detach(), camera.t_cam_world.detach()
     return corrections, replace(clip, recording=replace(clip.recording, tracks=tracks))
 
@@ -66,6 +68,26 @@ def test_disturbed_poses_of_training_frames_come_back(avatar: Avatar) -> None:
     assert screen_errors(avatar, found.recording, true.recording, train) < 0.5 * before
 
 
+def test_a_rig_has_one_correction_for_all_cameras_of_a_time() -> None:
+    """It moves the head, so every camera sees what it would see of the moved head."""
+    corrections = PoseCorrections([4], torch.tensor([0.01, -0.02, 0.03]))
+    with torch.no_grad():
+        corrections.moves[0] = torch.tensor([0.5, -1.0, 2.0, 1.5, -0.7])
+    row, R, t = torch.tensor([0]), torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.01, 0.0, 0.8])
+    turn = axis_angle_to_rotation_matrix(torch.tensor([[0.1, 0.6, -0.2]]))[0].double()
+    lens = (90.0, 90.0, 16.0, 16.0)
+    front = RigCamera("front", 32, 32, lens)
+    aside = RigCamera("aside", 32, 32, lens, tuple(turn.flatten().tolist()), (0.3, -0.1, 0.2))
+    # The mean of all corrections is subtracted; of a single one nothing would be left.
+    corrections.moves.data = torch.cat((corrections.moves.data, -corrections.moves.data))
+    seen = [one.sees(R, t) for one in (front, aside)]
+    front_moved, aside_moved = (corrections(one, row, corrections.jacobian(one)) for one in seen)
+    expected = aside.sees(front_moved.R_cam_world.detach(), front_moved.t_cam_world.detach())
+    torch.testing.assert_close(aside_moved.R_cam_world.detach(), expected.R_cam_world, atol=1e-6, rtol=0)
+    torch.testing.assert_close(aside_moved.t_cam_world.detach(), expected.t_cam_world, atol=1e-6, rtol=0)
+    assert float((front_moved.t_cam_world.detach() - t).abs().max()) > 1e-3
+
+
 def test_a_correction_turns_the_head_about_its_centre_and_has_no_common_part() -> None:
     centre = torch.tensor([0.01, -0.02, 0.03])
     corrections = PoseCorrections(range(3), centre)
@@ -73,7 +95,7 @@ def test_a_correction_turns_the_head_about_its_centre_and_has_no_common_part() -
     camera = Camera(R, t, 90.0, 90.0, 16.0, 16.0, 32, 32)
 
     def pose() -> HeadPose:
-        moved = corrections(camera, torch.tensor([2]), corrections.jacobian(R))
+        moved = corrections(camera, torch.tensor([2]), corrections.jacobian(camera))
         return HeadPose(moved.R_cam_world.detach(), moved.t_cam_world.detach())
 
     assert torch.equal(pose().R, R) and torch.equal(pose().t, t)

@@ -25,7 +25,7 @@ def clip(yaws: list[float], expressions: np.ndarray) -> dict[int, FrameTrack]:
 
 
 def covered(tracks: dict[int, FrameTrack]) -> Coverage:
-    read: Any = SimpleNamespace(source=SimpleNamespace(division={}), tracked=lambda: iter(tracks.items()))
+    read: Any = SimpleNamespace(source=SimpleNamespace(division={}, shots={}), tracked=lambda: iter(tracks.items()))
     found = measure_coverage(read, list(tracks), TEST)
     assert isinstance(found, Coverage) and len(found.split.train) == TRAIN
     return found
