@@ -258,10 +258,11 @@ def background_of(identity: Identity, height: int, width: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=2)
-def _renderer(seed: int) -> Renderer:
+def renderer_of(seed: int) -> Renderer:
+    """The person of a seed; kept, since baking the textures takes seconds."""
     return Renderer(sample_identity(seed))
 
 
 def render_frame(seed: int, params: HeadParams, camera: Camera) -> RenderedFrame:
-    """The person of a seed performing `params`, seen by `camera`; the person's textures are kept for the next call."""
-    return _renderer(seed).render(params, camera)
+    """The person of a seed performing `params`, seen by `camera`."""
+    return renderer_of(seed).render(params, camera)

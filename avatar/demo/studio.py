@@ -42,8 +42,8 @@ def _camera(index: int, size: int, azimuth: float, elevation: float) -> Camera:
     flat = np.cos(elevation)
     away = np.array([np.sin(azimuth) * flat, np.sin(elevation), np.cos(azimuth) * flat])
     focal = size * CAMERA_DISTANCE / FIELD_OF_VIEW_HEIGHT
-    side = 1.0 if index % 2 else -1.0
-    off_centre = np.array([0.05 * np.cos(2.4 * index), side * (0.04 + 0.02 * np.sin(1.7 * index))]) * size
+    signs = np.array([1 - index // 2 % 2 * 2, 1 - index % 2 * 2])
+    off_centre = signs * (0.04 + 0.02 * np.cos(np.array([2.4, 1.7]) * index)) * size
     right = np.cross(_UP, away)
     right /= np.linalg.norm(right)
     straight = np.stack((right, np.cross(-away, right), -away))

@@ -29,9 +29,8 @@ from tqdm import tqdm
 from avatar.compute.native import thread_count
 from avatar.compute.workers import in_order
 from avatar.demo.head_files import write_head_model
-from avatar.demo.identity import sample_identity
 from avatar.demo.motion import FPS, Motion, Performance, frame_camera, frame_params, perform
-from avatar.demo.render import VIEW_AXES, Renderer, Stage
+from avatar.demo.render import VIEW_AXES, Renderer, Stage, renderer_of
 from avatar.demo.studio import World, front_camera, root_joint, studio_cameras, world_of
 from avatar.demo.subject import check_arguments, check_number, single_threads, whole_folder, write_image
 from avatar.head.model import matrix_from_6d
@@ -64,7 +63,7 @@ def make_camera_folder(out: Path, cameras: int, frames: int = 100, size: int = 2
     check_number("cameras", cameras, 2, MAX_CAMERAS)
     union = f"UNION_demo{seed}"
     with whole_folder(out) as folder:
-        renderer = Renderer(sample_identity(seed))
+        renderer = renderer_of(seed)
         head_model = folder / "head_model"
         write_head_model(head_model, renderer.performer.head)
         studio = studio_cameras(cameras, size)
