@@ -81,6 +81,18 @@ def test_the_front_camera_stands_where_the_camera_of_one_video_does(camera_folde
             np.testing.assert_array_equal(seen.flame["expr"][0], frame_params(performance, time).expression)
 
 
+def test_nobody_blinks_since_the_layout_has_no_eyelids(camera_folder: Path) -> None:
+    renderer, performance = renderer_of(SEED), perform(SEED, FRAMES, "speech")
+    single, params = frame_camera(performance, 0, SIZE), frame_params(performance, 0)
+    pose = VIEW_AXES @ single.R_cam_world.numpy(), VIEW_AXES @ single.t_cam_world.numpy()
+    front = studio_cameras(CAMERAS, SIZE)[FRONT]
+    written = cv2.imread(str(camera_folder / "SPEECH" / "images" / f"00000_{FRONT:02d}.png"))
+    assert written is not None and params.eyelids.max() > 0.05
+    for lids, is_written in ((torch.zeros(2), True), (params.eyelids, False)):
+        picture = renderer.look(renderer.stage(replace(params, eyelids=lids), *pose), front)
+        assert np.array_equal(picture.image, written[..., ::-1]) == is_written
+
+
 def test_cameras_stand_over_120_degrees_and_the_ninth_of_16_in_front() -> None:
     for count in (2, 3, 16, 64):
         cameras = studio_cameras(count, SIZE)
