@@ -1,4 +1,4 @@
-"""avatar demo-data: a person of the program's own making, as a tracked folder or a video."""
+"""avatar demo-data: a person of the program's own making, as a tracked folder, a video or a folder of many cameras."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from argparse import Namespace
 
 from avatar.commands.demo import head_beside
 from avatar.commands.outputs import check_outputs
-from avatar.demo import make_head_model, make_subject, make_video
+from avatar.demo import make_camera_folder, make_head_model, make_subject, make_video
+from avatar.errors import UserError
 from avatar.files.video import VIDEO_SUFFIXES
 from avatar.pipeline import OK
 
@@ -15,15 +16,28 @@ NAMES_OF_VIDEOS = (*VIDEO_SUFFIXES, ".avi", ".m4v", ".webm")  # what a person ca
 
 def run_demo_data(arguments: Namespace) -> int:
     check_outputs([arguments.out], [])
-    if arguments.video or arguments.out.suffix.lower() in NAMES_OF_VIDEOS:
-        size = 512 if arguments.size is None else arguments.size
-        make_video(arguments.out, arguments.frames, size, arguments.seed, arguments.motion)
+    is_video = arguments.video or arguments.out.suffix.lower() in NAMES_OF_VIDEOS
+    if arguments.cameras is not None:
+        if is_video:
+            raise UserError("--cameras writes a folder, no video: leave out --video and name a folder")
+        if arguments.motion is not None:
+            raise UserError("--cameras films a sequence of each motion: leave out --motion")
+        frames, size = _or(arguments.frames, 100), _or(arguments.size, 256)
+        union = make_camera_folder(arguments.out, arguments.cameras, frames, size, arguments.seed)
+        print(f"Next   avatar train {union}")
+        return OK
+    frames, motion = _or(arguments.frames, 600), arguments.motion or "speech"
+    if is_video:
+        make_video(arguments.out, frames, _or(arguments.size, 512), arguments.seed, motion)
         if not (head := head_beside(arguments.out)).exists():
             make_head_model(head)
             print(f"Head   {head}")
         print(f"Next   avatar train {arguments.out} --head {head}")
         return OK
-    arguments.size = 256 if arguments.size is None else arguments.size
-    make_subject(arguments.out, arguments.frames, arguments.size, arguments.seed, arguments.motion)
+    make_subject(arguments.out, frames, _or(arguments.size, 256), arguments.seed, motion)
     print(f"Next   avatar train {arguments.out}")
     return OK
+
+
+def _or(given: int | None, default: int) -> int:
+    return default if given is None else given

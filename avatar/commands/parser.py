@@ -190,11 +190,12 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
     demo_data.add_argument("out", type=Path, metavar="OUT")
-    demo_data.add_argument("--frames", type=int, default=600)
+    demo_data.add_argument("--frames", type=int, help="default: 600; with --cameras 100 in a sequence")
+    demo_data.add_argument("--cameras", type=int, metavar="N", help="2 to 64: three sequences in VHAP's layout")
     demo_data.add_argument("--video", action="store_true", help="film it: OUT is an .mp4, head_model/ beside it")
     demo_data.add_argument("--size", type=int, help="width and height in pixels (default: 256, of a video 512)")
     demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
-    demo_data.add_argument("--motion", choices=("speech", "turn", "gaze"), default="speech")
+    demo_data.add_argument("--motion", choices=("speech", "turn", "gaze"), help="default: speech")
 
     demo = commands.add_parser("demo", help="make two subjects, train on one, evaluate, reenact with the other")
     demo.add_argument("out", type=Path, metavar="OUT")

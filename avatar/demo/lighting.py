@@ -1,6 +1,7 @@
-"""Light, fixed to the camera: soft key, fill and rim lights, a hemisphere of ambient light, windows that mirrors see.
+"""Light, fixed in the studio: soft key, fill and rim lights, a hemisphere of ambient light, windows that mirrors see.
 
-Directions are in view space: x right, y up, z towards the camera. Everything is linear and unclamped until `tone_map`.
+Directions are in the studio's axes: x right, y up, z towards the front camera. Everything is linear
+and unclamped until `tone_map`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Lights(NamedTuple):
 
 
 def make_lights(key_side: float) -> Lights:
-    """`key_side` from -1 (key light from the image's left) to 1 (from its right)."""
+    """`key_side` from -1 (key light from the front image's left) to 1 (from its right)."""
     directions = [(0.72 * key_side, 0.55, 0.72), (-0.9 * key_side, 0.12, 0.6), (-0.75 * key_side, 0.45, -0.62)]
     return Lights(*[(np.array(d) / np.linalg.norm(d)).astype(np.float32) for d in directions])
 
@@ -126,7 +127,7 @@ def blurred_shadow_map(depth: np.ndarray, covered: np.ndarray) -> np.ndarray:
 
 
 def shadow_basis(light: np.ndarray) -> np.ndarray:
-    """Rows [3, 3]: the shadow map's right, down and depth (away from the light) axes in view space."""
+    """Rows [3, 3]: the shadow map's right, down and depth (away from the light) axes in the studio."""
     right = np.cross(np.array([0.0, 1.0, 0.0]), light)
     right /= np.linalg.norm(right)
     return np.stack((right, np.cross(right, light), -light)).astype(np.float32)

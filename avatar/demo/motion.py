@@ -69,9 +69,9 @@ def _drift(rng: np.random.Generator, frames: int, seconds: float, columns: int) 
     return noise[pad : pad + frames] * np.sqrt(2.0 * np.sqrt(np.pi) * sigma)
 
 
-def perform(seed: int, frames: int, motion: Motion) -> Performance:
-    """The motion of a seed, `frames` long; always the same for the same arguments."""
-    rng = np.random.default_rng((seed, 2))
+def perform(seed: int, frames: int, motion: Motion, take: int = 0) -> Performance:
+    """The motion of a seed, `frames` long; always the same for the same arguments. Every take is another one."""
+    rng = np.random.default_rng((seed, 2, take) if take else (seed, 2))
     names = demo_head().expression_names
     expression = np.zeros((frames, NUM_EXPRESSION))
 

@@ -1,20 +1,24 @@
 """The true image of a demo person: z-buffer, deferred shading, box-filtered supersampling.
 
+Shading runs in the studio's axes (x right, y up, z towards the front camera), in which the lights are fixed.
 `render_frame` is a function of the person, FLAME parameters and camera alone, so the truth of a cross-reenactment (one
 person performing another's parameters) can be computed as well.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 
 from avatar.demo import lighting, scene, shading
 from avatar.demo.identity import Identity, sample_identity
 from avatar.demo.occlusion import ambient_occlusion
+from avatar.demo.pixels import Pixels, covered, to_screen
 from avatar.demo.sculpt import EYE_RADIUS
 from avatar.demo.skin import bake_skin, paint_iris, strand_tile
 from avatar.head.rasterize import MeshRaster, rasterize_mesh
@@ -25,6 +29,9 @@ TEXTURE_SIZE = 768
 BODY_SHARE = 0.35  # share of the head's turn that the shoulders follow
 VIEW_AXES = np.diag([1.0, -1.0, -1.0]).astype(np.float32)  # OpenCV camera axes <-> x right, y up, z to the camera
 SCENE_CENTRE = np.array([0.0, -0.03, 0.0], np.float32)  # of the shadow map, head space, metres
+_MAP_SCALE = lighting.SHADOW_SIZE / lighting.SHADOW_REACH
+_ON_MAP = np.array([_MAP_SCALE, _MAP_SCALE, 1.0], np.float32)
+_MAP_CENTRE = np.array([lighting.SHADOW_SIZE / 2, lighting.SHADOW_SIZE / 2, 0.0], np.float32)
 _WRINKLED_BY = (("brow_inner_up", "brow_outer_up"), ("brow_down",), ("smile", "cheek_up", "sneer"))
 
 
@@ -37,26 +44,17 @@ class RenderedFrame(NamedTuple):
     mouth: np.ndarray  # lips and what is seen between them
 
 
-class _Pixels(NamedTuple):
-    """The covered pixels: which face, where in it, and from which direction they are seen."""
+class Stage(NamedTuple):
+    """A person posed in the studio: what all cameras share. Vertex values are in the studio's axes."""
 
-    row: np.ndarray
-    column: np.ndarray
-    face: np.ndarray  # [N]
-    corners: np.ndarray  # [N, 3] vertex indices
-    barycentric: np.ndarray  # [N, 3]
-    ray: np.ndarray  # [N, 3] view-space direction with z = -1
-
-    def take(self, at: np.ndarray) -> _Pixels:
-        return _Pixels(*[np.take(values, at, axis=0) for values in self])
-
-    def interpolate(self, values: np.ndarray, corners: np.ndarray | None = None) -> np.ndarray:
-        """Per-vertex values [V, C] at the pixels [N, C]; other `corners` index other vertices, those of the chart say."""
-        corners = self.corners if corners is None else corners
-        out = np.take(values, corners[:, 0], axis=0) * self.barycentric[:, :1]
-        out += np.take(values, corners[:, 1], axis=0) * self.barycentric[:, 1:2]
-        out += np.take(values, corners[:, 2], axis=0) * self.barycentric[:, 2:]
-        return out
+    params: HeadParams
+    geometry: scene.Geometry  # in the head's space
+    R_studio_head: np.ndarray  # float32 [3, 3]
+    t_studio_head: np.ndarray  # float32 [3]
+    surface: np.ndarray  # [N, 7] normal, occlusion, colour
+    skin_slopes: np.ndarray  # [V, 6] gradients of u and v
+    strands: np.ndarray  # [H, 3] directions of the hair
+    shadow_map: np.ndarray  # of the key light
 
 
 class Renderer:
@@ -82,22 +80,49 @@ class Renderer:
         )
 
     def render(self, params: HeadParams, camera: Camera) -> RenderedFrame:
-        """The picture of this person with FLAME parameters `params` (metres, radians as 6D) from `camera`."""
-        big = camera.resized(SUPERSAMPLE * camera.width, SUPERSAMPLE * camera.height)
-        R_view = VIEW_AXES @ camera.R_cam_world.numpy().astype(np.float32)
-        t_view = VIEW_AXES @ camera.t_cam_world.numpy().astype(np.float32)
-        geometry = self.performer.pose(params, _partial_turn(R_view.T, 1.0 - BODY_SHARE))
-        raster = rasterize_mesh(
-            _to_screen(geometry.points, R_view, t_view, big), self.performer.faces, big.height, big.width
-        )
-        pixels = _covered(raster, self.performer.faces, big)
-        depth = raster.depth[pixels.row, pixels.column]
-        lit = self._key_share(geometry, R_view, t_view, pixels.ray * depth[:, None])
+        """The picture of this person with FLAME parameters `params` (metres, radians as 6D) from `camera`.
 
-        table = np.concatenate(
-            (lighting.turn(geometry.normals, R_view), self._occlusion[:, None], self.performer.colours), -1
+        The camera's world is the head's space, and the studio stands still around the camera.
+        """
+        R_studio_head = VIEW_AXES @ camera.R_cam_world.numpy().astype(np.float32)
+        t_studio_head = VIEW_AXES @ camera.t_cam_world.numpy().astype(np.float32)
+        in_front = replace(camera, R_cam_world=torch.from_numpy(VIEW_AXES), t_cam_world=torch.zeros(3))
+        return self.look(self.stage(params, R_studio_head, t_studio_head), in_front)
+
+    def stage(self, params: HeadParams, R_studio_head: np.ndarray, t_studio_head: np.ndarray) -> Stage:
+        """The person with FLAME parameters `params` and the head's float32 pose in the studio."""
+        performer = self.performer
+        geometry = performer.pose(params, _partial_turn(R_studio_head.T, 1.0 - BODY_SHARE))
+        slopes = (lighting.turn(slopes, R_studio_head) for slopes in (performer.slopes_u, performer.slopes_v))
+        return Stage(
+            params=params,
+            geometry=geometry,
+            R_studio_head=R_studio_head,
+            t_studio_head=t_studio_head,
+            surface=np.concatenate(
+                (lighting.turn(geometry.normals, R_studio_head), self._occlusion[:, None], performer.colours), -1
+            ),
+            skin_slopes=np.concatenate(tuple(slopes), -1),
+            strands=lighting.turn(performer.strands, R_studio_head),
+            shadow_map=self._shadow_map(geometry, R_studio_head),
         )
-        attributes = pixels.interpolate(table)
+
+    def look(self, stage: Stage, camera: Camera) -> RenderedFrame:
+        """The picture of a stage from `camera`, whose world is the studio."""
+        big = camera.resized(SUPERSAMPLE * camera.width, SUPERSAMPLE * camera.height)
+        R_view_studio = VIEW_AXES @ camera.R_cam_world.numpy().astype(np.float32)
+        t_view_studio = VIEW_AXES @ camera.t_cam_world.numpy().astype(np.float32)
+        R_view = R_view_studio @ stage.R_studio_head
+        t_view = R_view_studio @ stage.t_studio_head + t_view_studio
+        geometry = stage.geometry
+        raster = rasterize_mesh(
+            to_screen(geometry.points, R_view, t_view, big), self.performer.faces, big.height, big.width
+        )
+        pixels = covered(raster, self.performer.faces, big, R_view_studio)
+        depth = raster.depth[pixels.row, pixels.column]
+        lit = self._key_share(stage, pixels.ray * depth[:, None] - R_view_studio.T @ t_view_studio)
+
+        attributes = pixels.interpolate(stage.surface)
         whole = shading.Surface(
             normals=lighting.unit(attributes[:, :3]),
             view=-lighting.unit(pixels.ray),
@@ -110,90 +135,74 @@ class Renderer:
         for kind in np.unique(material):
             at = np.flatnonzero(material == kind)
             surface = shading.Surface(*[np.take(values, at, axis=0) for values in whole])
-            colour[at] = self._shade(int(kind), surface, pixels.take(at), geometry, R_view, params)
+            colour[at] = self._shade(int(kind), surface, pixels.take(at), stage)
         if len(geometry.lens_points):
-            self._add_lenses(colour, geometry, pixels, depth, whole.view, R_view, t_view, big)
+            lenses = to_screen(geometry.lens_points, R_view, t_view, big)
+            front = rasterize_mesh(lenses, self.performer.lenses.faces, big.height, big.width)
+            self._add_lenses(colour, front, pixels, depth, whole.view, stage)
         return self._develop(colour, material, pixels, camera)
 
-    def _shade(
-        self,
-        kind: int,
-        surface: shading.Surface,
-        pixels: _Pixels,
-        geometry: scene.Geometry,
-        R_view: np.ndarray,
-        params: HeadParams,
-    ) -> np.ndarray:
+    def _shade(self, kind: int, surface: shading.Surface, pixels: Pixels, stage: Stage) -> np.ndarray:
         if kind == scene.SKIN:
-            return self._shade_skin(surface, pixels, R_view, params)
+            return self._shade_skin(surface, pixels, stage)
         if kind == scene.HAIR:
-            strands = pixels.interpolate(
-                lighting.turn(self.performer.strands, R_view), pixels.corners - self.performer.starts[kind]
-            )
-            rest = pixels.interpolate(self.performer.hair_rest, pixels.corners - self.performer.starts[kind])
+            corners = pixels.corners - self.performer.starts[kind]
+            strands, rest = (pixels.interpolate(a, corners) for a in (stage.strands, self.performer.hair_rest))
             return shading.hair(surface, self.lights, strands, shading.strand_pattern(self._strands, rest))
         if kind in (scene.EYE_LEFT, scene.EYE_RIGHT):
             side = int(kind == scene.EYE_RIGHT)
-            shadow = _lid_shadow(self.performer.head, geometry, side, lighting.turn(surface.normals, R_view.T))
-            return shading.eye(surface, self.lights, self.iris, R_view @ geometry.eye_turns[side], shadow)
+            outward = lighting.turn(surface.normals, stage.R_studio_head.T)
+            shadow = _lid_shadow(self.performer.head, stage.geometry, side, outward)
+            turn = stage.R_studio_head @ stage.geometry.eye_turns[side]
+            return shading.eye(surface, self.lights, self.iris, turn, shadow)
         if kind in (scene.MOUTH_UPPER, scene.MOUTH_LOWER, scene.LINING):
             return shading.mouth(surface, self.lights)
         if kind == scene.FRAME:
             return shading.frame(surface, self.lights)
         return shading.cloth(surface, self.lights)
 
-    def _shade_skin(
-        self, surface: shading.Surface, pixels: _Pixels, R_view: np.ndarray, params: HeadParams
-    ) -> np.ndarray:
-        performer = self.performer
-        texels = pixels.interpolate(self._texels, performer.head.mesh.uv_faces[pixels.face])
-        expression = params.expression.numpy()[: self._wrinkles_of.shape[1]]
+    def _shade_skin(self, surface: shading.Surface, pixels: Pixels, stage: Stage) -> np.ndarray:
+        texels = pixels.interpolate(self._texels, self.performer.head.mesh.uv_faces[pixels.face])
+        expression = stage.params.expression.numpy()[: self._wrinkles_of.shape[1]]
         wrinkle = np.clip(self._wrinkles_of[:, : len(expression)] @ expression, 0.0, 1.2)
         low, high = (lighting.lookup(half, texels) for half in self._relief)
         relief = low[:, :2] + wrinkle[0] * low[:, 2:] + wrinkle[1] * high[:, :2] + wrinkle[2] * high[:, 2:]
-        gradients = np.concatenate(
-            (lighting.turn(performer.slopes_u, R_view), lighting.turn(performer.slopes_v, R_view)), -1
-        )
         colour = lighting.lookup(self.skin.colour, texels)
-        return shading.skin(surface, self.lights, colour, relief, pixels.interpolate(gradients))
+        return shading.skin(surface, self.lights, colour, relief, pixels.interpolate(stage.skin_slopes))
 
-    def _key_share(
-        self, geometry: scene.Geometry, R_view: np.ndarray, t_view: np.ndarray, at: np.ndarray
-    ) -> np.ndarray:
-        """Share of the key light [N] at view-space points [N, 3], by a shadow map seen from the light."""
-        basis = lighting.shadow_basis(self.lights.key)
-        size = lighting.SHADOW_SIZE
-        scale = np.array([size / lighting.SHADOW_REACH, size / lighting.SHADOW_REACH, 1.0], np.float32)
-        shift = np.array([size / 2, size / 2, 0.0], np.float32)
-        on_map = lighting.turn(geometry.points - SCENE_CENTRE, basis @ R_view) * scale + shift
+    def _shadow_map(self, geometry: scene.Geometry, R_studio_head: np.ndarray) -> np.ndarray:
+        """What the key light sees first."""
+        size, basis = lighting.SHADOW_SIZE, lighting.shadow_basis(self.lights.key)
+        on_map = lighting.turn(geometry.points - SCENE_CENTRE, basis @ R_studio_head) * _ON_MAP + _MAP_CENTRE
         away = np.array([0.0, 0.0, 10.0], np.float32)  # the rasteriser draws positive depths
         raster = rasterize_mesh(on_map + away, self.performer.faces, size, size)
-        shadow_map = lighting.blurred_shadow_map(raster.depth - away[2], raster.face_id >= 0)
-        centre = R_view @ SCENE_CENTRE + t_view
-        return lighting.lit_share(shadow_map, lighting.turn(at - centre, basis) * scale + shift)
+        return lighting.blurred_shadow_map(raster.depth - away[2], raster.face_id >= 0)
+
+    def _key_share(self, stage: Stage, at: np.ndarray) -> np.ndarray:
+        """Share of the key light [N] at points [N, 3] of the studio."""
+        centre = stage.R_studio_head @ SCENE_CENTRE + stage.t_studio_head
+        on_map = lighting.turn(at - centre, lighting.shadow_basis(self.lights.key)) * _ON_MAP + _MAP_CENTRE
+        return lighting.lit_share(stage.shadow_map, on_map)
 
     def _add_lenses(
         self,
         colour: np.ndarray,
-        geometry: scene.Geometry,
-        pixels: _Pixels,
+        front: MeshRaster,
+        pixels: Pixels,
         depth: np.ndarray,
         view: np.ndarray,
-        R_view: np.ndarray,
-        t_view: np.ndarray,
-        big: Camera,
+        stage: Stage,
     ) -> None:
-        """Lay what the lenses mirror over the pixels behind them, in place."""
+        """Lay what the lenses, rasterised as `front`, mirror over the pixels behind them, in place."""
         faces = self.performer.lenses.faces
-        front = rasterize_mesh(_to_screen(geometry.lens_points, R_view, t_view, big), faces, big.height, big.width)
         face, lens_depth = front.face_id[pixels.row, pixels.column], front.depth[pixels.row, pixels.column]
         at = np.flatnonzero((face >= 0) & (lens_depth < depth))
         weights = front.barycentric[pixels.row[at], pixels.column[at]]
         normals = np.einsum("nkc,nk->nc", self.performer.lens_normals[faces[face[at]]], weights)
-        normals = lighting.turn(normals, R_view)
+        normals = lighting.turn(normals, stage.R_studio_head)
         colour[at] = shading.lens(colour[at], lighting.unit(normals), view[at], self.lights)
 
-    def _develop(self, colour: np.ndarray, material: np.ndarray, pixels: _Pixels, camera: Camera) -> RenderedFrame:
+    def _develop(self, colour: np.ndarray, material: np.ndarray, pixels: Pixels, camera: Camera) -> RenderedFrame:
         height, width = SUPERSAMPLE * camera.height, SUPERSAMPLE * camera.width
         canvas = _background(tuple(self.identity.background.tolist()), height, width).copy()
         canvas[pixels.row, pixels.column] = lighting.tone_map(colour)
@@ -206,22 +215,6 @@ class Renderer:
         masks = cv2.resize(masks, small, interpolation=cv2.INTER_AREA)
         image, masks = (np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (image, masks))
         return RenderedFrame(image, *[np.ascontiguousarray(masks[..., k]) for k in range(3)])
-
-
-def _to_screen(points: np.ndarray, R_view: np.ndarray, t_view: np.ndarray, camera: Camera) -> np.ndarray:
-    p = lighting.turn(points, R_view) + t_view
-    depth = -p[:, 2]
-    return np.stack((p[:, 0] / depth * camera.fx + camera.cx, -p[:, 1] / depth * camera.fy + camera.cy, depth), -1)
-
-
-def _covered(raster: MeshRaster, faces: np.ndarray, camera: Camera) -> _Pixels:
-    row, column = np.nonzero(raster.face_id >= 0)
-    face = raster.face_id[row, column]
-    ray = np.empty((len(row), 3), np.float32)
-    ray[:, 0] = (column + 0.5 - camera.cx) / camera.fx
-    ray[:, 1] = -(row + 0.5 - camera.cy) / camera.fy
-    ray[:, 2] = -1.0
-    return _Pixels(row, column, face, faces[face], raster.barycentric[row, column], ray)
 
 
 def _partial_turn(R: np.ndarray, share: float) -> np.ndarray:
@@ -265,10 +258,11 @@ def background_of(identity: Identity, height: int, width: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=2)
-def _renderer(seed: int) -> Renderer:
+def renderer_of(seed: int) -> Renderer:
+    """The person of a seed; kept, since baking the textures takes seconds."""
     return Renderer(sample_identity(seed))
 
 
 def render_frame(seed: int, params: HeadParams, camera: Camera) -> RenderedFrame:
-    """The person of a seed performing `params`, seen by `camera`; the person's textures are kept for the next call."""
-    return _renderer(seed).render(params, camera)
+    """The person of a seed performing `params`, seen by `camera`."""
+    return renderer_of(seed).render(params, camera)

@@ -16,7 +16,7 @@ IRIS_EDGE = 0.455  # sine of the iris' angle on the eyeball
 
 
 class Surface(NamedTuple):
-    """The N pixels of a material; float32, view space."""
+    """The N pixels of a material; float32, the studio's axes."""
 
     normals: np.ndarray  # [N, 3]
     view: np.ndarray  # [N, 3] unit, towards the camera
@@ -105,18 +105,18 @@ def hair(s: Surface, lights: Lights, strands: np.ndarray, pattern: np.ndarray) -
     return out
 
 
-def eye(s: Surface, lights: Lights, iris: np.ndarray, eye_view: np.ndarray, lid_shadow: np.ndarray) -> np.ndarray:
-    """Eyeball with its colour map `iris`; `eye_view` [3, 3] eyeball to view; `lid_shadow` [N] from the lids."""
-    outward = turn(s.normals, eye_view.T)  # in the eyeball's own axes; the pupil is at +z
+def eye(s: Surface, lights: Lights, iris: np.ndarray, eye_turn: np.ndarray, lid_shadow: np.ndarray) -> np.ndarray:
+    """Eyeball with its colour map `iris`; `eye_turn` [3, 3] eyeball to studio; `lid_shadow` [N] from the lids."""
+    outward = turn(s.normals, eye_turn.T)  # in the eyeball's own axes; the pupil is at +z
     edge = np.hypot(outward[:, 0], outward[:, 1])
     on_iris = np.clip((0.51 - edge) / 0.06, 0.0, 1.0) * (outward[:, 2] > 0)
     # The cornea is a smaller sphere that stands out of the eyeball; the iris lies behind it.
-    own_view = turn(s.view, eye_view.T)
+    own_view = turn(s.view, eye_turn.T)
     behind = np.clip(np.sqrt(np.maximum(1.0 - edge**2, 0.0)) - np.sqrt(1 - IRIS_EDGE**2), 0.0, 0.12) * on_iris
     at = outward[:, :2] - (1.1 * behind)[:, None] * own_view[:, :2] / np.maximum(own_view[:, 2:], 0.35)
     colour = lookup(iris, np.stack((at[:, 0] + 1, 1 - at[:, 1]), -1) * (iris.shape[0] / 2) - 0.5)
     cornea = unit(outward * np.float32(EYE_RADIUS) - np.array([0.0, 0.0, 5.6], np.float32))
-    wet = turn(unit(cornea * on_iris[:, None] + outward * (1 - on_iris[:, None])), eye_view)
+    wet = turn(unit(cornea * on_iris[:, None] + outward * (1 - on_iris[:, None])), eye_turn)
     diffuse = _three_lights(s.normals, lights, SKIN_WRAP, (0.25 + 0.75 * s.lit)[:, None])
     diffuse += 0.9 * lighting.ambient(s.normals)
     tinted = lid_shadow[:, None] ** np.array([0.85, 1.0, 1.05], np.float32)

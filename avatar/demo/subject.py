@@ -48,7 +48,7 @@ def make_subject(
     check_arguments(frames, size, seed, motion)
     if not 0.0 <= neutral_bias <= 1.0:
         raise UserError(f"neutral_bias must be from 0 to 1, not {neutral_bias}")
-    with _whole(out) as folder:
+    with whole_folder(out) as folder:
         _write_subject(folder, frames, size, seed, motion, neutral_bias)
     return out
 
@@ -59,13 +59,13 @@ def make_head_model(out: Path) -> Path:
     Returns `out`. Raises UserError for a folder that is not empty.
     """
     out = Path(out)
-    with _whole(out) as folder:
+    with whole_folder(out) as folder:
         write_head_model(folder, demo_head())
     return out
 
 
 @contextmanager
-def _whole(out: Path) -> Iterator[Path]:
+def whole_folder(out: Path) -> Iterator[Path]:
     """A folder beside `out` that takes its place when nothing went wrong, and else is removed."""
     _check_place(out)
     try:
@@ -110,17 +110,19 @@ def tracking_bias(seed: int, strength: float) -> TrackingBias:
 
 def check_arguments(frames: int, size: int, seed: int, motion: str) -> None:
     """Raises UserError for values out of range."""
-    for name, value, low, high in (
-        ("frames", frames, 1, MAX_FRAMES),
-        ("size", size, MIN_SIZE, MAX_SIZE),
-        ("seed", seed, 0, 2**32 - 1),
-    ):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise UserError(f"{name} must be a whole number, not {value!r}")
-        if not low <= value <= high:
-            raise UserError(f"{name} must be from {low} to {high}, not {value}")
+    check_number("frames", frames, 1)
+    check_number("size", size, MIN_SIZE, MAX_SIZE)
+    check_number("seed", seed, 0, 2**32 - 1)
     if motion not in MOTIONS:
         raise UserError(f"motion must be one of {', '.join(MOTIONS)}, not {motion!r}")
+
+
+def check_number(name: str, value: int, low: int, high: int = MAX_FRAMES) -> None:
+    """Raises UserError for what is no whole number from `low` to `high`."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise UserError(f"{name} must be a whole number, not {value!r}")
+    if not low <= value <= high:
+        raise UserError(f"{name} must be from {low} to {high}, not {value}")
 
 
 def _check_place(out: Path) -> None:
@@ -187,10 +189,10 @@ def _write_frame(
 ) -> None:
     """Image and masks are numbered from 1, the tracking from 0, as video extraction and metrical-tracker leave them."""
     stem = f"{index + 1:05d}"
-    _write_image(folder / "imgs" / f"{stem}.jpg", picture.image[..., ::-1], JPEG)
-    _write_image(folder / "alpha" / f"{stem}.jpg", picture.alpha, JPEG)
+    write_image(folder / "imgs" / f"{stem}.jpg", picture.image[..., ::-1], JPEG)
+    write_image(folder / "alpha" / f"{stem}.jpg", picture.alpha, JPEG)
     for name, mask in (("neckhead", picture.head), ("mouth", picture.mouth)):
-        _write_image(folder / "parsing" / f"{stem}_{name}.png", np.where(mask > 127, np.uint8(255), np.uint8(0)), [])
+        write_image(folder / "parsing" / f"{stem}_{name}.png", np.where(mask > 127, np.uint8(255), np.uint8(0)), [])
     K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], np.float32)
     tracked = {
         "flame": {
@@ -210,6 +212,6 @@ def _write_frame(
     torch.save(tracked, folder / "checkpoint" / f"{index:05d}.frame")
 
 
-def _write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
+def write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
     # cv2.imwrite does not notice a full disk, and a name that is not UTF-8 ends the process.
     path.write_bytes(cv2.imencode(path.suffix, image, options)[1].tobytes())

@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_frame_is_written_under_a_name_that_is_not_utf8(tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"Zo\xeb.png")
-    subject._write_image(path, np.zeros((4, 4, 3), np.uint8), [])
+    subject.write_image(path, np.zeros((4, 4, 3), np.uint8), [])
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
