@@ -4,7 +4,7 @@
       transforms.json                  all frames
       transforms_{train,val,test}.json the first 70 % of the times (val: by the front camera), and the rest
       images/00000_00.png              time and camera
-      fg_masks/00000_00.png            coverage
+      fg_masks/00000_00.png            coverage of head and neck
       flame_param/00000.npz            one time's FLAME parameters
       canonical_flame_param.npz        the person at rest, jaw open by 0.3
     OUT/UNION_demo0                    listings of all sequences; FREE is the test, the front camera the validation
@@ -116,9 +116,10 @@ def _film(folder: Path, renderer: Renderer, sequences: list[Sequence], studio: l
 
 
 def _write_picture(folder: Path, time: int, index: int, renderer: Renderer, stage: Stage, camera: Camera) -> None:
+    """The matte ends below the neck, where GaussianAvatars' pictures are cut."""
     picture = renderer.look(stage, camera)
     write_image(folder / _image(time, index), picture.image[..., ::-1], [])
-    write_image(folder / _matte(time, index), picture.alpha, [])
+    write_image(folder / _matte(time, index), picture.head, [])
 
 
 def _image(time: int, camera: int) -> str:

@@ -33,12 +33,21 @@ def profile_error(assets: HeadAssets, seen: View, side: int) -> float:
     return float(np.abs(np.subtract(*columns)).mean())
 
 
+def chin_row(assets: HeadAssets, seen: View) -> int:
+    """The row of the picture that is 4 cm below the lips."""
+    vertices, joint = posed(assets, seen.flame)
+    R, t = seen.of_head(joint)
+    p = R @ (vertices[assets.regions["lips"].numpy()].mean(0) - (0, 0.04, 0)) + t
+    return int(p[1] / p[2] * seen.K[1, 1] + seen.K[1, 2])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_listed_head_lies_on_the_matte_of_each_camera(name: str, camera_folder: Path, assets: HeadAssets) -> None:
     for entry, seen in views(camera_folder, name):
         mesh = drawn(assets, seen).astype(np.uint8)
         inner = cv2.erode(mesh, np.ones((3, 3), np.uint8)) > 0
-        assert inner.sum() > 0.15 * SIZE**2 and (seen.matte[inner] > 127).all()
+        inner[chin_row(assets, seen) :] = False  # the neck goes on under the collar, where the matte ends
+        assert inner.sum() > 0.1 * SIZE**2 and (seen.matte[inner] > 127).all()
         if entry["camera_index"] != FRONT:  # the others see the face in profile
             assert profile_error(assets, seen, -1 if entry["camera_index"] == 0 else 0) < 0.6
 
