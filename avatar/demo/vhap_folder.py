@@ -109,9 +109,9 @@ def _film(folder: Path, renderer: Renderer, sequences: list[Sequence], studio: l
             _write_picture(folder / sequence.name, time, index, renderer, stage, camera)
 
     places = [(sequence, time) for sequence in sequences for time in range(frames)]
-    total = len(places) * len(studio)
+    total, workers = len(places) * len(studio), thread_count()  # before each of them has one thread
     with single_threads(), tqdm(total=total, desc="rendering", unit="image") as progress:
-        for _ in in_order(film, places, thread_count()):
+        for _ in in_order(film, places, workers):
             progress.update(len(studio))
 
 

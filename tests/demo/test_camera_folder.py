@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from listed_views import CAMERAS, FRAMES, FRONT, NAMES, SEED, SIZE, listing
 
 from avatar.cli import main
@@ -163,3 +164,16 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(UserError, match="No space left on device; nothing was left"):
         make_camera_folder(tmp_path / "out", 2, 2, SIZE, SEED)
     assert not list(tmp_path.iterdir())
+
+
+def test_all_cores_render(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[int] = []
+    monkeypatch.setattr(vhap_folder, "in_order", lambda film, places, workers: used.append(workers) or [])
+    monkeypatch.delenv("AVATAR_THREADS", raising=False)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        make_camera_folder(tmp_path / "out", 2, 2, SIZE, SEED)
+    finally:
+        torch.set_num_threads(before)
+    assert used == [3]
