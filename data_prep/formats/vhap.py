@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
@@ -43,6 +44,7 @@ from data_prep.formats.transforms import (
 
 NAME = "VHAP"
 NAMES = KindNames("fg_masks/", "head masks", "mouth masks", images="images/", tracking="flame_param/")
+FRONTAL_FRAMES = 8  # by which the front camera is told
 ALL, FRONT = "all", "front"  # what --cameras may say beside names
 
 
@@ -230,7 +232,12 @@ def _front(by_camera: dict[str, list[ListedFrame]]) -> str:
     """The camera that sees the face most from the front, among those with training frames."""
     trained = {name: own for name, own in by_camera.items() if any(frame.split in ("train", None) for frame in own)}
     candidates = trained or by_camera
-    return max(candidates, key=lambda name: _frontality(candidates[name][0]))
+
+    def facing(name: str) -> float:
+        own = candidates[name]
+        return float(np.mean([_frontality(own[i]) for i in evenly_spread(range(len(own)), FRONTAL_FRAMES)]))
+
+    return max(candidates, key=facing)
 
 
 def _frontality(frame: ListedFrame) -> float:
