@@ -11,10 +11,12 @@ import torch
 from avatar.compute.device import CPU, free_bytes
 from avatar.compute.memory import check_memory
 from avatar.config import Config, chosen_options, load_config
+from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.files.lock import locked
+from avatar.files.opening import shown_size
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.pipeline import INTERRUPTED, OK
@@ -121,6 +123,12 @@ def finish_training(
         f"Training {len(avatar):,} Gaussians ({config.model.name}) on {len(split.train)} frames of {subject.name}{by}, "
         f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
     )
+    width, height = subject.image_size(config.data.size)
+    if (decoded := len(split.train) * width * height * BYTES_PER_PIXEL) > CACHE_BYTES:
+        print(
+            f"Note: the decoded frames take {shown_size(decoded)}, of which {shown_size(CACHE_BYTES)} are kept in memory; "
+            "the others are decoded again at each turn"
+        )
     begin = time.monotonic()
     done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
     first = checkpoint.step if checkpoint else 0

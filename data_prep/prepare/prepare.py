@@ -23,6 +23,7 @@ from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
 from data_prep.prepare.cache import default_location, input_hash
+from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import detect_offset
 from data_prep.prepare.inspect_images import Inspection, composited_background, inspect_images
 from data_prep.prepare.mask_polarity import polarity_problems
@@ -103,6 +104,7 @@ def prepare(
     if not source.ignore_misfit:
         judgement.refuse()
         refuse_misplaced_cameras(model, tracks.frames, files, pairing.pairs, tracked.shots)
+    refuse_dark_cameras(files, pairing.pairs, tracked.shots)
     evidence = f"{evidence}: {judgement.evidence}"
     say(evidence)
     has_lips = len(region_faces(model, "lips")) > 0

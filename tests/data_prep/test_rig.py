@@ -201,6 +201,28 @@ def test_a_missing_picture_is_left_out(single: Path, tmp_path: Path) -> None:
     assert any("left out 1 of 18" in line for line in said)
 
 
+def test_a_black_camera_is_refused(single: Path, tmp_path: Path) -> None:
+    folder = edited(single, tmp_path / "copy", lambda _: None)
+    for path in folder.glob("images/*_12.png"):
+        assert cv2.imwrite(str(path), np.zeros((56, 64, 3), np.uint8))
+    with pytest.raises(UserError, match="the pictures of camera 12 are black: 0.0 of 255"):
+        opened(folder, tmp_path / "out")
+
+
+def test_ten_thousand_listed_pictures_that_are_not_there_are_refused(single: Path, tmp_path: Path) -> None:
+    folder = edited(single, tmp_path / "copy", lambda _: None)
+    content = json.loads((folder / "transforms_train.json").read_text())
+    (entry,) = content["frames"][:1]
+    content["frames"] += [
+        entry | {"file_path": f"images/{n:05d}_07.png", "flame_param_path": f"flame_param/{n:05d}.npz"}
+        for n in range(100, 10_100)
+    ]
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match="10000 of 10018 images cannot be used, more than 5%") as error:
+        opened(folder, tmp_path / "out")
+    assert len(str(error.value)) < 2000
+
+
 def test_two_sizes_within_a_camera_are_refused(single: Path, tmp_path: Path) -> None:
     folder = edited(single, tmp_path / "copy", lambda _: None)
     path = folder / "images" / "00002_07.png"
