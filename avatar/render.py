@@ -3,27 +3,54 @@
 `Renderer` gives what `avatar.draw(avatar(params, None, camera.head_rotation), camera, background)` gives, to rounding,
 without autograd, where the avatar is. The avatar says what is computed once (`Avatar.frozen`): the first layer's product
 with the positional code, the colours and, on a CPU, each HyperGaussian, which for inference is an affine map of its latent:
-n multiply-adds for each of ten offsets remain. On a GPU the launches count, and one does all that follows the network.
+n multiply-adds for each of ten offsets remain. On a GPU the launches count: one does all that follows the network, and a
+frame is replayed as a CUDA graph where its camera's intrinsics have been seen before.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.device import on_gpu, to_device
+from avatar.compute.cuda_graph import Replay, new_pool, own_stream
+from avatar.compute.device import at_once, on_gpu, to_device
 from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
-from avatar.splat import CannotDraw, checked_drawings
+from avatar.splat import CannotDraw, checked_drawings, is_checked
 from avatar.splat.cpu import thread_count
 from avatar.types import Camera, Gaussians, HeadParams, Rendering
 
 AHEAD_ON_GPU = 3  # frames whose copies are on their way
+WARM = 2  # frames of a kind that are launched before: they compile, and make what is made once
+KEPT = 16  # kinds that are ready at a time
+_PARAMS = tuple(field.name for field in fields(HeadParams))
+
+
+class _Kind(NamedTuple):
+    """Frames that launch the same."""
+
+    expressions: int
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    is_reference: bool
+
+    @classmethod
+    def of(cls, params: HeadParams, camera: Camera) -> _Kind:
+        c = camera
+        is_reference = c.R_ref_cam is None
+        return cls(len(params.expression), c.width, c.height, c.fx, c.fy, c.cx, c.cy, is_reference)
 
 
 class Renderer:
@@ -36,6 +63,11 @@ class Renderer:
     def __init__(self, avatar: Avatar, background: Float[Tensor, " 3"]) -> None:
         self.background = to_device(background.detach().clone(), avatar.device)
         self.avatar = avatar.frozen()
+        self._replays = avatar.is_fused and on_gpu(self.background) and not self.background.is_meta
+        self._kinds: OrderedDict[_Kind, int | Replay[Rendering]] = OrderedDict()  # how many were launched, or a replay
+        self._pool = new_pool(self.background.device)
+        self._lock = threading.Lock()  # of the replays' buffers
+        self._read: torch.cuda.Event | None = None  # when what the last one gave has been
 
     @torch.no_grad()
     def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
@@ -45,7 +77,54 @@ class Renderer:
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
         """One frame as soon as possible: each step uses all threads."""
+        if self._replays:
+            rendering = self._replayed(params, camera)
+            device = self.background.device
+            if rendering is not None and not (is_checked(device) and bool(rendering.alpha.isnan().any())):
+                return rendering
         return self.draw(self.gaussians(params, camera), camera, self.background)
+
+    def _replayed(self, params: HeadParams, camera: Camera) -> Rendering | None:
+        """The frame by a replay; None: it has to be launched."""
+        kind = _Kind.of(params, camera)
+        with self._lock:
+            known = self._kinds.pop(kind, 0)
+            if len(self._kinds) >= KEPT:
+                self._kinds.popitem(last=False)
+            if not isinstance(known, Replay) and known < WARM:
+                self._kinds[kind] = known + 1
+                return None
+            named = {name: getattr(params, name) for name in _PARAMS}
+            named |= {"R": camera.R_cam_world, "t": camera.t_cam_world}
+            named |= {} if camera.R_ref_cam is None else {"R_ref_cam": camera.R_ref_cam}
+            inputs = at_once(named, self.background.device)
+            if not isinstance(known, Replay):
+                try:
+                    known = self._captured(camera, inputs)
+                except CannotDraw:  # a launched frame says why
+                    return None
+                except RuntimeError:
+                    self._replays = False
+                    return None
+            self._kinds[kind] = known
+            if self._read is not None:
+                torch.cuda.current_stream().wait_event(self._read)
+            rendering = Rendering(*(part.clone() for part in known(inputs)))
+            if self.background.is_cuda:
+                self._read = torch.cuda.Event()
+                self._read.record()
+            return rendering
+
+    def _captured(self, camera: Camera, inputs: Mapping[str, Tensor]) -> Replay[Rendering]:
+        def play(named: Mapping[str, Tensor]) -> Rendering:
+            params = HeadParams(**{name: named[name] for name in _PARAMS})
+            seen = replace(camera, R_cam_world=named["R"], t_cam_world=named["t"], R_ref_cam=named.get("R_ref_cam"))
+            with checked_drawings(False):
+                return self.avatar.draw(self.gaussians(params, seen), seen, self.background)
+
+        with own_stream(self.background.device):
+            play({name: part.clone() for name, part in inputs.items()})  # aligned as the replay's own are
+            return Replay(play, inputs, self._pool)
 
     def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:
         """The avatar's Gaussians, with a sentence where its parameters are beyond what can be drawn (UserError)."""
@@ -74,10 +153,16 @@ class Renderer:
 
     def _stream_from_gpu(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         pending: deque[tuple[tuple[HeadParams, Camera], Rendering, torch.cuda.Event]] = deque()
+        copying = torch.cuda.Stream(self.background.device)
         for frame in frames:
-            copies = Rendering(*(t.to("cpu", non_blocking=True) for t in self.render(*frame)))
-            arrived = torch.cuda.Event()
-            arrived.record()
+            rendering = self.render(*frame)
+            copying.wait_stream(torch.cuda.current_stream(self.background.device))
+            with torch.cuda.stream(copying):
+                copies = Rendering(*(t.to("cpu", non_blocking=True) for t in rendering))
+                arrived = torch.cuda.Event()
+                arrived.record()
+            for part in rendering:
+                part.record_stream(copying)
             pending.append((frame, copies, arrived))
             if len(pending) > AHEAD_ON_GPU:
                 yield self._arrived(*pending.popleft())

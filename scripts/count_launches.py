@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -104,9 +103,8 @@ class Rehearsal:
         avatar.embedding.touching(avatar.mesh.assets.num_vertices)  # made once, and only of numbers that are there
         self.avatar = avatar.to(device)
         self.config, self.trainer = config, config.trainer
-        with patch("torch.optim.adam._device_dtype_check_for_fused"):  # it knows no meta device
-            self.corrections = make_pose_corrections(self.avatar, (0, 1), config.trainer)
-            self.optimizer = make_optimizer(self.avatar, config.trainer, self.corrections)
+        self.corrections = make_pose_corrections(self.avatar, (0, 1), config.trainer)
+        self.optimizer = make_optimizer(self.avatar, config.trainer, self.corrections)
         self.guard = Guard(self.optimizer, device)
         self.background = torch.ones(3, device=device)
         rest = torch.tensor(IDENTITY_6D)
@@ -121,10 +119,8 @@ class Rehearsal:
 
     def step(self, perceptual: PerceptualTerm, late: bool) -> Counter[str]:
         """What one training step launches; `late`: in the second half of the training."""
-        with patch("torch.optim.adam._device_dtype_check_for_fused"):
-            for _ in range(2):  # the first makes the optimizer's state
-                with counting() as launches:
-                    self.train(perceptual, late)
+        with counting() as launches:
+            self.train(perceptual, late)
         return launches
 
     def train(self, perceptual: PerceptualTerm, late: bool) -> None:

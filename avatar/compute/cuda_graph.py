@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 Made = TypeVar("Made")
+Pool = Any  # torch's handle of memory
+
+
+def new_pool(device: torch.device) -> Pool | None:
+    """Memory for the intermediate values of several replays."""
+    return torch.cuda.graph_pool_handle() if device.type == "cuda" else None
 
 
 class Replay(Generic[Made]):
@@ -18,9 +24,13 @@ class Replay(Generic[Made]):
     Whatever else the function reads must stay where it is, and it may neither wait for the GPU nor bring it anything. What
     it gives is overwritten by the next start. To be captured it is called, but nothing runs; that takes a stream of one's
     own (`own_stream`), on which it has run before. Where there is no GPU it is called at each start instead, for tests.
+
+    Replays that are made with one `pool` share their memory: what one gives must be used before another starts.
     """
 
-    def __init__(self, function: Callable[[Mapping[str, Tensor]], Made], inputs: Mapping[str, Tensor]) -> None:
+    def __init__(
+        self, function: Callable[[Mapping[str, Tensor]], Made], inputs: Mapping[str, Tensor], pool: Pool | None = None
+    ) -> None:
         self._buffers = {
             name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in inputs.items()
         }
@@ -29,7 +39,8 @@ class Replay(Generic[Made]):
         if next(iter(self._buffers.values())).is_cuda:
             graph = torch.cuda.CUDAGraph()
             # Other threads, which decode frames, may do what they like.
-            with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
+            own = torch.cuda.current_stream()
+            with torch.cuda.graph(graph, pool=pool, stream=own, capture_error_mode="thread_local"):
                 self._made = function(self._buffers)
             self._graph = graph
 

@@ -14,6 +14,7 @@ GPU_FUNCTIONS = {
     "make Gaussians": "avatar.gaussians.fused_gpu.fused_gaussians_gpu",
     "splat": "avatar.splat.gpu.splat_gpu",
     "upload a camera's pose": "avatar.splat.gpu.pose_on",
+    "Adam": "avatar.train.adam_gpu.GpuAdam",
     "Huber loss": "avatar.losses.gpu.huber_gpu",
     "D-SSIM": "avatar.losses.gpu.dssim_gpu",
 }

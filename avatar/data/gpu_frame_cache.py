@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -9,7 +11,7 @@ from torch import Tensor
 
 from avatar.compute.device import to_device
 from avatar.data.subject import FramePixels, Subject
-from avatar.types import Frame, HeadParams
+from avatar.types import Camera, Frame, HeadParams
 
 SHARE = 0.5  # of the memory that is free on the GPU when a training begins
 
@@ -17,6 +19,15 @@ SHARE = 0.5  # of the memory that is free on the GPU when a training begins
 def frame_cache_bytes(device: torch.device) -> int:
     """How much of a GPU's memory frames may take."""
     return int(SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else 0
+
+
+class _Kept(NamedTuple):
+    """One frame at one size."""
+
+    flat: UInt8[Tensor, " bytes"]  # on the GPU, one part after the other, so that one division makes floats of all
+    head_box: tuple[slice, slice]
+    camera: Camera
+    params: HeadParams
 
 
 class GpuFrameCache:
@@ -28,7 +39,7 @@ class GpuFrameCache:
     def __init__(self, subject: Subject, device: torch.device, limit_bytes: int) -> None:
         self._subject, self._device = subject, device
         self._room = limit_bytes
-        self._kept: dict[int, tuple[UInt8[Tensor, " bytes"], tuple[slice, slice]]] = {}
+        self._kept: dict[int, _Kept] = {}
         tracks = subject.recording.tracks
         self._tracks = {name: to_device(tracks[name], device) for name in HeadParams.__dataclass_fields__}
 
@@ -36,30 +47,30 @@ class GpuFrameCache:
         return index in self._kept
 
     def frame(self, index: int, pixels: FramePixels | None, size: int | None) -> Frame:
-        """A frame decoded at `size`; its pixels may be None where the shelf holds it."""
+        """A frame decoded at `size`, always the same one; its pixels may be None where the cache holds it."""
+        recording = self._subject.recording
+        time = recording.time(index)
         kept = self._kept.get(index)
         if kept is None:
             assert pixels is not None
-            # One after the other in memory, so that one division makes floats of all.
             flat = torch.from_numpy(np.concatenate([part.reshape(-1) for part in pixels]))
-            kept = to_device(flat, self._device), box_of(pixels.head_mask)
+            params = HeadParams(**{name: track[time] for name, track in self._tracks.items()})
+            camera = self._subject.camera(index, size)
+            kept = _Kept(to_device(flat, self._device), box_of(pixels.head_mask), camera, params)
             if flat.nbytes <= self._room:
                 self._room -= flat.nbytes
                 self._kept[index] = kept
-        width, height = self._subject.image_size(size, index)
-        recording = self._subject.recording
-        time = recording.time(index)
-        image, alpha, head_mask, mouth_mask = planes(kept[0], height, width)
+        image, alpha, head_mask, mouth_mask = planes(kept.flat, kept.camera.height, kept.camera.width)
         return Frame(
             index=index,
             name=recording.names[index],
-            camera=self._subject.camera(index, size),
-            params=HeadParams(**{name: track[time] for name, track in self._tracks.items()}),
+            camera=kept.camera,
+            params=kept.params,
             image=image,
             alpha=alpha,
             head_mask=head_mask,
             mouth_mask=mouth_mask,
-            head_box=kept[1],
+            head_box=kept.head_box,
             shared_time=None if recording.rig is None else time,
         )
 

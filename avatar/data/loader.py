@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import OrderedDict, deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +15,7 @@ from avatar.types import Frame
 CACHE_BYTES = 2**30  # for decoded frames; what does not fit is decoded again
 BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
 FRAMES_AHEAD = 3  # decoded ahead of the training step, in one thread
+GPU_WORKERS = 8  # threads that decode for a GPU, which takes frames faster than one can
 
 
 class FrameLoader:
@@ -29,7 +31,9 @@ class FrameLoader:
         self.cached_bytes = 0
         self._frame_cache = frame_cache
         self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
+        workers = 1 if frame_cache is None else min(os.cpu_count() or 1, GPU_WORKERS)
+        self._ahead = FRAMES_AHEAD * workers
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="frames")
         self._closed = False
 
     def __enter__(self) -> FrameLoader:
@@ -59,7 +63,7 @@ class FrameLoader:
         pending: dict[int, Future[FramePixels]] = {}
         try:
             while True:
-                while len(queue) < FRAMES_AHEAD:
+                while len(queue) < self._ahead:
                     index = next(order, None)
                     if index is None:
                         break

@@ -27,6 +27,8 @@ from avatar.tensors import check_shapes
 HUBER_DELTA = 0.1
 MOUTH_WEIGHT = 40.0
 LPIPS_WEIGHT = 0.05
+HEAD_MARGIN = 16  # pixels around the head's box
+CROP_SIZES = 8  # of a side, where crops are to have few sizes
 
 # (image [H, W, 3], target [H, W, 3], mask [H, W]) -> a dissimilarity of the two images times the mask, scalar
 Perceptual = Callable[..., Tensor]
@@ -117,25 +119,47 @@ def _by_gpu_kernels(image: Tensor, target: Tensor, mask: Tensor) -> bool:
     return plain and not (target.requires_grad or mask.requires_grad)
 
 
-def on_head(perceptual: Perceptual, margin: int = 16, least: int = MIN_SIZE) -> Perceptual:
+def on_head(perceptual: Perceptual, margin: int = HEAD_MARGIN, least: int = MIN_SIZE) -> Perceptual:
     """`perceptual` of the mask's bounding box, grown by `margin` pixels, in place of the whole frame.
 
     The value is scaled by the box's share of the frame, so it weighs what the mean over the whole frame does: both images
     are black outside the mask. Only networks that see the frame's border where the box ends can tell. A head far away gets
     a box of `least` pixels a side, which LPIPS needs, where the frame has them. Who knows the box may name it
-    (`Frame.head_box`): to look for it is to wait for a GPU.
+    (`Frame.head_box`): to look for it is to wait for a GPU. Or rows and columns, int64 tensors, are taken as they are, which a
+    CUDA graph can read (`crop_of_few_sizes`).
     """
 
-    def cropped(image: Tensor, target: Tensor, mask: Tensor, box: tuple[slice, slice] | None = None) -> Tensor:
-        box = bounding_box(mask) if box is None else box
-        if box is None or box[0].start == box[0].stop:
-            return (image * 0.0).sum()
-        crop = grown_box(box, (mask.shape[0], mask.shape[1]), margin=margin, least=least)
-        inside = mask[crop]
-        share = inside.numel() / mask.numel()
-        return share * perceptual(image[crop], target[crop], inside)
+    def cropped(
+        image: Tensor,
+        target: Tensor,
+        mask: Tensor,
+        box: tuple[slice, slice] | None = None,
+        crop: tuple[Tensor, Tensor] | None = None,
+    ) -> Tensor:
+        if crop is not None:
+            parts = [part.index_select(0, crop[0]).index_select(1, crop[1]) for part in (image, target, mask)]
+        else:
+            box = bounding_box(mask) if box is None else box
+            if box is None or box[0].start == box[0].stop:
+                return (image * 0.0).sum()
+            inside = grown_box(box, (mask.shape[0], mask.shape[1]), margin=margin, least=least)
+            parts = [part[inside] for part in (image, target, mask)]
+        share = parts[2].numel() / mask.numel()
+        return share * perceptual(*parts)
 
     return cropped
+
+
+def crop_of_few_sizes(box: tuple[slice, slice], shape: tuple[int, int]) -> tuple[slice, slice]:
+    """What `on_head` takes of an image of `shape`, or more: each side has one of `CROP_SIZES` lengths."""
+    grain = max(-(-max(shape) // CROP_SIZES), MIN_SIZE)
+    sides = grown_box(box, shape, margin=HEAD_MARGIN)
+    lengths = [-(-(side.stop - side.start) // grain) * grain for side in sides]
+    rows, columns = (
+        grown_box((side, side), (size, size), least=length)[0]
+        for side, size, length in zip(sides, shape, lengths, strict=True)
+    )
+    return rows, columns
 
 
 def masked_lpips(lpips: Callable[[Tensor, Tensor], Tensor]) -> Perceptual:

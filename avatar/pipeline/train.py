@@ -124,7 +124,8 @@ def finish_training(
         f"{len(split.test)} held out, {config.trainer.iterations:,} steps"
     )
     width, height = subject.image_size(config.data.size)
-    if (decoded := len(split.train) * width * height * BYTES_PER_PIXEL) > CACHE_BYTES:
+    decoded = len(split.train) * width * height * BYTES_PER_PIXEL
+    if device.type == "cpu" and decoded > CACHE_BYTES:
         print(
             f"Note: the decoded frames take {shown_size(decoded)}, of which {shown_size(CACHE_BYTES)} are kept in memory; "
             "the others are decoded again at each turn"

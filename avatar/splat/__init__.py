@@ -13,14 +13,14 @@ from torch import Tensor
 from avatar.compute.device import on_gpu
 from avatar.compute.gpu_functions import gpu_function
 from avatar.splat.cpu import CannotDraw, splat_cpu
-from avatar.splat.gpu_buffers import checked_drawings
+from avatar.splat.gpu_buffers import checked_drawings, is_checked
 from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, Gaussians, Rendering
 
-__all__ = ["CannotDraw", "checked_drawings", "splat"]
+__all__ = ["CannotDraw", "checked_drawings", "is_checked", "splat"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30

@@ -37,9 +37,9 @@ _checked: ContextVar[bool] = ContextVar("checked", default=False)
 
 
 @contextmanager
-def checked_drawings() -> Iterator[None]:
-    """Drawings in here wait for the GPU, and raise CannotDraw where they could only be NaN otherwise."""
-    token = _checked.set(True)
+def checked_drawings(checked: bool = True) -> Iterator[None]:
+    """Drawings in here wait for the GPU, and raise CannotDraw where they could only be NaN otherwise; or do not."""
+    token = _checked.set(checked)
     try:
         yield
     finally:

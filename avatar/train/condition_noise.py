@@ -26,10 +26,16 @@ class ConditionNoise:
 
     def of(self, step: int) -> Float[Tensor, " C"]:
         """What is added in step `step` (from 0): a function of seed and step; on the CPU."""
+        return torch.from_numpy(self._weights(step)) @ self._deviations
+
+    def of_steps(self, steps: range) -> Float[Tensor, "S C"]:
+        """What is added in each of these steps, to rounding."""
+        return torch.from_numpy(np.stack([self._weights(step) for step in steps])) @ self._deviations
+
+    def _weights(self, step: int) -> Float[np.ndarray, " T"]:
+        """Of the deviations: a sum of them with weights that are independent and normal has their covariance."""
         generator = np.random.default_rng([self._seed, step, _STREAM])
-        # A sum of deviations with weights that are independent and normal has their covariance.
-        weights = generator.standard_normal(len(self._deviations), dtype=np.float32)
-        return torch.from_numpy(weights) @ self._deviations
+        return generator.standard_normal(len(self._deviations), dtype=np.float32)
 
 
 def make_noise(recording: Recording, config: TrainerConfig) -> ConditionNoise | None:

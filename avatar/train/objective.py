@@ -84,9 +84,19 @@ class Objective:
         """The third term of step `step`."""
         return self.perceptual.at(step, perceptual_start(self.config))
 
-    def loss(self, step: int, frame: Frame, image: Float[Tensor, "H W 3"], target: Tensor) -> PhotometricLoss:
+    def loss(
+        self,
+        step: int,
+        frame: Frame,
+        image: Float[Tensor, "H W 3"],
+        target: Tensor,
+        crop: tuple[Tensor, Tensor] | None = None,
+    ) -> PhotometricLoss:
+        """`crop`, rows and columns, takes the place of the frame's box of the head."""
         term = self.term(step)
-        function = partial(term.function, box=frame.head_box) if term and term.crops else term and term.function
+        function = term and term.function
+        if term and term.crops:
+            function = partial(term.function, box=frame.head_box, crop=crop)
         return photometric_loss(
             image,
             target,

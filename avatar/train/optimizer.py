@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from avatar.compute.device import on_gpu, to_device
+from avatar.compute.device import on_gpu
+from avatar.compute.gpu_functions import gpu_function
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
@@ -28,13 +29,9 @@ def make_optimizer(
     if pose_corrections is not None:
         named.append(([pose_corrections.moves], config.pose_rate))
     groups: list[dict[str, Any]] = [{"params": params, "lr": rate, "full_lr": rate} for params, rate in named]
-    # What a CUDA graph can capture costs a GPU nothing, and is of no use to a CPU.
-    optimizer = torch.optim.Adam(groups, eps=EPSILON, fused=True, capturable=avatar.quats.is_cuda)
-    if on_gpu(avatar.quats) and not avatar.quats.is_meta:  # where they are read: a graph is for any step's rates
-        rates_there = torch.zeros(len(groups), device=avatar.quats.device)
-        for group, rate in zip(optimizer.param_groups, rates_there, strict=True):
-            group["lr"] = rate
-    return optimizer
+    if on_gpu(avatar.quats):
+        return gpu_function("Adam")(groups, eps=EPSILON, device=avatar.device)
+    return torch.optim.Adam(groups, eps=EPSILON, fused=True)
 
 
 def schedule(step: int, config: TrainerConfig) -> float:
@@ -52,14 +49,11 @@ def schedule(step: int, config: TrainerConfig) -> float:
 
 def set_rates(optimizer: torch.optim.Adam, share: float) -> None:
     """Give every group this share of the learning rate that it was made with."""
-    groups = optimizer.param_groups
-    rates = [group["full_lr"] * share for group in groups]
-    if isinstance(first := groups[0]["lr"], Tensor):
-        assert first._base is not None  # the groups' rates are views of one tensor
-        first._base.copy_(to_device(torch.tensor(rates), first.device))
-        return
-    for group, rate in zip(groups, rates, strict=True):
-        group["lr"] = rate
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], Tensor):  # of a GPU's, one for all groups: the share
+            group["lr"].fill_(share)
+            return
+        group["lr"] = group["full_lr"] * share
 
 
 def optimizer_tensors(optimizer: torch.optim.Adam, named: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
@@ -78,7 +72,11 @@ def load_optimizer(
     for name, parameter in named.items():
         prefix = f"optimizer.{name}."
         own = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-        state = {key: value.to(parameter.device, copy=True) for key, value in own.items()}
-        if state.keys() != {"exp_avg", "exp_avg_sq", "step"}:
+        if own.keys() != {"exp_avg", "exp_avg_sq", "step"}:
             raise UserError(f"the checkpoint lacks the optimizer state of {name}; training cannot go on from it")
-        optimizer.state[parameter] = state
+        state = optimizer.state[parameter]
+        for key, value in own.items():
+            if key in state:  # where a GPU's kernels read it
+                state[key].copy_(value)
+            else:
+                state[key] = value.to(parameter.device, copy=True)

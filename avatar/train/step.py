@@ -25,7 +25,7 @@ from avatar.types import Frame, HeadParams
 Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
 
 _IMAGES = ("image", "alpha", "head_mask", "mouth_mask")
-_OPTIONAL = ("noise", "row", "pose_jacobian")
+_OPTIONAL = ("noise", "row", "pose_jacobian", "crop_rows", "crop_columns")
 _PARAMS = tuple(field.name for field in fields(HeadParams))
 
 
@@ -37,6 +37,8 @@ class StepInputs(NamedTuple):
     noise: Float[Tensor, " C"] | None = None  # added to the network's input
     row: Int[Tensor, "1"] | None = None  # of the frame among the pose corrections
     pose_jacobian: Float[Tensor, "5 12"] | None = None  # of the frame's camera in its correction
+    crop_rows: Int[Tensor, " h"] | None = None  # of the frame, which the perceptual term sees
+    crop_columns: Int[Tensor, " w"] | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """All that differs between two steps, by name."""
@@ -99,7 +101,10 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
         image = objective.draw(step, gaussians, camera, avatar)
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
-    loss = objective.loss(step, frame, image, target)
+    crop = None
+    if inputs.crop_rows is not None and inputs.crop_columns is not None:
+        crop = inputs.crop_rows, inputs.crop_columns
+    loss = objective.loss(step, frame, image, target, crop)
     state.optimizer.zero_grad()
     loss.total.backward()
     gradients = gradients_of(state)

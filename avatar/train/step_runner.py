@@ -1,8 +1,8 @@
 """How a training's steps are made: one operation after the other, or on a GPU, after a few, by replaying them.
 
 A step launches a hundred kernels and more, and the host takes several times as long to start them as a GPU to run them. But
-they are the same in every step: a CUDA graph holds them, and reads from buffers what differs. Steps in which something else
-takes part (LPIPS, whose crop has another size each time; a step that is repeated to say what was wrong) are launched.
+they are the same in every step: a CUDA graph holds them, and reads from buffers what differs. A step that is repeated to
+say what was wrong is launched.
 """
 
 from __future__ import annotations
@@ -13,21 +13,23 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.compute.cuda_graph import Replay
+from avatar.compute.cuda_graph import Replay, new_pool
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.gpu_functions import gpu_function
+from avatar.losses.photometric import crop_of_few_sizes
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import Judge, StepInputs, StepOutputs, TrainState, train_step
-from avatar.types import Frame
+from avatar.types import Camera, Frame
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
 MESH_BYTES = 2**28  # of posed meshes, 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again
-KEPT = 2  # kinds that are ready at a time; each has memory of its own
+KEPT = 8  # kinds that are ready at a time
+BLOCK = 64  # steps whose noise comes to a GPU at once
 
 
 class Kind(NamedTuple):
@@ -36,6 +38,23 @@ class Kind(NamedTuple):
     size: tuple[int, int]
     sh_degree: int
     term: Weighted | None
+    crop: tuple[int, int] | None  # height and width of what the perceptual term sees
+
+    @classmethod
+    def of(cls, step: int, inputs: StepInputs, term: Weighted | None) -> Kind:
+        camera, rows, columns = inputs.frame.camera, inputs.crop_rows, inputs.crop_columns
+        crop = None if rows is None or columns is None else (len(rows), len(columns))
+        return cls((camera.width, camera.height), sh_degree(step), term, crop)
+
+
+class FrameConstants(NamedTuple):
+    """What a step takes of a frame that is the same each time, where the avatar is."""
+
+    camera: Camera
+    row: Int[Tensor, "1"] | None
+    pose_jacobian: Float[Tensor, "5 12"] | None
+    crop_rows: Int[Tensor, " h"] | None
+    crop_columns: Int[Tensor, " w"] | None
 
 
 class StepRunner:
@@ -52,10 +71,12 @@ class StepRunner:
         self._device = avatar.device
         self._meshes: dict[int, Tensor] = {}  # by time: they do not change while the avatar does
         self._mesh_bytes = MESH_BYTES
-        self._jacobians: dict[int, Tensor] = {}  # of the frames' cameras in their corrections
+        self._constants: dict[int, FrameConstants] = {}
+        self._noises: tuple[int, Tensor] | None = None  # the first step of a block, and what is added in each
         self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_fused
         self._launched: Counter[Kind] = Counter()
         self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
+        self._pool = new_pool(self._device)
         self.replayed = 0  # steps so far
 
     def vertices(self, frame: Frame) -> Float[Tensor, "V 3"]:
@@ -73,7 +94,8 @@ class StepRunner:
         gives is overwritten by the next one."""
         state, config = self._state, self._state.objective.config
         set_rates(state.optimizer, schedule(step, config))
-        inputs, kind = self.inputs(step, frame), self._kind(step, frame)
+        inputs = self.inputs(step, frame)
+        kind = Kind.of(step, inputs, state.objective.term(step)) if self._replays else None  # None: to be launched
         replay = None if kind is None or judge is None else self._ready(kind, step, inputs, judge)
         if replay is not None:
             self.replayed += 1
@@ -87,27 +109,40 @@ class StepRunner:
 
     def inputs(self, step: int, frame: Frame) -> StepInputs:
         """What step `step` takes of a frame, where the avatar is."""
-        vertices, camera = self.vertices(frame), frame.camera
-        noise = None if self._noise is None else to_device(self._noise.of(step), self._device)
-        corrections, row, jacobian = self._state.pose_corrections, None, None
-        if corrections is not None:
-            row = torch.full((1,), corrections.rows[frame.time], device=self._device)
-            if frame.index not in self._jacobians:
-                self._jacobians[frame.index] = to_device(corrections.jacobian(camera), self._device)
-            jacobian = self._jacobians[frame.index]
-        if on_gpu(vertices):
-            R, t = gpu_function("upload a camera's pose")(camera, self._device).float().split((9, 3))
-            turn = None if camera.R_ref_cam is None else to_device(camera.R_ref_cam, self._device)
-            camera = replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t, R_ref_cam=turn)
-            frame = replace(frame, camera=camera)
-        return StepInputs(frame, vertices, noise, row, jacobian)
-
-    def _kind(self, step: int, frame: Frame) -> Kind | None:
-        """None: to be launched."""
+        constants = self._constants.get(frame.index)
+        if constants is None:
+            constants = self._constants[frame.index] = self._constants_of(frame)
+        camera, row, jacobian, *crop = constants
         term = self._state.objective.term(step)
-        if not self._replays or (term is not None and term.crops):
+        if term is None or not term.crops:
+            crop = [None, None]
+        frame = replace(frame, camera=camera)
+        return StepInputs(frame, self.vertices(frame), self._noise_of(step), row, jacobian, *crop)
+
+    def _constants_of(self, frame: Frame) -> FrameConstants:
+        camera, corrections, device = frame.camera, self._state.pose_corrections, self._device
+        row = jacobian = rows = columns = None
+        if corrections is not None:
+            row = torch.full((1,), corrections.rows[frame.time], device=device)
+            jacobian = to_device(corrections.jacobian(camera), device)
+        if on_gpu(self._state.avatar.quats):
+            R, t = gpu_function("upload a camera's pose")(camera, device).float().split((9, 3))
+            turn = None if camera.R_ref_cam is None else to_device(camera.R_ref_cam, device)
+            camera = replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t, R_ref_cam=turn)
+            if frame.head_box is not None:
+                crop = crop_of_few_sizes(frame.head_box, (camera.height, camera.width))
+                rows, columns = (to_device(torch.arange(side.start, side.stop), device) for side in crop)
+        return FrameConstants(camera, row, jacobian, rows, columns)
+
+    def _noise_of(self, step: int) -> Float[Tensor, " C"] | None:
+        if self._noise is None:
             return None
-        return Kind((frame.camera.width, frame.camera.height), sh_degree(step), term)
+        if self._device.type == "cpu":
+            return self._noise.of(step)
+        first = step - step % BLOCK  # whichever step a training begins with
+        if self._noises is None or self._noises[0] != first:
+            self._noises = first, to_device(self._noise.of_steps(range(first, first + BLOCK)), self._device)
+        return self._noises[1][step - first]
 
     def _ready(self, kind: Kind, step: int, inputs: StepInputs, judge: Judge) -> Replay[StepOutputs] | None:
         """What replays steps like this one, captured if need be; None: the step has to be launched."""
@@ -118,7 +153,7 @@ class StepRunner:
             return train_step(self._state, step, inputs.with_tensors(tensors), judge)
 
         try:
-            replay = Replay(play, inputs.tensors())
+            replay = Replay(play, inputs.tensors(), self._pool)
         except RuntimeError as error:
             self._replays = False
             self._say(f"Steps are launched one operation at a time, because they cannot be replayed: {error}")

@@ -128,9 +128,8 @@ class ViewRenderer:
 
     @torch.no_grad()
     def rendered(self, params: HeadParams, camera: Camera) -> Rendering:
-        """The avatar alone, where it computes; nothing is read back."""
-        gaussians = self.trained.gaussians(params, camera)
-        return self.trained.avatar.draw(gaussians, camera, self.trained.renderer.background)
+        """The avatar alone, where it computes."""
+        return self.trained.render(params, camera)
 
 
 def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

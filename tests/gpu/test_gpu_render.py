@@ -7,14 +7,18 @@ from dataclasses import replace
 import pytest
 import torch
 from heads import grid_head, random_params
-from interpreter import DEVICE, error, the_cpus_way
+from interpreter import DEVICE, as_on_a_gpu, error, the_cpus_way
 
+from avatar import render as render_module
+from avatar.compute.cuda_graph import Replay
 from avatar.config import load_config
+from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.render import Renderer
 from avatar.runs.model_registry import make_avatar
+from avatar.splat import checked_drawings
 from avatar.splat.scenes import head_camera
-from avatar.types import Gaussians
+from avatar.types import Camera, Gaussians, HeadParams
 
 RECIPES = ("model=hypergaussians", "experiment=paper", "model=flashavatar")
 
@@ -70,3 +74,70 @@ def test_later_training_does_not_show() -> None:
         for parameter in avatar.parameters():
             parameter.zero_()
     assert all(torch.equal(a, b) for a, b in zip(renderer.gaussians(random_params()), before, strict=True))
+
+
+def moving(size: int = 24, frames: int = 5) -> list[tuple[HeadParams, Camera]]:
+    """Different expressions before a camera that turns."""
+    camera = head_camera(size)
+    turns = [torch.linalg.qr(torch.eye(3) + 0.02 * i * torch.ones(3, 3).triu(1))[0] for i in range(frames)]
+    turns = [turn * turn.diagonal().sign() for turn in turns]
+    cameras = [replace(camera, R_cam_world=turn @ camera.R_cam_world) for turn in turns]
+    return [(random_params(seed), seen) for seed, seen in enumerate(cameras)]
+
+
+@pytest.mark.parametrize("other", [None, torch.linalg.qr(torch.eye(3) + 0.1 * torch.ones(3, 3).triu(1))[0]])
+def test_replayed_frames_have_the_bits_of_launched_ones(
+    other: torch.Tensor | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = [(params, replace(camera, R_ref_cam=other)) for params, camera in moving()]
+    avatar = avatar_of("model.head_rotation=true").to(DEVICE)
+    avatar.learn_head_rotation(torch.stack([camera.head_rotation for _, camera in frames]))
+    monkeypatch.setattr(render_module, "WARM", 99)
+    launching = Renderer(avatar, torch.ones(3))
+    expected = [launching.render(*frame) for frame in frames]
+    monkeypatch.setattr(render_module, "WARM", 1)
+    replaying = Renderer(avatar, torch.ones(3))
+    starts = count_starts(monkeypatch)
+    found = [replaying.render(*frame) for frame in frames]
+    assert starts == [1] * (len(frames) - 1)
+    for own, wanted in zip(found, expected, strict=True):
+        assert torch.equal(own.image, wanted.image) and torch.equal(own.alpha, wanted.alpha)
+    assert not torch.equal(found[1].image, found[2].image)
+
+
+def count_starts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    starts: list[int] = []
+
+    class Counted(Replay):
+        def __call__(self, inputs):  # type: ignore[no-untyped-def]
+            starts.append(1)
+            return super().__call__(inputs)
+
+    monkeypatch.setattr(render_module, "Replay", Counted)
+    return starts
+
+
+def test_other_intrinsics_are_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_module, "WARM", 1)
+    monkeypatch.setattr(render_module, "KEPT", 2)
+    renderer = Renderer(avatar_of("model=hypergaussians").to(DEVICE), torch.ones(3))
+    params, camera = random_params(), head_camera(20)
+    zoomed = [replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom) for zoom in (1.0, 1.2, 1.4)]
+    expected = [renderer.render(params, seen).image for seen in zoomed]
+    for _ in range(2):
+        for seen, wanted in zip(zoomed, expected, strict=True):
+            assert torch.equal(renderer.render(params, seen).image, wanted)
+    assert not torch.equal(expected[0], expected[1])
+
+
+def test_a_replayed_frame_that_cannot_be_drawn_raises_where_it_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_module, "WARM", 1)
+    renderer = Renderer(avatar_of("model=hypergaussians").to(DEVICE), torch.ones(3))
+    params, camera = random_params(), head_camera(20)
+    bad = replace(params, expression=params.expression * float("inf"))
+    with as_on_a_gpu():
+        good = [renderer.render(params, camera) for _ in range(3)]
+        assert renderer.render(bad, camera).alpha.isnan().any()
+        with checked_drawings(), pytest.raises(UserError, match="cannot be drawn"):
+            renderer.render(bad, camera)
+        assert torch.equal(renderer.render(params, camera).image, good[0].image)

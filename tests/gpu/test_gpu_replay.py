@@ -16,6 +16,7 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.compute.cuda_graph import Replay, own_stream
+from avatar.losses.lpips_network import Lpips
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
 from avatar.train import objective as objective_module
@@ -88,6 +89,23 @@ def test_replayed_steps_have_the_bits_of_launched_ones(
     assert replaying.replayed == 20 - 4  # the first of each kind: degrees 0, 1, 1 with a third term, 2
     assert same == losses and len(set(losses)) == 20
     assert expected.tensors["pose_corrections.moves"].any()
+    assert_same(found, expected)
+
+
+def test_steps_with_lpips_of_the_heads_box_are_replayed(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze").on(DEVICE)
+    monkeypatch.setattr(objective_module, "load_lpips", lambda *_, **__: lpips)
+    monkeypatch.setattr(objective_module, "SPARSE_EVERY", 2)
+    tiny = ("data.size=40", "trainer.perceptual=lpips", "trainer.iterations=12", "trainer.checkpoint_every=12")
+    expected, _, losses = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, *tiny, warm=99)
+    found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, *tiny, warm=1)
+    sizes = {kind.crop for kind in replaying._captured if kind.crop}
+    assert sizes and all(height % 32 == 0 or height == 40 for height, _ in sizes)
+    assert replaying.replayed == 12 - len(replaying._launched)
+    assert same == losses
     assert_same(found, expected)
 
 

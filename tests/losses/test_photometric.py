@@ -7,8 +7,17 @@ import torch
 from torch import Tensor
 
 from avatar.losses.lpips_network import Lpips
-from avatar.losses.metrics import ssim
-from avatar.losses.photometric import dssim, masked_huber, masked_lpips, on_head, photometric_loss
+from avatar.losses.metrics import grown_box, ssim
+from avatar.losses.photometric import (
+    CROP_SIZES,
+    HEAD_MARGIN,
+    crop_of_few_sizes,
+    dssim,
+    masked_huber,
+    masked_lpips,
+    on_head,
+    photometric_loss,
+)
 
 
 def huber_written_out(image: Tensor, target: Tensor, delta: float) -> float:
@@ -105,6 +114,38 @@ def test_the_heads_box_weighs_what_the_whole_frame_does() -> None:
     nothing = on_head(mean_error)(leaf, target, torch.zeros(24, 31, dtype=torch.float64))
     (gradient,) = torch.autograd.grad(nothing, leaf)
     assert nothing.item() == 0.0 and not gradient.any()
+
+
+def test_a_crop_by_rows_and_columns_weighs_what_the_whole_frame_does() -> None:
+    image, target, _, _ = sample()
+    head = torch.zeros(24, 31, dtype=torch.float64)
+    head[4:12, 20:28] = torch.rand(8, 8) + 0.01
+
+    def mean_error(a, b, m):
+        return (((a - b) * m[..., None]) ** 2).mean()
+
+    crop = torch.arange(2, 20), torch.arange(13, 31)
+    leaves = [image.clone().requires_grad_() for _ in range(2)]
+    found, whole = on_head(mean_error)(leaves[0], target, head, crop=crop), mean_error(leaves[1], target, head)
+    torch.testing.assert_close(found, whole)
+    gradients = [torch.autograd.grad(value, leaf)[0] for value, leaf in zip((found, whole), leaves, strict=True)]
+    torch.testing.assert_close(*gradients)
+
+
+@pytest.mark.parametrize("shape", [(512, 512), (288, 360), (40, 33)])
+def test_crops_have_few_sizes_and_hold_the_heads_box(shape: tuple[int, int]) -> None:
+    sizes = set()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(300):
+        corners = [torch.randint(0, side + 1, (2,), generator=generator).sort().values.tolist() for side in shape]
+        box = slice(*corners[0]), slice(*corners[1])
+        crop, least = crop_of_few_sizes(box, shape), grown_box(box, shape, margin=HEAD_MARGIN)
+        for side, inside, size in zip(crop, least, shape, strict=True):
+            assert 0 <= side.start <= inside.start and inside.stop <= side.stop <= size
+            assert side.stop - side.start >= min(32, size)
+        sizes.add(tuple(side.stop - side.start for side in crop))
+    assert len(sizes) <= CROP_SIZES**2
+    assert {height for height, _ in sizes} <= {*range(64, shape[0], 64), shape[0], 32, *range(45, shape[0], 45)}
 
 
 @pytest.mark.parametrize("corner", [(0, 0), (70, 20), (97, 60)])

@@ -56,6 +56,11 @@ def test_noise_is_a_function_of_seed_and_step(subject: Subject) -> None:
         assert not torch.equal(noise.of(7), other)
 
 
+def test_noise_of_several_steps_is_that_of_each(subject: Subject) -> None:
+    noise = ConditionNoise(conditions_of(subject), SHARE, seed=3)
+    torch.testing.assert_close(noise.of_steps(range(5, 9)), torch.stack([noise.of(step) for step in range(5, 9)]))
+
+
 @pytest.mark.parametrize("share", [0.0, SHARE])
 def test_training_poses_the_mesh_without_it(
     share: float, tracked_folder: Path, subject: Subject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
