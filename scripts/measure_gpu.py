@@ -22,10 +22,10 @@ from torch import Tensor
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.splat_gpu import device_of, settle
 from avatar.compute.cuda_graph import own_stream
-from avatar.compute.device import interpreted
+from avatar.compute.device import CPU, interpreted
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
-from avatar.losses.photometric import dssim
+from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.pipeline.choose_device import choose_device
 from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
@@ -35,6 +35,7 @@ from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Gaussians
 
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4  # mean over the pixels, of a field's norm; cut-offs may decide a pixel
+STREAMED = 20
 STAND_IN = PerceptualTerm("dssim", Weighted(dssim, 0.05))
 
 
@@ -115,9 +116,9 @@ def check_capture(scene: Scene) -> str:
 class Replays:
     """The steps of a rehearsal, which are replayed after the first ones."""
 
-    def __init__(self, rehearsal: Rehearsal) -> None:
+    def __init__(self, rehearsal: Rehearsal, perceptual: PerceptualTerm = STAND_IN) -> None:
         self.rehearsal = rehearsal
-        self.steps = StepRunner(rehearsal.state(STAND_IN))
+        self.steps = StepRunner(rehearsal.state(perceptual))
 
     def train(self, late: bool) -> None:
         r = self.rehearsal
@@ -161,6 +162,9 @@ def tune(scene: Scene, repeats: int, quick: bool) -> list[tuple[gpu_draw.Tuning,
 
 def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: int) -> dict[str, Time]:
     renderer, replays = Renderer(rehearsal.avatar, rehearsal.background), Replays(rehearsal)
+    lpips = Weighted(on_head(masked_lpips(rehearsal.lpips)), 0.05, crops=True)
+    with_lpips = Replays(rehearsal, PerceptualTerm("lpips", lpips))
+    frame = rehearsal.params.to(CPU), rehearsal.camera
 
     def settled(function: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -174,10 +178,13 @@ def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: 
         "splatting, backward": scene.backward,
         "posing": settled(lambda: renderer.avatar.vertices(rehearsal.params)),
         "network, HyperGaussians and placing": settled(lambda: renderer.gaussians(rehearsal.params)),
-        "a rendered frame": settled(lambda: renderer.render(rehearsal.params, rehearsal.camera)),
+        "a rendered frame": settled(lambda: renderer.draw(renderer.gaussians(*frame), frame[1], renderer.background)),
+        "the same, replayed": settled(lambda: renderer.render(*frame)),
+        f"{STREAMED} frames, streamed to the CPU": lambda: sum(1 for _ in renderer.stream([frame] * STREAMED)),
         "a training step, first half": settled(lambda: rehearsal.train(STAND_IN, late=False)),
         "a training step with D-SSIM": settled(lambda: rehearsal.train(STAND_IN, late=True)),
         "the same two, replayed": settled(lambda: (replays.train(False), replays.train(True))),
+        "a training step with LPIPS, replayed": settled(lambda: with_lpips.train(True)),
     }
     return paired_medians(functions, repeats, warm_up=min(WARM + 1, repeats - 1))
 

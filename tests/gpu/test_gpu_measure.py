@@ -21,7 +21,7 @@ def measure_gpu(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return measure_gpu
 
 
-SMALL = ["--size", "16", "--splats", "30", "--uv-size", "6", "--repeats", "1", "--quick"]
+SMALL = ["--size", "32", "--splats", "30", "--uv-size", "6", "--repeats", "1", "--quick"]
 
 
 def test_checks_times_and_tunings_are_written(measure_gpu: ModuleType, tmp_path: Path) -> None:
