@@ -9,9 +9,10 @@ frame is replayed as a CUDA graph where its camera's intrinsics have been seen b
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.compute.cuda_graph import Replay, new_pool, own_stream
-from avatar.compute.device import at_once, on_gpu, to_device
+from avatar.compute.device import on_gpu, to_device
 from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
@@ -64,7 +65,7 @@ class Renderer:
         self.background = to_device(background.detach().clone(), avatar.device)
         self.avatar = avatar.frozen()
         self._replays = avatar.is_fused and on_gpu(self.background) and not self.background.is_meta
-        self._kinds: OrderedDict[_Kind, int | Replay[Rendering]] = OrderedDict()  # how many were launched, or a replay
+        self._kinds: OrderedDict[_Kind, int | Replay[Tensor]] = OrderedDict()  # how many were launched, or a replay
         self._pool = new_pool(self.background.device)
         self._lock = threading.Lock()  # of the replays' buffers
         self._read: torch.cuda.Event | None = None  # when what the last one gave has been
@@ -77,15 +78,17 @@ class Renderer:
     @torch.no_grad()
     def render(self, params: HeadParams, camera: Camera) -> Rendering:
         """One frame as soon as possible: each step uses all threads."""
-        if self._replays:
-            rendering = self._replayed(params, camera)
-            device = self.background.device
-            if rendering is not None and not (is_checked(device) and bool(rendering.alpha.isnan().any())):
+        packed = self._replayed(params, camera)
+        if packed is not None:
+            rendering = unpacked(packed, camera)
+            if not (is_checked(self.background.device) and is_nan(rendering)):
                 return rendering
         return self.draw(self.gaussians(params, camera), camera, self.background)
 
-    def _replayed(self, params: HeadParams, camera: Camera) -> Rendering | None:
-        """The frame by a replay; None: it has to be launched."""
+    def _replayed(self, params: HeadParams, camera: Camera) -> Float[Tensor, " P"] | None:
+        """The frame, `packed`, by a replay; None: it has to be launched."""
+        if not self._replays:
+            return None
         kind = _Kind.of(params, camera)
         with self._lock:
             known = self._kinds.pop(kind, 0)
@@ -94,13 +97,12 @@ class Renderer:
             if not isinstance(known, Replay) and known < WARM:
                 self._kinds[kind] = known + 1
                 return None
-            named = {name: getattr(params, name) for name in _PARAMS}
-            named |= {"R": camera.R_cam_world, "t": camera.t_cam_world}
-            named |= {} if camera.R_ref_cam is None else {"R_ref_cam": camera.R_ref_cam}
-            inputs = at_once(named, self.background.device)
+            parts = [*(getattr(params, name) for name in _PARAMS), camera.R_cam_world, camera.t_cam_world]
+            parts += [] if camera.R_ref_cam is None else [camera.R_ref_cam]
+            inputs = {"parts": to_device(torch.cat([part.float().flatten() for part in parts]), self.background.device)}
             if not isinstance(known, Replay):
                 try:
-                    known = self._captured(camera, inputs)
+                    known = self._captured(camera, inputs, [part.shape for part in parts])
                 except CannotDraw:  # a launched frame says why
                     return None
                 except RuntimeError:
@@ -108,22 +110,25 @@ class Renderer:
                     return None
             self._kinds[kind] = known
             if self._read is not None:
-                torch.cuda.current_stream().wait_event(self._read)
-            rendering = Rendering(*(part.clone() for part in known(inputs)))
+                torch.cuda.current_stream(self.background.device).wait_event(self._read)
+            frame = known(inputs).clone()
             if self.background.is_cuda:
                 self._read = torch.cuda.Event()
                 self._read.record()
-            return rendering
+            return frame
 
-    def _captured(self, camera: Camera, inputs: Mapping[str, Tensor]) -> Replay[Rendering]:
-        def play(named: Mapping[str, Tensor]) -> Rendering:
-            params = HeadParams(**{name: named[name] for name in _PARAMS})
-            seen = replace(camera, R_cam_world=named["R"], t_cam_world=named["t"], R_ref_cam=named.get("R_ref_cam"))
+    def _captured(self, camera: Camera, inputs: Mapping[str, Tensor], shapes: Sequence[torch.Size]) -> Replay[Tensor]:
+        def play(named: Mapping[str, Tensor]) -> Tensor:
+            flat = named["parts"].split([shape.numel() for shape in shapes])
+            values = [part.view(shape) for part, shape in zip(flat, shapes, strict=True)]
+            params = HeadParams(**dict(zip(_PARAMS, values, strict=False)))
+            R, t, *turn = values[len(_PARAMS) :]
+            seen = replace(camera, R_cam_world=R, t_cam_world=t, R_ref_cam=turn[0] if turn else None)
             with checked_drawings(False):
-                return self.avatar.draw(self.gaussians(params, seen), seen, self.background)
+                return packed(self.avatar.draw(self.gaussians(params, seen), seen, self.background))
 
         with own_stream(self.background.device):
-            play({name: part.clone() for name, part in inputs.items()})  # aligned as the replay's own are
+            play({name: part.clone() for name, part in inputs.items()})
             return Replay(play, inputs, self._pool)
 
     def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:
@@ -152,26 +157,44 @@ class Renderer:
         yield from in_order(lambda frame: self.render(*frame), frames, workers)
 
     def _stream_from_gpu(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
-        pending: deque[tuple[tuple[HeadParams, Camera], Rendering, torch.cuda.Event]] = deque()
+        pending: deque[tuple[tuple[HeadParams, Camera], Tensor, torch.cuda.Event]] = deque()
         copying = torch.cuda.Stream(self.background.device)
-        for frame in frames:
-            rendering = self.render(*frame)
+        for params, camera in frames:
+            frame = self._replayed(params, camera)
+            if frame is None:
+                frame = packed(self.render(params, camera))
             copying.wait_stream(torch.cuda.current_stream(self.background.device))
             with torch.cuda.stream(copying):
-                copies = Rendering(*(t.to("cpu", non_blocking=True) for t in rendering))
+                copy = frame.to("cpu", non_blocking=True)
                 arrived = torch.cuda.Event()
                 arrived.record()
-            for part in rendering:
-                part.record_stream(copying)
-            pending.append((frame, copies, arrived))
+            frame.record_stream(copying)
+            pending.append(((params, camera), copy, arrived))
             if len(pending) > AHEAD_ON_GPU:
                 yield self._arrived(*pending.popleft())
         while pending:
             yield self._arrived(*pending.popleft())
 
-    def _arrived(self, frame: tuple[HeadParams, Camera], copies: Rendering, arrived: torch.cuda.Event) -> Rendering:
+    def _arrived(self, frame: tuple[HeadParams, Camera], copy: Tensor, arrived: torch.cuda.Event) -> Rendering:
         arrived.synchronize()
-        if bool(copies.alpha.isnan().any()):
+        rendering = unpacked(copy, frame[1])
+        if is_nan(rendering):
             with checked_drawings():
                 self.render(*frame)  # raises what is wrong
-        return copies
+        return rendering
+
+
+def packed(rendering: Rendering) -> Float[Tensor, " P"]:
+    """Image, then alpha: one thing to copy."""
+    return torch.cat([part.flatten() for part in rendering])
+
+
+def unpacked(values: Float[Tensor, " P"], camera: Camera) -> Rendering:
+    size = camera.height, camera.width
+    image, alpha = values.split([3 * size[0] * size[1], size[0] * size[1]])
+    return Rendering(image.view(*size, 3), alpha.view(size))
+
+
+def is_nan(rendering: Rendering) -> bool:
+    """Whether a GPU could not draw it: then every pixel is NaN. Waits for it."""
+    return math.isnan(float(rendering.alpha[0, 0]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -40,15 +39,6 @@ def to_device(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type == "cuda" and tensor.is_cpu and not tensor.requires_grad:
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
-
-
-def at_once(named: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
-    """Float tensors on `device`, in one copy where they are on another."""
-    if all(tensor.device == device for tensor in named.values()):
-        return dict(named)
-    flat = to_device(torch.cat([tensor.float().reshape(-1) for tensor in named.values()]), device)
-    parts = flat.split([tensor.numel() for tensor in named.values()])
-    return {name: part.view(tensor.shape) for (name, tensor), part in zip(named.items(), parts, strict=True)}
 
 
 def free_bytes(device: torch.device) -> float | None:

@@ -129,7 +129,8 @@ class StepRunner:
             R, t = gpu_function("upload a camera's pose")(camera, device).float().split((9, 3))
             turn = None if camera.R_ref_cam is None else to_device(camera.R_ref_cam, device)
             camera = replace(camera, R_cam_world=R.view(3, 3), t_cam_world=t, R_ref_cam=turn)
-            if frame.head_box is not None:
+            term = self._state.objective.perceptual.term
+            if frame.head_box is not None and term is not None and term.crops:
                 crop = crop_of_few_sizes(frame.head_box, (camera.height, camera.width))
                 rows, columns = (to_device(torch.arange(side.start, side.stop), device) for side in crop)
         return FrameConstants(camera, row, jacobian, rows, columns)
