@@ -64,7 +64,7 @@ class Renderer:
     def __init__(self, avatar: Avatar, background: Float[Tensor, " 3"]) -> None:
         self.background = to_device(background.detach().clone(), avatar.device)
         self.avatar = avatar.frozen()
-        self._replays = avatar.is_fused and on_gpu(self.background) and not self.background.is_meta
+        self._replays = avatar.is_replayable and on_gpu(self.background) and not self.background.is_meta
         self._kinds: OrderedDict[_Kind, int | Replay[Tensor]] = OrderedDict()  # how many were launched, or a replay
         self._pool = new_pool(self.background.device)
         self._lock = threading.Lock()  # of the replays' buffers

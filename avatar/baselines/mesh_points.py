@@ -43,7 +43,7 @@ class MeshPoints(nn.Module):
     _across: Int[Tensor, "F 3"]  # with _turn and _shift: what lies over the edges, as `unfolding` says
     _turn: Float[Tensor, "F 3 2 2"]
     _shift: Float[Tensor, "F 3 2"]
-    _frames: Float[Tensor, "F 4"]  # orientations of the neutral triangles
+    _inverse_frames: Float[Tensor, "F 4"]  # from the orientations of the neutral triangles
 
     def __init__(self, num_points: int, *, learned: bool) -> None:
         super().__init__()
@@ -67,7 +67,11 @@ class MeshPoints(nn.Module):
         """
         corners = flat_corners(neutral[faces])
         constants = dict(zip(("across", "turn", "shift"), unfolding(faces, corners), strict=True))
-        constants |= {"faces": faces, "corners": corners, "frames": frame_quats(neutral[faces])}
+        constants |= {
+            "faces": faces,
+            "corners": corners,
+            "inverse_frames": frame_quats(neutral[faces]) * neutral.new_tensor((1, -1, -1, -1)),
+        }
         for name, value in constants.items():
             self.register_buffer(f"_{name}", value, persistent=False)
         self.face.copy_(face)
@@ -87,8 +91,7 @@ class MeshPoints(nn.Module):
 
     def turns(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 4"]:
         """The rotation of each point's triangle from the neutral to the posed mesh, (w, x, y, z)."""
-        inverse = self._frames[self.face] * self._frames.new_tensor([1.0, -1.0, -1.0, -1.0])
-        return quaternion_product(frame_quats(vertices[self._faces[self.face]]), inverse)
+        return quaternion_product(frame_quats(vertices[self._faces[self.face]]), self._inverse_frames[self.face])
 
     @torch.no_grad()
     def walk(self, carried: Sequence[Float[Tensor, "N 3"]] = ()) -> int:

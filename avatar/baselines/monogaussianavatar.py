@@ -50,6 +50,7 @@ def drawn(from_: Int[Tensor, " P"], count: int, generator: torch.Generator) -> I
 
 class MonoGaussianAvatar(FlashAvatar):
     is_fused = False
+    is_replayable = False  # the set of points grows
     unknown_to_browsers = "points that have left their texel"
     count: Tensor  # of the points that are alive, which are the first ones
 

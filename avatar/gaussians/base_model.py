@@ -42,6 +42,7 @@ class Avatar(nn.Module):
     """
 
     is_fused = False  # whether a GPU has kernels for all that follows the network, in place of torch's own operations
+    is_replayable = True  # whether steps, and frames, do the same operations each time
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 

@@ -73,7 +73,7 @@ class StepRunner:
         self._mesh_bytes = MESH_BYTES
         self._constants: dict[int, FrameConstants] = {}
         self._noises: tuple[int, Tensor] | None = None  # the first step of a block, and what is added in each
-        self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_fused
+        self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_replayable
         self._launched: Counter[Kind] = Counter()
         self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
         self._pool = new_pool(self._device)
