@@ -70,7 +70,8 @@ class MeshPoints(nn.Module):
         constants |= {
             "faces": faces,
             "corners": corners,
-            "inverse_frames": frame_quats(neutral[faces]) * neutral.new_tensor((1, -1, -1, -1)),
+        inverse = frame_quats(neutral[faces]) * neutral.new_tensor((1, -1, -1, -1))
+        constants |= {"faces": faces, "corners": corners, "inverse_frames": inverse}
         }
         for name, value in constants.items():
             self.register_buffer(f"_{name}", value, persistent=False)
