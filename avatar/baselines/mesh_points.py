@@ -67,12 +67,8 @@ class MeshPoints(nn.Module):
         """
         corners = flat_corners(neutral[faces])
         constants = dict(zip(("across", "turn", "shift"), unfolding(faces, corners), strict=True))
-        constants |= {
-            "faces": faces,
-            "corners": corners,
         inverse = frame_quats(neutral[faces]) * neutral.new_tensor((1, -1, -1, -1))
         constants |= {"faces": faces, "corners": corners, "inverse_frames": inverse}
-        }
         for name, value in constants.items():
             self.register_buffer(f"_{name}", value, persistent=False)
         self.face.copy_(face)

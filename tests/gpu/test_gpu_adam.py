@@ -56,7 +56,8 @@ def test_steps_are_those_of_torch() -> None:
         reference.step()
         for found, expected, old in zip(own, exact, before, strict=True):
             moved = (expected - old).abs().max()
-            assert (found.detach().cpu() - expected).abs().max() < 2e-3 * moved + 1e-7 * expected.abs().max()
+            rounding = (step + 1) * 6e-8 * expected.abs().max()  # of each sum
+            assert (found.detach().cpu() - expected).abs().max() < 2e-3 * moved + rounding
             state, wanted = adam.state[found], reference.state[expected]
             assert float(state["step"]) == step + 1
             for name in ("exp_avg", "exp_avg_sq"):
