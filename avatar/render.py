@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.compute.cuda_graph import Replay, new_pool, own_stream
+from avatar.compute.cuda_graph import Downloads, Replay, new_pool, own_stream
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.workers import in_order
 from avatar.errors import UserError
@@ -158,18 +158,12 @@ class Renderer:
 
     def _stream_from_gpu(self, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         pending: deque[tuple[tuple[HeadParams, Camera], Tensor, torch.cuda.Event]] = deque()
-        copying = torch.cuda.Stream(self.background.device)
+        downloads = Downloads(self.background.device)
         for params, camera in frames:
             frame = self._replayed(params, camera)
             if frame is None:
                 frame = packed(self.render(params, camera))
-            copying.wait_stream(torch.cuda.current_stream(self.background.device))
-            with torch.cuda.stream(copying):
-                copy = frame.to("cpu", non_blocking=True)
-                arrived = torch.cuda.Event()
-                arrived.record()
-            frame.record_stream(copying)
-            pending.append(((params, camera), copy, arrived))
+            pending.append(((params, camera), *downloads.begin(frame)))
             if len(pending) > AHEAD_ON_GPU:
                 yield self._arrived(*pending.popleft())
         while pending:

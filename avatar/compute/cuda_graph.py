@@ -57,6 +57,23 @@ class Replay(Generic[Made]):
         return self._made
 
 
+class Downloads:
+    """Copies to the CPU, made while a GPU goes on."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device)
+
+    def begin(self, tensor: Tensor) -> tuple[Tensor, torch.cuda.Event]:
+        """The copy, and what is to be waited for before it is read."""
+        self._stream.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(self._stream):
+            copy, arrived = tensor.to("cpu", non_blocking=True), torch.cuda.Event()
+            arrived.record()
+        tensor.record_stream(self._stream)
+        return copy, arrived
+
+
 @contextmanager
 def own_stream(device: torch.device) -> Iterator[None]:
     """What is launched in here comes after what was launched before, and before what comes after; from a stream of one's

@@ -120,9 +120,11 @@ class Lpips(nn.Module):
         return total
 
     def on(self, device: torch.device) -> Lpips:
-        """Move to a device. On a GPU channels come first: with channels last its pooling adds gradients up in any order."""
+        """Move to a device. On a GPU channels come first: with channels last its pooling adds gradients up in any order. So
+        do some of cuDNN's convolutions, which are turned off for the whole process."""
         if device.type == "cpu":
             return self.to(device)
+        torch.backends.cudnn.deterministic = True
         return self.to(device, memory_format=torch.contiguous_format)  # type: ignore[call-overload]
 
     def _unit_features(self, image: Tensor) -> list[Tensor]:

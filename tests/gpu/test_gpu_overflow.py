@@ -15,9 +15,12 @@ from gpu.test_gpu_training import TINY
 from interpreter import DEVICE, as_on_a_gpu, the_cpus_way
 from lively import lively_avatar
 from small_runs import new_avatar, open_small, small_config
+from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
+from avatar import render as render_module
+from avatar.compute.device import CPU
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation.draw import draw
@@ -45,17 +48,17 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
     return replace(trained, avatar=deepcopy(trained.avatar).to(DEVICE))
 
 
-def frame_of(trained: TrainedAvatar) -> Frame:
-    plane = torch.ones(32, 32, device=DEVICE)
+def frame_of(trained: TrainedAvatar, device: torch.device = DEVICE) -> Frame:
+    plane = torch.ones(32, 32, device=device)
     camera, params = trained.recording.camera(5, 32), trained.recording.params(5)
-    return Frame(5, "5", camera, params, torch.ones(32, 32, 3, device=DEVICE), plane, plane, plane)
+    return Frame(5, "5", camera, params, torch.ones(32, 32, 3, device=device), plane, plane, plane)
 
 
 DRAWN: dict[str, Callable[[TrainedAvatar], object]] = {
     "a picture": lambda trained: trained.render(trained.rest_params(), trained.rest_camera(32)),
     "a stream": lambda trained: list(streamed(trained)),
     "an evaluated frame": lambda trained: draw(
-        trained.renderer, frame_of(trained), [EvaluationLook((1.0, 1.0, 1.0), True, "round")]
+        trained.renderer, frame_of(trained, CPU), [EvaluationLook((1.0, 1.0, 1.0), True, "round")]
     ),
     "a viewed frame": lambda trained: ViewRenderer(trained).draw(
         (trained.rest_params(), trained.rest_camera(32)), Setting(), 32
@@ -68,14 +71,17 @@ def streamed(trained: TrainedAvatar) -> list[Any]:
     frames = [(trained.rest_params(), trained.rest_camera(32))] * 4
     with pytest.MonkeyPatch.context() as patch:
         if DEVICE.type == "cpu":
-            patch.setattr(torch.cuda, "Event", Arrived)
+            patch.setattr(render_module, "Downloads", AtOnce)
         return list(trained.renderer._stream_from_gpu(frames))
 
 
-class Arrived:
-    """Of a copy that was there at once."""
+class AtOnce:
+    """Copies that have arrived."""
 
-    def record(self) -> None: ...
+    def __init__(self, _: torch.device) -> None: ...
+
+    def begin(self, tensor: Tensor) -> tuple[Tensor, AtOnce]:
+        return tensor.clone(), self
 
     def synchronize(self) -> None: ...
 
@@ -83,9 +89,9 @@ class Arrived:
 @pytest.mark.parametrize("what", DRAWN)
 def test_a_drawing_beyond_the_buffers_is_refused_with_a_sentence(what: str, trained: TrainedAvatar) -> None:
     with as_on_a_gpu(6_000):
-        DRAWN[what](trained)
+        DRAWN[what](replace(trained))
     with as_on_a_gpu(3), pytest.raises((UserError, CannotDraw), match=OVERFLOWS):
-        DRAWN[what](trained)
+        DRAWN[what](replace(trained))  # with a renderer of its own: a captured frame keeps its buffers
 
 
 def test_a_viewed_frame_fits_whatever_was_drawn_before(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
