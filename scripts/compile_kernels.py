@@ -35,7 +35,7 @@ from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
 from avatar.kernels.launch import watched
 from avatar.losses.photometric import dssim
-from avatar.splat import splat
+from avatar.splat import splat, splat_features
 from avatar.splat.scenes import head_camera, head_shell
 from avatar.train.objective import PerceptualTerm, Weighted
 from avatar.types import Gaussians
@@ -59,7 +59,7 @@ TYPES = {
 }
 DIVISIBLE = [["tt.divisibility", 16]]
 SHOWN = ("ANTIALIASED", "POSE", "HAS_IMAGE", "HAS_ALPHA", "HAS_GRID", "HAS_HYPER", "SAVE", "GRADIENT", "COLUMNS")
-SHOWN += ("WIDTH",)
+SHOWN += ("WIDTH", "CHANNELS", "FEATURES")
 
 
 class Variant(NamedTuple):
@@ -126,6 +126,10 @@ def rehearse(assets: HeadAssets) -> list[Variant]:
         for antialiased, camera in product((False, True), (still, replace(still, R_cam_world=R, t_cam_world=t))):
             shell = Gaussians(*(field.to(META).requires_grad_() for field in head_shell()))
             drawn = splat(shell, camera, torch.zeros(3, device=META), antialiased=antialiased)
+            (drawn.image.sum() + drawn.alpha.sum()).backward()
+        for channels in (8, 32, 33):
+            features = torch.zeros(len(shell.means), channels, device=META, requires_grad=True)
+            drawn = splat_features(*shell[:4], features, still, torch.zeros(channels, device=META))
             (drawn.image.sum() + drawn.alpha.sum()).backward()
     return sorted(found)
 

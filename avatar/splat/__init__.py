@@ -86,6 +86,7 @@ def splat(
         camera,
         background,
         backend=chosen,
+        sh_degree=sh_degree,
         alpha_min=alpha_min,
         alpha_max=alpha_max,
         t_min=t_min,
@@ -94,7 +95,7 @@ def splat(
         antialiased=antialiased,
         region=region,
     )
-    return _draw(chosen, gaussians, camera, background, sh_degree=_checked_degree(gaussians, sh_degree), **options)
+    return _draw(chosen, gaussians, camera, background, options)
 
 
 def splat_features(
@@ -131,6 +132,7 @@ def splat_features(
         camera,
         background,
         backend=chosen,
+        sh_degree=None,
         alpha_min=alpha_min,
         alpha_max=alpha_max,
         t_min=t_min,
@@ -139,11 +141,11 @@ def splat_features(
         antialiased=antialiased,
         region=region,
     )
-    return _draw(chosen, gaussians, camera, background, sh_degree=None, **options)
+    return _draw(chosen, gaussians, camera, background, options)
 
 
 def _draw(
-    backend: str, gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Tensor, **options: Any
+    backend: str, gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Tensor, options: dict[str, Any]
 ) -> Rendering:
     if backend == "reference":
         try:
@@ -160,21 +162,13 @@ def _backend_for(tensor: Any) -> str:
     return "gpu" if isinstance(tensor, Tensor) and on_gpu(tensor) else "cpu"
 
 
-def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
-    stored_degree = sh_degree_of(gaussians.sh.shape[1])
-    if sh_degree is None:
-        return stored_degree
-    if not 0 <= sh_degree <= stored_degree:
-        raise ValueError(f"sh_degree must be 0 to {stored_degree}, the degree that sh holds, got {sh_degree}")
-    return sh_degree
-
-
 def _checked_options(
     gaussians: Gaussians | FeatureGaussians,
     camera: Camera,
     background: Tensor,
     *,
     backend: str,
+    sh_degree: int | None,
     alpha_min: float,
     alpha_max: float,
     t_min: float,
@@ -183,7 +177,7 @@ def _checked_options(
     antialiased: bool,
     region: tuple[slice, slice] | None,
 ) -> dict[str, Any]:
-    """Check everything but the degree, and give the other options of `splat` as the backends take them."""
+    """Check everything, and give the options of `splat` as the backends take them; features have no degree."""
     if isinstance(gaussians, Gaussians):
         shown, channels = {"sh": (gaussians.sh, "N K 3")}, "3"
     else:
@@ -202,6 +196,12 @@ def _checked_options(
         raise ValueError(f"features must have one channel or more, got {list(shown['features'][0].shape)}")
     _check_dtype_and_device(gaussians, background, backend)
     _check_camera(camera, gaussians.means.device, backend)
+    if isinstance(gaussians, Gaussians):
+        stored_degree = sh_degree_of(sizes["K"])
+        if sh_degree is None:
+            sh_degree = stored_degree
+        elif not 0 <= sh_degree <= stored_degree:
+            raise ValueError(f"sh_degree must be 0 to {stored_degree}, the degree that sh holds, got {sh_degree}")
     if not 0 <= alpha_min < 1:
         raise ValueError(f"alpha_min must be in [0, 1), got {alpha_min}")
     if not 0 < alpha_max <= 0.9999:
@@ -217,6 +217,7 @@ def _checked_options(
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
     alpha_min, alpha_max, t_min = struct.unpack("3f", struct.pack("3f", alpha_min, alpha_max, max(t_min, T_MIN)))
     return {
+        "sh_degree": sh_degree,
         "alpha_min": alpha_min,
         "alpha_max": alpha_max,
         "t_min": t_min,

@@ -25,10 +25,9 @@ def test_skipping_does_not_change_a_bit(name: str, simd: str, monkeypatch: pytes
         **scene.options,
         "backend": "cpu",
     }
-    degree = avatar.splat._checked_degree(scene.gaussians, options.pop("sh_degree"))
     checked = avatar.splat._checked_options(scene.gaussians, scene.camera, scene.background, **options)
     gaussians, size = Gaussians(*(t.contiguous() for t in scene.gaussians)), (scene.camera.height, scene.camera.width)
-    settings = {**cpu._settings(scene.camera, sh_degree=degree, **checked), "everywhere": True}
+    settings = {**cpu._settings(scene.camera, **checked), "everywhere": True}
     image, alpha, _ = cpu._draw(gaussians, scene.background, size, settings)
     assert torch.equal(image, drawn.image) and torch.equal(alpha, drawn.alpha)
 
