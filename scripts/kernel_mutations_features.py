@@ -29,7 +29,7 @@ FEATURE_MUTATIONS = [
         "all groups of channels are the first",
         "channel = tl.program_id(0) % groups * GROUP + tl.arange(0, GROUP)\n    column",
         "channel = tl.arange(0, GROUP)\n    column",
-        first="gpu-33",
+        first="33-gpu",
     ),
     Mutation(
         "composite_features",
@@ -42,7 +42,7 @@ FEATURE_MUTATIONS = [
         "what lies behind has the first group's background",
         "tl.load(background + group + c, mask",
         "tl.load(background + c, mask",
-        first="gpu-33",
+        first="33-gpu",
     ),
     Mutation(
         "composite_features",
@@ -56,14 +56,14 @@ FEATURE_MUTATIONS = [
         "alpha's gradient misses all groups but the last",
         "g = tl.dot(own, by_pixel, g, ",
         "g = tl.dot(own, by_pixel, tl.zeros_like(g), ",
-        first="gpu-33",
+        first="33-gpu",
     ),
     Mutation(
         "composite_features",
         "the second group's features have no gradient",
         "tl.store(to, by_own, mask",
         "tl.store(to, tl.where(group > 0, 0.0, by_own), mask",
-        first="gpu-33",
+        first="33-gpu",
     ),
     Mutation(
         "composite_features",
@@ -83,7 +83,7 @@ FEATURE_MUTATIONS = [
         "what lies behind is forgotten between chunks",
         "behind += tl.sum(adds, 0)",
         "behind += 0.0",
-        first="walls",
+        first="other cut-offs",
     ),
     Mutation(
         "composite_features",

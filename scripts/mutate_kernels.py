@@ -47,7 +47,7 @@ SPLATTER = [
     f"{REFERENCE}[thresholds-gpu]",
 ]
 FEATURES = [
-    *(f"{SPLAT_FEATURES}test_gpu_kernels_agree_with_the_reference[{backend}]" for backend in ("gpu-5", "gpu-33")),
+    *(f"{SPLAT_FEATURES}test_gpu_kernels_agree_with_the_reference[{channels}-gpu]" for channels in (5, 33)),
     *(
         f"{SPLAT_FEATURES}test_gpu_kernels_agree_with_the_reference_on_other_scenes[{scene}-gpu]"
         for scene in ("walls", "other cut-offs")

@@ -91,8 +91,10 @@ struct alignas(64) Chunk {
 };
 
 inline void copy_padded(const float* from, int count, std::int64_t padded, float* to) {
-    __builtin_memcpy(to, from, count * sizeof(float));
-    for (std::int64_t k = count; k < padded; ++k) to[k] = 0.0f;
+    std::int64_t k = 0;
+    for (; k + kLanes <= count; k += kLanes) store_anywhere(to + k, load_anywhere(from + k));
+    for (; k < count; ++k) to[k] = from[k];
+    for (; k < padded; ++k) to[k] = 0.0f;
 }
 
 // Where the values of a block's pixels lie in an image of so many channels; `outside` for those beyond the region.
