@@ -8,21 +8,21 @@ FEATURE_MUTATIONS = [
     Mutation(
         "project",
         "a feature that is not finite goes unseen",
-        "for k in range(CHANNELS):",
-        "for k in range(CHANNELS - 1):",
+        "for k in range(channels):",
+        "for k in range(channels - 1):",
         first="a_feature_that",
     ),
     Mutation(
         "composite_features",
         "features are read one channel off",
-        "splat[:, None] * CHANNELS + channel[None, :]",
-        "splat[:, None] * CHANNELS + (channel[None, :] + 1) % CHANNELS",
+        "splat[:, None] * channels + channel[None, :]",
+        "splat[:, None] * channels + (channel[None, :] + 1) % channels",
     ),
     Mutation(
         "composite_features",
         "the last channel of an image is left out",
-        "mask = (channel < CHANNELS)[:, None] & inside",
-        "mask = (channel < CHANNELS - 1)[:, None] & inside",
+        "mask = (channel < channels)[:, None] & inside",
+        "mask = (channel < channels - 1)[:, None] & inside",
     ),
     Mutation(
         "composite_features",
@@ -34,8 +34,8 @@ FEATURE_MUTATIONS = [
     Mutation(
         "composite_features",
         "a channel shows its neighbour's background",
-        "tl.load(background + channel, mask=channel < CHANNELS",
-        "tl.load(background + channel + 1, mask=channel + 1 < CHANNELS",
+        "tl.load(background + channel, mask=channel < channels",
+        "tl.load(background + channel + 1, mask=channel + 1 < channels",
     ),
     Mutation(
         "composite_features",
@@ -94,7 +94,7 @@ FEATURE_MUTATIONS = [
     Mutation(
         "composite_features",
         "a clamped alpha has a gradient",
-        "tl.where(free, ",
+        "tl.where(drawn & (unclamped <= alpha_max), ",
         "tl.where(shown > 0.0, ",
         first="other cut-offs",
     ),

@@ -33,10 +33,10 @@ def falloffs(records, stride, at, column, row):
 
 
 @triton.jit
-def show(
+def weights(
     records,
     stride,
-    first,
+    at,
     done,
     pairs,
     column,
@@ -48,24 +48,26 @@ def show(
     t_min,
     STEP: tl.constexpr,
 ):
-    """The next STEP splats of a tile's list, from pair `done` on: where their records are, their weights at each pixel
-    [STEP, pixels], and each pixel's transmittance and stop behind them.
+    """Of a step's splats, pairs `done` and on: weight, the transmittance behind each, and whether enough is left of it for
+    the splat to be drawn; [STEP, pixels].
     """
-    k = tl.arange(0, STEP)
-    at = first + done + k
     _, _, _, unclamped = falloffs(records, stride, at, column, row)
     alpha = tl.minimum(unclamped, alpha_max)
-    hit = (alpha >= alpha_min) & (done + k < pairs)[:, None]
+    hit = (alpha >= alpha_min) & (done + tl.arange(0, STEP) < pairs)[:, None]
     alpha = tl.where(hit, alpha, 0.0)
     # The transmittance only falls: the first splat that brings it below t_min and all after it are not drawn.
     after = transmittance[None, :] * tl.cumprod(1.0 - alpha, 0)
     enough = (after >= t_min) & (done < stop)[None, :]
     drawn = hit & enough
-    weight = tl.where(drawn, after * (alpha / (1.0 - alpha)), 0.0)
+    return tl.where(drawn, after * (alpha / (1.0 - alpha)), 0.0), after, enough
+
+
+@triton.jit
+def behind_step(after, enough, done, transmittance, stop, STEP: tl.constexpr):
+    """Each pixel's transmittance and stop behind a step's splats."""
     transmittance = tl.min(tl.where(enough, after, transmittance[None, :]), 0)
     reached = done + tl.sum(enough.to(tl.int32), 0)
-    stop = tl.where((reached < done + STEP) & (done < stop), reached, stop)
-    return at, weight, transmittance, stop
+    return transmittance, tl.where((reached < done + STEP) & (done < stop), reached, stop)
 
 
 @triton.jit(
@@ -110,18 +112,21 @@ def composite(
     begin = tl.load(begins + tile)
     pairs = tl.load(begins + tile + 1) - begin
     first = tl.multiple_of(first_record(begin, tile, CHUNK), CHUNK)
+    k = tl.arange(0, STEP)
     transmittance = tl.where(inside, 1.0, 0.0)
     red, green, blue = tl.zeros_like(transmittance), tl.zeros_like(transmittance), tl.zeros_like(transmittance)
     stop = tl.where(inside, NEVER_STOPS, 0)
     done = 0
     alive = 1
     while (done < pairs) & (alive > 0):
-        at, weight, transmittance, stop = show(
-            records, stride, first, done, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min, STEP
+        at = first + done + k
+        weight, after, enough = weights(
+            records, stride, at, done, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min, STEP
         )
         red += tl.sum(weight * tl.load(records + 6 * stride + at)[:, None], 0)
         green += tl.sum(weight * tl.load(records + 7 * stride + at)[:, None], 0)
         blue += tl.sum(weight * tl.load(records + 8 * stride + at)[:, None], 0)
+        transmittance, stop = behind_step(after, enough, done, transmittance, stop, STEP)
         alive = tl.max((stop == NEVER_STOPS).to(tl.int32), 0)
         done += STEP
     tl.store(chunks + tile, done // STEP)

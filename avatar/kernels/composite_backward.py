@@ -12,12 +12,12 @@ MOMENTS = tl.constexpr(9)
 
 
 @triton.jit
-def show_again(records, stride, at, pair, pairs, column, row, transmittance, stop, alpha_min, alpha_max):
-    """STEP splats once more, from behind: (u, v), falloff, where alpha has a gradient, 1 - alpha, the transmittance behind
-    each, its weight [STEP, pixels], and the transmittance in front of all."""
+def show_again(records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max):
+    """STEP splats once more, from behind: (u, v), falloff, alpha before it is clamped, whether drawn, 1 - alpha, the
+    transmittance behind each, its weight [STEP, pixels], and the transmittance in front of all."""
     u, v, falloff, unclamped = falloffs(records, stride, at, column, row)
     clamped = tl.minimum(unclamped, alpha_max)
-    live = (pair < pairs)[:, None] & (pair[:, None] < stop[None, :])
+    live = (start + k < pairs)[:, None] & ((start + k)[:, None] < stop[None, :])
     drawn = (clamped >= alpha_min) & live
     alpha = tl.where(drawn, clamped, 0.0)
     through = 1.0 - alpha
@@ -27,7 +27,7 @@ def show_again(records, stride, at, pair, pairs, column, row, transmittance, sto
     transmittance = transmittance / tl.min(passed, 0)
     after = transmittance[None, :] * passed
     shown = (after / through) * alpha
-    return u, v, falloff, drawn & (unclamped <= alpha_max), through, after, shown, transmittance
+    return u, v, falloff, unclamped, drawn, through, after, shown, transmittance
 
 
 @triton.jit
@@ -108,8 +108,8 @@ def composite_backward(
     for done in range(0, seen, STEP):
         start = seen - STEP - done
         at = first + start + k
-        u, v, falloff, free, through, after, shown, transmittance = show_again(
-            records, stride, at, start + k, pairs, column, row, transmittance, stop, alpha_min, alpha_max
+        u, v, falloff, unclamped, drawn, through, after, shown, transmittance = show_again(
+            records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max
         )
         g = tl.fma(
             g_red[None, :],
@@ -120,7 +120,7 @@ def composite_backward(
         adds = shown * g
         hidden = behind[None, :] + tl.sum(tl.where(later[:, :, None], adds[None, :, :], 0.0), 1)
         behind += tl.sum(adds, 0)
-        weight = tl.where(free, tl.fma(after, g, -hidden) / through * falloff, 0.0)
+        weight = tl.where(drawn & (unclamped <= alpha_max), tl.fma(after, g, -hidden) / through * falloff, 0.0)
 
         to = moments + MOMENTS * at
         store_shape(to, u, v, weight)

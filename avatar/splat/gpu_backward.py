@@ -42,20 +42,19 @@ def backward(
         channels = len(background)
         group, number = grouped(channels)
         by_features = torch.empty((stride, channels), dtype=torch.float32, device=background.device)
-        cut |= {"CHANNELS": channels, "GROUP": group}
         start(
             composite_features_backward,
             d.grid.tiles,
-            *(*lists, gaussians[4], *rest, by_features),
+            *(*lists, gaussians[4], channels, *rest, by_features),
             warps=tuning.backward_warps,
+            GROUP=tuning.backward_group,
             **cut,
         )
         start(
             sum_features,
             programs(N, tuning.summed) * number,
-            *(d.order, d.ends, d.boxes, d.places, by_features, N, d.capacity, gradients[4]),
+            *(d.order, d.ends, d.boxes, d.places, by_features, channels, N, d.capacity, gradients[4]),
             warps=1,
-            CHANNELS=channels,
             GROUP=group,
             LANES=min(tuning.summed_lanes, 16),
             BLOCK=tuning.summed,

@@ -33,6 +33,7 @@ class Tuning:
     backward_step: int = 4
     warps: int = 2  # of a tile
     backward_warps: int = 1
+    backward_group: int = 16  # channels of features at a time
     lanes: int = 128  # Gaussians or pairs of a program
     backward_lanes: int = 32
     summed: int = 1  # Gaussians of a program that sums their pairs, `summed_lanes` at a time
@@ -45,8 +46,8 @@ class Tuning:
 
     @property
     def for_features(self) -> Tuning:
-        """Products of matrices take sixteen rows or more, and the registers of more warps."""
-        steps = {"step": max(self.step, 16), "backward_step": max(self.backward_step, 16)}
+        """Products of matrices need more splats at a time, and the registers of more warps."""
+        steps = {"step": max(self.step, 16), "backward_step": max(self.backward_step, 8)}
         return replace(self, **steps, warps=max(self.warps, 4), backward_warps=max(self.backward_warps, 4))
 
 
@@ -126,11 +127,10 @@ def draw(
     start(
         project,
         programs(N, tuning.lanes),
-        *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree or 0, N, s.width, s.height, *grid),
+        *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree or 0, channels, N, s.width, s.height, *grid),
         *(depths, ellipses, looks, boxes),
         warps=warps,
         STORED=0 if has_features else stored,
-        CHANNELS=stored if has_features else 0,
         ANTIALIASED=s.antialiased,
         TILE=tuning.tile,
         BLOCK=tuning.lanes,
@@ -179,8 +179,8 @@ def draw(
     cut = {"warps": tuning.warps, "TILE": tuning.tile, "CHUNK": tuning.chunk, "STEP": tuning.step}
     if has_features:
         group, number = grouped(channels)
-        cut |= {"CHANNELS": channels, "GROUP": group}
-        start(composite_features, grid.tiles * number, records, begins, ends, gaussians[4], *rest, **cut)
+        lists = records, begins, ends, gaussians[4], channels
+        start(composite_features, grid.tiles * number, *lists, *rest, GROUP=group, **cut)
     else:
         start(composite, grid.tiles, records, begins, ends, *rest, **cut)
     lists = (order, ends, boxes, begins, records, places)
