@@ -33,27 +33,13 @@ def falloffs(records, stride, at, column, row):
 
 
 @triton.jit
-def weights(
-    records,
-    stride,
-    at,
-    done,
-    pairs,
-    column,
-    row,
-    transmittance,
-    stop,
-    alpha_min,
-    alpha_max,
-    t_min,
-    STEP: tl.constexpr,
-):
-    """Of a step's splats, pairs `done` and on: weight, the transmittance behind each, and whether enough is left of it for
+def weights(records, stride, at, done, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min):
+    """Of a step's splats, pairs `done + k`: weight, the transmittance behind each, and whether enough is left of it for
     the splat to be drawn; [STEP, pixels].
     """
     _, _, _, unclamped = falloffs(records, stride, at, column, row)
     alpha = tl.minimum(unclamped, alpha_max)
-    hit = (alpha >= alpha_min) & (done + tl.arange(0, STEP) < pairs)[:, None]
+    hit = (alpha >= alpha_min) & (done + k < pairs)[:, None]
     alpha = tl.where(hit, alpha, 0.0)
     # The transmittance only falls: the first splat that brings it below t_min and all after it are not drawn.
     after = transmittance[None, :] * tl.cumprod(1.0 - alpha, 0)
@@ -121,7 +107,7 @@ def composite(
     while (done < pairs) & (alive > 0):
         at = first + done + k
         weight, after, enough = weights(
-            records, stride, at, done, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min, STEP
+            records, stride, at, done, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min
         )
         red += tl.sum(weight * tl.load(records + 6 * stride + at)[:, None], 0)
         green += tl.sum(weight * tl.load(records + 7 * stride + at)[:, None], 0)

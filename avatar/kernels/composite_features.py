@@ -80,7 +80,7 @@ def composite_features(
     while (done < pairs) & (alive > 0):
         at = first + done + k
         weight, after, enough = weights(
-            records, stride, at, done, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min, STEP
+            records, stride, at, done, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min
         )
         own = tl.trans(_features(features, records, stride, at, channel, channels))
         shown = tl.dot(own, weight, shown, input_precision="ieee")
