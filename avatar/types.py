@@ -131,8 +131,18 @@ class Gaussians(NamedTuple):
     sh: Float[Tensor, "N K 3"]  # spherical-harmonics colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16
 
 
+class FeatureGaussians(NamedTuple):
+    """`Gaussians` with C values each in place of a colour."""
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+    features: Float[Tensor, "N C"]
+
+
 class Rendering(NamedTuple):
     """A splatted image. `image` holds the background already; `alpha` is 1 - transmittance."""
 
-    image: Float[Tensor, "H W 3"]
+    image: Float[Tensor, "H W C"]  # C = 3 unless features were splatted
     alpha: Float[Tensor, "H W"]

@@ -35,7 +35,7 @@ from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
 from avatar.kernels.launch import watched
 from avatar.losses.photometric import dssim
-from avatar.splat import splat
+from avatar.splat import splat, splat_features
 from avatar.splat.scenes import head_camera, head_shell
 from avatar.train.objective import PerceptualTerm, Weighted
 from avatar.types import Gaussians
@@ -59,7 +59,7 @@ TYPES = {
 }
 DIVISIBLE = [["tt.divisibility", 16]]
 SHOWN = ("ANTIALIASED", "POSE", "HAS_IMAGE", "HAS_ALPHA", "HAS_GRID", "HAS_HYPER", "SAVE", "GRADIENT", "COLUMNS")
-SHOWN += ("WIDTH",)
+SHOWN += ("WIDTH", "STORED", "FEATURES", "GROUP", "channels")
 
 
 class Variant(NamedTuple):
@@ -75,6 +75,7 @@ class Variant(NamedTuple):
     @property
     def label(self) -> str:
         chosen = [f"{name}={value}" for name, value in self.constants if name in SHOWN]
+        chosen += [f"{name}=16n" for name in (self.signature[i][0] for i in self.divisible) if name in SHOWN]
         return f"{self.kernel} ({', '.join(chosen)})" if chosen else self.kernel
 
 
@@ -87,16 +88,19 @@ class Use(NamedTuple):
 
 
 def variant_of(kernel: Any, arguments: Sequence[Any], constants: dict[str, Any]) -> Variant:
-    """As Triton specialises: by type, and by divisibility unless the kernel says otherwise."""
+    """As Triton specialises: by type, and unless the kernel says otherwise by divisibility and for 1."""
     names = kernel.arg_names
     fixed = {kernel.arg_names[i] if isinstance(i, int) else i for i in kernel.do_not_specialize or ()}
-    signature, divisible = [], []
+    signature, divisible, ones = [], [], []
     for i, name in enumerate(names):
         if i >= len(arguments):
             signature.append((name, "constexpr"))
         elif isinstance(arguments[i], Tensor):
             signature.append((name, TYPES[arguments[i].dtype]))
             divisible.append(i)  # torch's allocations are
+        elif isinstance(arguments[i], int) and arguments[i] == 1 and name not in fixed:
+            signature.append((name, "constexpr"))
+            ones.append((name, 1))
         elif isinstance(arguments[i], int):
             signature.append((name, "i32"))
             if name not in fixed and arguments[i] % 16 == 0:
@@ -104,7 +108,7 @@ def variant_of(kernel: Any, arguments: Sequence[Any], constants: dict[str, Any])
         else:
             signature.append((name, "fp32"))
     warps = constants.pop("num_warps")
-    own = tuple((name, constants[name]) for name in names[len(arguments) :])
+    own = (*ones, *((name, constants[name]) for name in names[len(arguments) :]))
     return Variant(kernel.fn.__module__, kernel.fn.__name__, tuple(signature), tuple(divisible), own, warps)
 
 
@@ -127,6 +131,11 @@ def rehearse(assets: HeadAssets) -> list[Variant]:
             shell = Gaussians(*(field.to(META).requires_grad_() for field in head_shell()))
             drawn = splat(shell, camera, torch.zeros(3, device=META), antialiased=antialiased)
             (drawn.image.sum() + drawn.alpha.sum()).backward()
+        # 1, multiples of 16 and others, in groups of either size; the image alone, and with alpha.
+        for channels, outputs in product((1, 8, 16, 32, 33), (1, 2)):
+            features = torch.zeros(len(shell.means), channels, device=META, requires_grad=True)
+            drawn = splat_features(*shell[:4], features, still, torch.zeros(channels, device=META))
+            torch.stack([output.sum() for output in drawn[:outputs]]).sum().backward()
     return sorted(found)
 
 

@@ -111,8 +111,8 @@ SPLATTER_MUTATIONS = [
     Mutation(
         "composite",
         "the neighbour's list is read too",
-        "& (done + k < pairs)[:, None]\n        alpha",
-        "\n        alpha",
+        "& (done + k < pairs)[:, None]\n    alpha",
+        "\n    alpha",
     ),
     Mutation(
         "composite",

@@ -2,7 +2,7 @@
 
     TRITON_INTERPRET=1 python scripts/mutate_kernels.py [--jobs 2] [--only WORD] [--changed-only]
 
-The mistakes are those of `kernel_mutations.py` and `kernel_mutations_avatar.py`. The same tests pass without a mistake,
+The mistakes are those of `kernel_mutations*.py`. The same tests pass without a mistake,
 which is the first thing tried unless --changed-only says that it has been. Ends with status 1 when a mistake goes unseen.
 """
 
@@ -13,14 +13,22 @@ import sys
 
 import kernel_mutations
 from kernel_mutations_avatar import AVATAR_MUTATIONS
+from kernel_mutations_features import FEATURE_MUTATIONS
 from mutation_runner import Mutation, Task, options, run
 
-BACKENDS, BUFFERS, HOSTILE, PLACE = (
-    f"tests/{name}.py::"
-    for name in ("splat/test_splat_backends", "gpu/test_gpu_buffers", "gpu/test_gpu_hostile", "gpu/test_gpu_fused")
+BACKENDS, SPLAT_FEATURES, BUFFERS, HOSTILE, PLACE = (
+    f"tests/{folder}/test_{name}.py::"
+    for folder, name in (
+        ("splat", "splat_backends"),
+        ("splat", "splat_features"),
+        ("gpu", "gpu_buffers"),
+        ("gpu", "gpu_hostile"),
+        ("gpu", "gpu_fused"),
+    )
 )
 LOOPS = BACKENDS + "test_image_and_alpha_are_those_of_the_definition_written_as_loops"
 REFERENCE = BACKENDS + "test_gpu_kernels_agree_with_the_reference"
+FEATURE_THAT_SPOILS = BUFFERS + "test_a_feature_that_is_not_finite_spoils_the_image_where_nobody_waits"
 SPLATTER = [
     *(
         f"{LOOPS}[{scene}-gpu]"
@@ -31,11 +39,22 @@ SPLATTER = [
     "tests/splat/test_splat_public_bugs.py::test_gradient_is_zero_where_alpha_is_clamped[gpu]",
     BUFFERS + "test_room_for_exactly_the_pairs_is_enough_and_one_less_makes_the_image_nan",
     BUFFERS + "test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits",
+    FEATURE_THAT_SPOILS,
     BUFFERS + "test_so_does_one_of_a_pose_that_is_on_the_gpu",
     "tests/gpu/test_gpu_production.py::test_a_scene_agrees_with_the_reference[small]",
     HOSTILE + "test_the_same_bits_and_whole_bands[17x33]",
     HOSTILE + "test_the_same_bits_and_whole_bands[walls]",
     f"{REFERENCE}[thresholds-gpu]",
+]
+FEATURES = [
+    *(f"{SPLAT_FEATURES}test_gpu_kernels_agree_with_the_reference[{channels}-gpu]" for channels in (5, 33)),
+    *(
+        f"{SPLAT_FEATURES}test_gpu_kernels_agree_with_the_reference_on_other_scenes[{scene}-gpu]"
+        for scene in ("walls", "other cut-offs")
+    ),
+    SPLAT_FEATURES + "test_each_output_has_its_own_gradient[alpha-gpu]",
+    FEATURE_THAT_SPOILS,
+    HOSTILE + "test_the_same_bits_and_whole_bands[features]",
 ]
 FUSED = [
     PLACE + "test_gaussians_and_gradients_are_those_of_the_steps_one_by_one[grid and heads]",
@@ -50,6 +69,7 @@ TESTS = {
     **dict.fromkeys(("activations", "hyper", "fused", "fused_backward"), FUSED),
     **dict.fromkeys(("huber", "reduce", "ssim"), LOSSES),
     "pose": POSING,
+    "composite_features": FEATURES,
 }
 
 
@@ -76,9 +96,8 @@ def main() -> int:
     arguments = options(__doc__).parse_args()
     if os.environ.get("TRITON_INTERPRET") != "1":
         raise SystemExit("the kernels are interpreted: set TRITON_INTERPRET=1")
-    chosen = [
-        m for m in kernel_mutations.SPLATTER_MUTATIONS + AVATAR_MUTATIONS if arguments.only in f"{m.module}: {m.what}"
-    ]
+    planted = kernel_mutations.SPLATTER_MUTATIONS + FEATURE_MUTATIONS + AVATAR_MUTATIONS
+    chosen = [m for m in planted if arguments.only in f"{m.module}: {m.what}"]
     areas = {id(tests_of(m.module)): m.module for m in reversed(chosen)}.values()  # the first module of each
     unchanged = [Task(f"{module}, as it is", tuple(tests_of(module)), None) for module in areas]
     tasks = [*([] if arguments.changed_only else unchanged), *map(task_of, chosen)]

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from kernel_mutations import SPLATTER_MUTATIONS
 from kernel_mutations_avatar import AVATAR_MUTATIONS
+from kernel_mutations_features import FEATURE_MUTATIONS
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
 OWN = tomllib.loads((SCRIPTS / "mutations.toml").read_text(encoding="utf-8"))["mutation"]
 KERNELS = [
     {"file": f"avatar/kernels/{mutation.module}.py", "what": mutation.what, "old": mutation.old, "new": mutation.new}
-    for mutation in SPLATTER_MUTATIONS + AVATAR_MUTATIONS
+    for mutation in SPLATTER_MUTATIONS + FEATURE_MUTATIONS + AVATAR_MUTATIONS
 ]
 
 

@@ -8,6 +8,8 @@ import triton
 import triton.language as tl
 
 FIELDS = tl.constexpr(9)  # of a record: u and v of the tile's first pixel; a, b, c, opacity; red, green, blue
+# With features the splat's number stands in the place of red, as bits, and there are no more.
+FEATURE_FIELDS = tl.constexpr(7)
 
 
 @triton.jit(do_not_specialize=["count", "capacity", "stride", "steps", "first_x", "first_y", "across", "tiles"])
@@ -29,6 +31,7 @@ def expand(
     splats,
     corners,
     records,
+    FEATURES: tl.constexpr,
     TILE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -38,8 +41,8 @@ def expand(
     steps   of the search through `ends`: the bits of N
     keys    int16 or int32 [capacity];  splats  int32 [capacity];  corners  float32 [2, capacity]
     A tile in which the splat reaches alpha_min nowhere is left out here, if that is easily seen.
-    The colours of all `stride` records are cleared: a chunk reaches over the end of its tile's list, and a product of
-    nothing with what the memory held before could be NaN.
+    The colours (with FEATURES the splats' numbers) of all `stride` records are cleared: a chunk reaches over the end of its
+    tile's list, and a product of nothing with what the memory held before could be NaN.
     """
     slot = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     total = tl.load(ends + count - 1)
@@ -77,8 +80,11 @@ def expand(
     nearest_v = tl.maximum(v - slack_v, 0.0) + tl.minimum(v + step_v + slack_v, 0.0)
     live &= nearest_u * nearest_u + nearest_v * nearest_v <= reach
 
-    for field in tl.static_range(6, FIELDS):
-        tl.store(records + field * stride + slot, tl.zeros([BLOCK], tl.float32), mask=slot < stride)
+    if FEATURES:
+        tl.store(records + 6 * stride + slot, tl.zeros([BLOCK], tl.float32), mask=slot < stride)
+    else:
+        for field in tl.static_range(6, FIELDS):
+            tl.store(records + field * stride + slot, tl.zeros([BLOCK], tl.float32), mask=slot < stride)
     here = slot < capacity
     tl.store(keys + slot, tl.where(live, row * across + column, tiles).to(keys.dtype.element_ty), mask=here)
     tl.store(splats + slot, splat, mask=here)
@@ -110,13 +116,14 @@ def gather(
     tiles,
     records,
     places,
+    FEATURES: tl.constexpr,
     CHUNK: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Lay the pairs of each tile side by side.
 
     sorted_keys [capacity], permutation int64 [capacity]: of the slots, by tile;  begins  int32 [tiles + 1], by pair
-    records  float32 [9, stride], see FIELDS;  places  int32 [capacity], where each slot's record is, -1: nowhere
+    records  float32 [9 or 7, stride], see FIELDS;  places  int32 [capacity], where each slot's record is, -1: nowhere
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < capacity
@@ -134,6 +141,9 @@ def gather(
         value = tl.load(ellipses + (2 + k) * count + splat, mask=live, other=0.0)
         tl.store(records + (2 + k) * stride + place, value.to(tl.float32), mask=live)
     tl.store(records + 5 * stride + place, tl.load(looks + splat, mask=live, other=0.0), mask=live)
-    for k in tl.static_range(3):
-        value = tl.load(looks + (2 + k) * count + splat, mask=live, other=0.0)
-        tl.store(records + (6 + k) * stride + place, value, mask=live)
+    if FEATURES:
+        tl.store(records + 6 * stride + place, splat.to(tl.float32, bitcast=True), mask=live)
+    else:
+        for k in tl.static_range(3):
+            value = tl.load(looks + (2 + k) * count + splat, mask=live, other=0.0)
+            tl.store(records + (6 + k) * stride + place, value, mask=live)

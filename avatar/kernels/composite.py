@@ -32,6 +32,30 @@ def falloffs(records, stride, at, column, row):
     return u, v, falloff, tl.load(records + 5 * stride + at)[:, None] * falloff
 
 
+@triton.jit
+def weights(records, stride, at, done, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min):
+    """Of a step's splats, pairs `done + k`: weight, the transmittance behind each, and whether enough is left of it for
+    the splat to be drawn; [STEP, pixels].
+    """
+    _, _, _, unclamped = falloffs(records, stride, at, column, row)
+    alpha = tl.minimum(unclamped, alpha_max)
+    hit = (alpha >= alpha_min) & (done + k < pairs)[:, None]
+    alpha = tl.where(hit, alpha, 0.0)
+    # The transmittance only falls: the first splat that brings it below t_min and all after it are not drawn.
+    after = transmittance[None, :] * tl.cumprod(1.0 - alpha, 0)
+    enough = (after >= t_min) & (done < stop)[None, :]
+    drawn = hit & enough
+    return tl.where(drawn, after * (alpha / (1.0 - alpha)), 0.0), after, enough
+
+
+@triton.jit
+def behind_step(after, enough, done, transmittance, stop, STEP: tl.constexpr):
+    """Each pixel's transmittance and stop behind a step's splats."""
+    transmittance = tl.min(tl.where(enough, after, transmittance[None, :]), 0)
+    reached = done + tl.sum(enough.to(tl.int32), 0)
+    return transmittance, tl.where((reached < done + STEP) & (done < stop), reached, stop)
+
+
 @triton.jit(
     do_not_specialize=["count", "capacity", "width", "first_x", "first_y", "across", "left", "top", "right", "bottom"]
 )
@@ -82,21 +106,13 @@ def composite(
     alive = 1
     while (done < pairs) & (alive > 0):
         at = first + done + k
-        _, _, _, unclamped = falloffs(records, stride, at, column, row)
-        alpha = tl.minimum(unclamped, alpha_max)
-        hit = (alpha >= alpha_min) & (done + k < pairs)[:, None]
-        alpha = tl.where(hit, alpha, 0.0)
-        # The transmittance only falls: the first splat that brings it below t_min and all after it are not drawn.
-        after = transmittance[None, :] * tl.cumprod(1.0 - alpha, 0)
-        enough = (after >= t_min) & (done < stop)[None, :]
-        drawn = hit & enough
-        weight = tl.where(drawn, after * (alpha / (1.0 - alpha)), 0.0)
+        weight, after, enough = weights(
+            records, stride, at, done, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max, t_min
+        )
         red += tl.sum(weight * tl.load(records + 6 * stride + at)[:, None], 0)
         green += tl.sum(weight * tl.load(records + 7 * stride + at)[:, None], 0)
         blue += tl.sum(weight * tl.load(records + 8 * stride + at)[:, None], 0)
-        transmittance = tl.min(tl.where(enough, after, transmittance[None, :]), 0)
-        reached = done + tl.sum(enough.to(tl.int32), 0)
-        stop = tl.where((reached < done + STEP) & (done < stop), reached, stop)
+        transmittance, stop = behind_step(after, enough, done, transmittance, stop, STEP)
         alive = tl.max((stop == NEVER_STOPS).to(tl.int32), 0)
         done += STEP
     tl.store(chunks + tile, done // STEP)

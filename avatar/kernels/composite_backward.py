@@ -11,6 +11,37 @@ from avatar.kernels.composite import falloffs, tile_pixels
 MOMENTS = tl.constexpr(9)
 
 
+@triton.jit
+def show_again(records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max):
+    """STEP splats once more, from behind: (u, v), falloff, alpha before it is clamped, whether drawn, 1 - alpha, the
+    transmittance behind each, its weight [STEP, pixels], and the transmittance in front of all."""
+    u, v, falloff, unclamped = falloffs(records, stride, at, column, row)
+    clamped = tl.minimum(unclamped, alpha_max)
+    live = (start + k < pairs)[:, None] & ((start + k)[:, None] < stop[None, :])
+    drawn = (clamped >= alpha_min) & live
+    alpha = tl.where(drawn, clamped, 0.0)
+    through = 1.0 - alpha
+
+    # The transmittances behind each splat, from the one behind all of them.
+    passed = tl.cumprod(through, 0)
+    transmittance = transmittance / tl.min(passed, 0)
+    after = transmittance[None, :] * passed
+    shown = (after / through) * alpha
+    return u, v, falloff, unclamped, drawn, through, after, shown, transmittance
+
+
+@triton.jit
+def store_shape(to, u, v, weight):
+    """The first six moments."""
+    weight_u, weight_v = weight * u, weight * v
+    tl.store(to, tl.sum(weight, 1))
+    tl.store(to + 1, tl.sum(weight_u, 1))
+    tl.store(to + 2, tl.sum(weight_u * u, 1))
+    tl.store(to + 3, tl.sum(weight_v, 1))
+    tl.store(to + 4, tl.sum(weight_u * v, 1))
+    tl.store(to + 5, tl.sum(weight_v * v, 1))
+
+
 # With g = dL/dcolour of a pixel, T_k the transmittance in front of splat k and A = 1 - T_end the alpha output, splat k's
 # alpha has the gradient
 #     T_k g.c_k - behind_k / (1 - alpha_k) = (T_{k+1} g.c_k - behind_k) / (1 - alpha_k),
@@ -77,18 +108,9 @@ def composite_backward(
     for done in range(0, seen, STEP):
         start = seen - STEP - done
         at = first + start + k
-        u, v, falloff, unclamped = falloffs(records, stride, at, column, row)
-        clamped = tl.minimum(unclamped, alpha_max)
-        live = (start + k < pairs)[:, None] & ((start + k)[:, None] < stop[None, :])
-        drawn = (clamped >= alpha_min) & live
-        alpha = tl.where(drawn, clamped, 0.0)
-        through = 1.0 - alpha
-
-        # The transmittances behind each splat, from the one behind all of them.
-        passed = tl.cumprod(through, 0)
-        transmittance = transmittance / tl.min(passed, 0)
-        after = transmittance[None, :] * passed
-        shown = (after / through) * alpha
+        u, v, falloff, unclamped, drawn, through, after, shown, transmittance = show_again(
+            records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max
+        )
         g = tl.fma(
             g_red[None, :],
             tl.load(records + 6 * stride + at)[:, None],
@@ -100,14 +122,8 @@ def composite_backward(
         behind += tl.sum(adds, 0)
         weight = tl.where(drawn & (unclamped <= alpha_max), tl.fma(after, g, -hidden) / through * falloff, 0.0)
 
-        weight_u, weight_v = weight * u, weight * v
         to = moments + MOMENTS * at
-        tl.store(to, tl.sum(weight, 1))
-        tl.store(to + 1, tl.sum(weight_u, 1))
-        tl.store(to + 2, tl.sum(weight_u * u, 1))
-        tl.store(to + 3, tl.sum(weight_v, 1))
-        tl.store(to + 4, tl.sum(weight_u * v, 1))
-        tl.store(to + 5, tl.sum(weight_v * v, 1))
+        store_shape(to, u, v, weight)
         tl.store(to + 6, tl.sum(shown * g_red[None, :], 1))
         tl.store(to + 7, tl.sum(shown * g_green[None, :], 1))
         tl.store(to + 8, tl.sum(shown * g_blue[None, :], 1))

@@ -45,7 +45,9 @@ def _tiles_between(low, high, pixels, first_tile, tiles, TILE: tl.constexpr):
     return begin - first_tile, tl.where(first <= last, tl.maximum(end - begin, 0), 0)
 
 
-@triton.jit(do_not_specialize=["degree", "count", "width", "height", "first_x", "first_y", "across", "down"])
+@triton.jit(
+    do_not_specialize=["degree", "channels", "count", "width", "height", "first_x", "first_y", "across", "down"]
+)
 def project(
     means,
     quats,
@@ -56,6 +58,7 @@ def project(
     intrinsics,
     alpha_min,
     degree,
+    channels,
     count,
     width,
     height,
@@ -77,7 +80,8 @@ def project(
     depths     float64 [N], of the centre; infinite where nothing is drawn
     ellipses   float64 [5, N]: x, y (pixels) and a, b, c. With d = pixel - (x, y), u = a d_x + b d_y and v = c d_y, alpha
                is opacity * 2^-(u^2 + v^2)
-    looks      float32 [5, N]: opacity, reach (alpha can reach alpha_min where u^2 + v^2 <= reach only), red, green, blue
+    looks      float32 [5, N]: opacity, reach (alpha can reach alpha_min where u^2 + v^2 <= reach only), red, green, blue;
+               [2, N], without a colour, where `sh` is features [N, channels] and STORED is 0
     boxes      int32 [4, N]: first tile across and down, tiles across, tiles in all
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -92,6 +96,10 @@ def project(
         poisoned |= not_finite(tl.load(scales + 3 * i + k, mask=here, other=0.0))
     for k in tl.static_range(3 * STORED):
         poisoned |= not_finite(tl.load(sh + 3 * STORED * i + k, mask=here, other=0.0))
+
+    if STORED == 0:
+        for k in range(channels):
+            poisoned |= not_finite(tl.load(sh + i.to(tl.int64) * channels + k, mask=here, other=0.0))
 
     transparent = opacity < alpha_min
     p_x, p_y, p_z = in_camera(pose, mean_x, mean_y, mean_z)
@@ -139,9 +147,10 @@ def project(
     tile_y, tiles_y = _tiles_between(y - half_y, y + half_y, height, first_y, down, TILE)
     tiles = tl.where(drawn, tiles_x * tiles_y, 0)
 
-    d_x, d_y, d_z, _ = view_direction(pose, mean_x, mean_y, mean_z)
-    red, green, blue = colour(sh + 3 * STORED * i, d_x, d_y, d_z, degree, STORED, here)
-    poisoned |= (tiles > 0) & (not_finite(red) | not_finite(green) | not_finite(blue))
+    if STORED > 0:
+        d_x, d_y, d_z, _ = view_direction(pose, mean_x, mean_y, mean_z)
+        red, green, blue = colour(sh + 3 * STORED * i, d_x, d_y, d_z, degree, STORED, here)
+        poisoned |= (tiles > 0) & (not_finite(red) | not_finite(green) | not_finite(blue))
 
     tl.store(depths + i, tl.where(tiles > 0, p_z, float("inf")), mask=here)
     tl.store(ellipses + i, x, mask=here)
@@ -151,9 +160,10 @@ def project(
     tl.store(ellipses + 4 * count + i, c, mask=here)
     tl.store(looks + i, opacity, mask=here)
     tl.store(looks + count + i, reach, mask=here)
-    tl.store(looks + 2 * count + i, tl.maximum(red, 0.0), mask=here)
-    tl.store(looks + 3 * count + i, tl.maximum(green, 0.0), mask=here)
-    tl.store(looks + 4 * count + i, tl.maximum(blue, 0.0), mask=here)
+    if STORED > 0:
+        tl.store(looks + 2 * count + i, tl.maximum(red, 0.0), mask=here)
+        tl.store(looks + 3 * count + i, tl.maximum(green, 0.0), mask=here)
+        tl.store(looks + 4 * count + i, tl.maximum(blue, 0.0), mask=here)
     tl.store(boxes + i, tile_x, mask=here)
     tl.store(boxes + count + i, tile_y, mask=here)
     tl.store(boxes + 2 * count + i, tiles_x, mask=here)

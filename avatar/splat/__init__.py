@@ -1,4 +1,4 @@
-"""Drawing of Gaussians: one function with one meaning on every backend."""
+"""Drawing of Gaussians, with colours or with features: functions with one meaning on every backend."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from avatar.splat.reference import splat_reference
 from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
-from avatar.types import Camera, Gaussians, Rendering
+from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
-__all__ = ["CannotDraw", "checked_drawings", "is_checked", "splat"]
+__all__ = ["CannotDraw", "checked_drawings", "is_checked", "splat", "splat_features"]
+
+Backend = Literal["cpu", "gpu", "reference"]
 
 MAX_SIDE = 1 << 15  # pixels
 T_MIN = 1e-30
@@ -32,7 +34,7 @@ def splat(
     camera: Camera,
     background: Float[Tensor, " 3"],
     *,
-    backend: Literal["cpu", "gpu", "reference"] | None = None,
+    backend: Backend | None = None,
     sh_degree: int | None = None,
     alpha_min: float = 1 / 255,
     alpha_max: float = 0.999,
@@ -93,13 +95,65 @@ def splat(
         antialiased=antialiased,
         region=region,
     )
-    if chosen == "reference":
+    return _draw(chosen, gaussians, camera, background, options)
+
+
+def splat_features(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    features: Float[Tensor, "N C"],
+    camera: Camera,
+    background: Float[Tensor, " C"],
+    *,
+    backend: Backend | None = None,
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.999,
+    t_min: float = 1e-4,
+    blur: float = 0.3,
+    near: float = NEAR,
+    antialiased: bool = False,
+    region: tuple[slice, slice] | None = None,
+) -> Rendering:
+    """Draw C >= 1 values a Gaussian, without a view direction and without a clamp, over a background of C channels.
+
+    means       metres, world;  quats  (w, x, y, z), of any length;  scales  metres;  opacities  in [0, 1]
+    features    finite, of any size and sign
+
+    Image [H, W, C] and alpha [H, W]. Differentiable in all six tensors and in the camera's pose. A splat's alpha at a
+    pixel is found once for all channels ("gpu": for 32). Everything else, options and errors included, is as of `splat`,
+    whose image this is where its colours are the features.
+    """
+    gaussians = FeatureGaussians(means, quats, scales, opacities, features)
+    chosen = backend or _backend_for(means)
+    options = _checked_options(
+        gaussians,
+        camera,
+        background,
+        backend=chosen,
+        sh_degree=None,
+        alpha_min=alpha_min,
+        alpha_max=alpha_max,
+        t_min=t_min,
+        blur=blur,
+        near=near,
+        antialiased=antialiased,
+        region=region,
+    )
+    return _draw(chosen, gaussians, camera, background, options)
+
+
+def _draw(
+    backend: str, gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Tensor, options: dict[str, Any]
+) -> Rendering:
+    if backend == "reference":
         try:
             check_finite(**gaussians._asdict(), background=background)
         except ValueError as error:
             raise CannotDraw(str(error)) from None
         return splat_reference(gaussians, camera, background, **options)
-    if chosen == "gpu":
+    if backend == "gpu":
         return gpu_function("splat")(gaussians, camera, background, **options)
     return splat_cpu(gaussians, camera, background, **options)
 
@@ -109,7 +163,7 @@ def _backend_for(tensor: Any) -> str:
 
 
 def _checked_options(
-    gaussians: Gaussians,
+    gaussians: Gaussians | FeatureGaussians,
     camera: Camera,
     background: Tensor,
     *,
@@ -123,24 +177,31 @@ def _checked_options(
     antialiased: bool,
     region: tuple[slice, slice] | None,
 ) -> dict[str, Any]:
-    """Check everything, and give the options of `splat` as the backends take them."""
+    """Check everything, and give the options of `splat` as the backends take them; features have no degree."""
+    if isinstance(gaussians, Gaussians):
+        shown, channels = {"sh": (gaussians.sh, "N K 3")}, "3"
+    else:
+        shown, channels = {"features": (gaussians.features, "N C")}, "C"
     sizes = check_shapes(
         means=(gaussians.means, "N 3"),
         quats=(gaussians.quats, "N 4"),
         scales=(gaussians.scales, "N 3"),
         opacities=(gaussians.opacities, "N"),
-        sh=(gaussians.sh, "N K 3"),
-        background=(background, "3"),
+        **shown,
+        background=(background, channels),
         R_cam_world=(camera.R_cam_world, "3 3"),
         t_cam_world=(camera.t_cam_world, "3"),
     )
+    if sizes.get("C") == 0:
+        raise ValueError(f"features must have one channel or more, got {list(shown['features'][0].shape)}")
     _check_dtype_and_device(gaussians, background, backend)
     _check_camera(camera, gaussians.means.device, backend)
-    stored_degree = sh_degree_of(sizes["K"])
-    if sh_degree is None:
-        sh_degree = stored_degree
-    elif not 0 <= sh_degree <= stored_degree:
-        raise ValueError(f"sh_degree must be 0 to {stored_degree}, the degree that sh holds, got {sh_degree}")
+    if isinstance(gaussians, Gaussians):
+        stored_degree = sh_degree_of(sizes["K"])
+        if sh_degree is None:
+            sh_degree = stored_degree
+        elif not 0 <= sh_degree <= stored_degree:
+            raise ValueError(f"sh_degree must be 0 to {stored_degree}, the degree that sh holds, got {sh_degree}")
     if not 0 <= alpha_min < 1:
         raise ValueError(f"alpha_min must be in [0, 1), got {alpha_min}")
     if not 0 < alpha_max <= 0.9999:
@@ -167,7 +228,7 @@ def _checked_options(
     }
 
 
-def _check_dtype_and_device(gaussians: Gaussians, background: Tensor, backend: str) -> None:
+def _check_dtype_and_device(gaussians: Gaussians | FeatureGaussians, background: Tensor, backend: str) -> None:
     if backend not in ("cpu", "gpu", "reference"):
         raise ValueError(f'backend must be "cpu", "gpu" or "reference", got {backend!r}')
     if backend == "gpu" and not on_gpu(gaussians.means):

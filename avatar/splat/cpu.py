@@ -14,24 +14,27 @@ from avatar.compute.native import instruction_set, thread_count
 from avatar.splat.pose import pose_of
 from avatar.splat.region import Region
 from avatar.tensors import describe_non_finite
-from avatar.types import Camera, Gaussians, Rendering
+from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
 
 class CannotDraw(ValueError):
     """The values of the Gaussians are at fault: one is not finite, a colour overflows, or they are too large."""
 
 
-def splat_cpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
-    """`avatar.splat.splat` without its checks of shape and type; float32 tensors on the CPU."""
-    size, pose = (camera.height, camera.width), pose_of(camera, gaussians.means.device)
-    image, alpha = _Splat.apply(*gaussians, background, pose, size, _settings(camera, **options))  # pyright: ignore
+def splat_cpu(
+    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Float[Tensor, " C"], **options: Any
+) -> Rendering:
+    """`avatar.splat.splat` and `splat_features` without their checks of shape and type; float32 tensors on the CPU."""
+    pose, settings = pose_of(camera, gaussians.means.device), _settings(camera, **options)
+    size = camera.height, camera.width
+    image, alpha = _Splat.apply(gaussians._make, *gaussians, background, pose, size, settings)  # pyright: ignore
     return Rendering(image, alpha)
 
 
 def _settings(
     camera: Camera,
     *,
-    sh_degree: int,
+    sh_degree: int | None,
     alpha_min: float,
     alpha_max: float,
     t_min: float,
@@ -45,7 +48,7 @@ def _settings(
         "rotation": camera.R_cam_world.flatten().tolist(),
         "translation": camera.t_cam_world.tolist(),
         "intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy),
-        "sh_degree": sh_degree,
+        "sh_degree": -1 if sh_degree is None else sh_degree,  # -1: features
         "cutoffs": (alpha_min, alpha_max, t_min),
         "blur": blur,
         "near": near,
@@ -57,14 +60,12 @@ def _settings(
 
 
 def _draw(
-    gaussians: Gaussians, background: Tensor, size: tuple[int, int], settings: dict[str, Any]
+    gaussians: Gaussians | FeatureGaussians, background: Tensor, size: tuple[int, int], settings: dict[str, Any]
 ) -> tuple[Tensor, Tensor, _core.Drawing]:
-    image = torch.empty((*size, 3), dtype=torch.float32)
+    image = torch.empty((*size, len(background)), dtype=torch.float32)
     alpha = torch.empty(size, dtype=torch.float32)
     try:
-        drawing = _core.splat_forward(
-            **gaussians._asdict(), background=background.contiguous(), **settings, image=image, alpha=alpha
-        )
+        drawing = _core.splat_forward(*gaussians, background.contiguous(), **settings, image=image, alpha=alpha)
     except ValueError as error:  # colours that overflow, too many splats to a tile; types and shapes are checked before
         raise CannotDraw(str(error)) from None
     if drawing is None:
@@ -78,10 +79,10 @@ def _draw(
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *inputs, background, _, size, settings = arguments
-        gaussians = Gaussians(*(t.detach().contiguous() for t in inputs))
+        make, *inputs, background, _, size, settings = arguments
+        gaussians = make(t.detach().contiguous() for t in inputs)
         image, alpha, drawing = _draw(gaussians, background.detach(), size, settings)
-        ctx.drawing = drawing
+        ctx.drawing, ctx.channels = drawing, len(background)
         ctx.save_for_backward(*gaussians)
         ctx.set_materialize_grads(False)
         return image, alpha
@@ -89,17 +90,11 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
-        gaussians = Gaussians(*ctx.saved_tensors)
-        gradients = Gaussians(*(torch.empty_like(t) for t in gaussians))
-        grad_background = torch.empty(3, dtype=torch.float32)
-        grad_pose = torch.empty(12, dtype=torch.float64) if ctx.needs_input_grad[6] else None
-        _core.splat_backward(
-            ctx.drawing,
-            **gaussians._asdict(),
-            grad_image=None if grad_image is None else grad_image.contiguous(),
-            grad_alpha=None if grad_alpha is None else grad_alpha.contiguous(),
-            **{f"grad_{name}": gradient for name, gradient in gradients._asdict().items()},
-            grad_background=grad_background,
-            grad_pose=grad_pose,
-        )
-        return *gradients, grad_background, grad_pose, None, None
+        gaussians = ctx.saved_tensors
+        gradients = [torch.empty_like(t) for t in gaussians]
+        grad_background = torch.empty(ctx.channels, dtype=torch.float32)
+        grad_pose = torch.empty(12, dtype=torch.float64) if ctx.needs_input_grad[7] else None
+        cotangents = (None if grad is None else grad.contiguous() for grad in (grad_image, grad_alpha))
+        arguments: list[Any] = [ctx.drawing, *gaussians, *cotangents, *gradients]
+        _core.splat_backward(*arguments, grad_background=grad_background, grad_pose=grad_pose)
+        return None, *gradients, grad_background, grad_pose, None, None

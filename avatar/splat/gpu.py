@@ -20,14 +20,16 @@ from avatar.splat.gpu_backward import backward
 from avatar.splat.gpu_draw import Settings, draw
 from avatar.splat.pose import pose_of
 from avatar.splat.region import Region
-from avatar.types import Camera, Gaussians, Rendering
+from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
 
-def splat_gpu(gaussians: Gaussians, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
-    """`avatar.splat.splat` without its checks of shape and type; float32 tensors on a GPU."""
+def splat_gpu(
+    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Float[Tensor, " C"], **options: Any
+) -> Rendering:
+    """`avatar.splat.splat` and `splat_features` without their checks of shape and type; float32 tensors on a GPU."""
     device = gaussians.means.device
     pose, settings = pose_on(camera, device), settings_of(camera, device, **options)
-    image, alpha = _Splat.apply(*gaussians, background, pose, settings)  # pyright: ignore
+    image, alpha = _Splat.apply(gaussians._make, *gaussians, background, pose, settings)  # pyright: ignore
     return Rendering(image, alpha)
 
 
@@ -70,10 +72,10 @@ def _kept(values: tuple[float, ...], device: torch.device) -> Tensor:
 class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *inputs, background, pose, settings = arguments
-        gaussians, background = Gaussians(*(t.detach().contiguous() for t in inputs)), background.detach().contiguous()
+        make, *inputs, background, pose, settings = arguments
+        gaussians, background = make(t.detach().contiguous() for t in inputs), background.detach().contiguous()
         pose = pose.detach()
-        ctx.settings, ctx.drawing = settings, None
+        ctx.make, ctx.settings, ctx.drawing = make, settings, None
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*gaussians, background, pose)
         if len(gaussians.means) == 0:
@@ -86,10 +88,10 @@ class _Splat(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
         *tensors, background, pose = ctx.saved_tensors
-        gaussians, drawing = Gaussians(*tensors), ctx.drawing
+        gaussians, drawing = ctx.make(tensors), ctx.drawing
         *_, wants_background, wants_pose, _ = ctx.needs_input_grad
         if drawing is None:
-            gradients = Gaussians(*(torch.zeros_like(t) for t in gaussians))
+            gradients = [torch.zeros_like(t) for t in gaussians]
             by_pose = torch.zeros_like(pose) if wants_pose else None
             rest = torch.ones_like(background[0])
         else:
@@ -99,4 +101,4 @@ class _Splat(torch.autograd.Function):
         by_background = None
         if wants_background:
             by_background = torch.zeros_like(background) if grad_image is None else (grad_image * rest).sum((0, 1))
-        return *gradients, by_background, by_pose, None
+        return None, *gradients, by_background, by_pose, None

@@ -30,6 +30,7 @@ class Kind(NamedTuple):
     splats: int
     tiles: int
     alpha_min: float
+    features: int = 0  # channels
 
 
 _fixed: dict[Kind, int] = {}
@@ -74,7 +75,7 @@ def capacity_of(kind: Kind, count: Callable[[], int]) -> int:
 def roomy(kind: Kind, needed: int, free: float | None) -> int:
     """The capacity of a kind whose first drawing needs so many pairs; the headroom takes half of the free bytes at most."""
     wanted = max(HEADROOM * needed, PER_SPLAT * kind.splats + PER_TILE * kind.tiles)
-    affordable = MAX_PAIRS if free is None else int(free / 2 / BYTES)
+    affordable = MAX_PAIRS if free is None else int(free / 2 / (BYTES + 4 * kind.features))
     return max(needed, 1, min(wanted, affordable, most_pairs(kind)))
 
 

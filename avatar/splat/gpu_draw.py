@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -10,15 +10,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avatar.kernels.bin import FIELDS, expand, gather
+from avatar.kernels.bin import FEATURE_FIELDS, FIELDS, expand, gather
 from avatar.kernels.composite import composite
+from avatar.kernels.composite_features import composite_features
 from avatar.kernels.launch import start
 from avatar.kernels.project import POISON, project
 from avatar.splat.cpu import CannotDraw
 from avatar.splat.gpu_buffers import MAX_PAIRS, Kind, capacity_of
 from avatar.splat.region import Region
 from avatar.tensors import check_finite
-from avatar.types import Gaussians, Rendering
+from avatar.types import FeatureGaussians, Gaussians, Rendering
 
 ALIGNED = 16  # values; what Triton sees of a number that it may load as vectors by
 
@@ -32,6 +33,7 @@ class Tuning:
     backward_step: int = 4
     warps: int = 2  # of a tile
     backward_warps: int = 1
+    backward_group: int = 16  # channels of features at a time
     lanes: int = 128  # Gaussians or pairs of a program
     backward_lanes: int = 32
     summed: int = 1  # Gaussians of a program that sums their pairs, `summed_lanes` at a time
@@ -41,6 +43,12 @@ class Tuning:
     def chunk(self) -> int:
         """Records of a tile begin at multiples of it."""
         return max(self.step, self.backward_step)
+
+    @property
+    def for_features(self) -> Tuning:
+        """Products of matrices need more splats at a time, and the registers of more warps."""
+        steps = {"step": max(self.step, 16), "backward_step": max(self.backward_step, 8)}
+        return replace(self, **steps, warps=max(self.warps, 4), backward_warps=max(self.backward_warps, 4))
 
 
 TUNING = Tuning()
@@ -53,7 +61,7 @@ class Settings(NamedTuple):
     width: int
     height: int
     region: Region
-    sh_degree: int
+    sh_degree: int | None  # None: features
     alpha_min: float
     alpha_max: float
     t_min: float
@@ -91,7 +99,7 @@ class Drawing(NamedTuple):
     ends: Int[Tensor, " N"]
     boxes: Int[Tensor, "4 N"]
     begins: Int[Tensor, " B"]
-    records: Float[Tensor, "9 stride"]
+    records: Float[Tensor, "F stride"]
     places: Int[Tensor, " capacity"]
     transmittances: Float[Tensor, "H W"]
     stops: Int[Tensor, "H W"]
@@ -99,44 +107,51 @@ class Drawing(NamedTuple):
 
 
 def draw(
-    gaussians: Gaussians, pose: Float[Tensor, " 12"], background: Float[Tensor, " 3"], settings: Settings
+    gaussians: Gaussians | FeatureGaussians,
+    pose: Float[Tensor, " 12"],
+    background: Float[Tensor, " C"],
+    settings: Settings,
 ) -> tuple[Rendering, Drawing]:
     """Draw contiguous tensors of at least one Gaussian, seen from `pose` (float64, see avatar.splat.pose)."""
-    device, tuning, s = gaussians.means.device, TUNING, settings
-    N, stored = len(gaussians.means), gaussians.sh.shape[1]
+    device, s = gaussians.means.device, settings
+    N, channels, stored = len(gaussians.means), len(background), gaussians[4].shape[1]
+    has_features = s.sh_degree is None
+    tuning = TUNING.for_features if has_features else TUNING
     grid, warps = tile_grid(s.region, tuning.tile), tuning.lanes // 32
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
 
     depths, ellipses = empty(N, dtype=torch.float64), empty(5, N, dtype=torch.float64)
-    looks, boxes = empty(5, N), empty(4, N, dtype=torch.int32)
+    looks, boxes = empty(2 if has_features else 5, N), empty(4, N, dtype=torch.int32)
     start(
         project,
         programs(N, tuning.lanes),
-        *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree, N, s.width, s.height, *grid),
+        *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree or 0, channels, N, s.width, s.height, *grid),
         *(depths, ellipses, looks, boxes),
         warps=warps,
-        STORED=stored,
+        STORED=0 if has_features else stored,
         ANTIALIASED=s.antialiased,
         TILE=tuning.tile,
         BLOCK=tuning.lanes,
     )
     order = torch.sort(depths, stable=True).indices
     ends = boxes[3].index_select(0, order).cumsum(0)
-    kind = Kind(device, N, grid.tiles, s.alpha_min)
+    kind = Kind(device, N, grid.tiles, s.alpha_min, channels if has_features else 0)
     capacity = capacity_of(kind, lambda: needed_pairs(gaussians, pose, background, boxes, ends))
 
     stride = programs(programs(capacity, tuning.chunk) * tuning.chunk + grid.tiles * tuning.chunk, ALIGNED) * ALIGNED
     key_type = torch.int16 if grid.tiles < 2**15 - 1 else torch.int32
     keys, splats, corners = empty(capacity, dtype=key_type), empty(capacity, dtype=torch.int32), empty(2, capacity)
-    records, places = empty(FIELDS.value, stride), empty(capacity, dtype=torch.int32)
+    fields = FEATURE_FIELDS if has_features else FIELDS
+    records, places = empty(fields.value, stride), empty(capacity, dtype=torch.int32)
     start(
         expand,
         programs(stride, tuning.lanes),
         *(order, ends, boxes, ellipses, looks, N, capacity, stride, N.bit_length(), *grid.place, grid.tiles),
         *(keys, splats, corners, records),
         warps=warps,
+        FEATURES=has_features,
         TILE=tuning.tile,
         BLOCK=tuning.lanes,
     )
@@ -148,27 +163,26 @@ def draw(
         *(sorted_keys, permutation, begins, splats, corners, ellipses, looks, N, capacity, stride, grid.tiles),
         *(records, places),
         warps=warps,
+        FEATURES=has_features,
         CHUNK=tuning.chunk,
         BLOCK=tuning.lanes,
     )
     size = s.height, s.width
     if s.is_whole:
-        image, alphas, transmittances = empty(*size, 3), empty(*size), empty(*size)
+        image, alphas, transmittances = empty(*size, channels), empty(*size), empty(*size)
     else:
         image, alphas = background.repeat(*size, 1), torch.zeros(size, device=device)
         transmittances = torch.ones(size, device=device)
     stops, chunks = empty(*size, dtype=torch.int32), empty(grid.tiles, dtype=torch.int32)
-    start(
-        composite,
-        grid.tiles,
-        *(records, begins, ends, background, s.alpha_min, s.alpha_max, s.t_min, N, capacity, stride),
-        *(s.width, *grid.place, *s.region),
-        *(image, alphas, transmittances, stops, chunks),
-        warps=tuning.warps,
-        TILE=tuning.tile,
-        CHUNK=tuning.chunk,
-        STEP=tuning.step,
-    )
+    rest = (background, s.alpha_min, s.alpha_max, s.t_min, N, capacity, stride, s.width, *grid.place, *s.region)
+    rest += (image, alphas, transmittances, stops, chunks)
+    cut = {"warps": tuning.warps, "TILE": tuning.tile, "CHUNK": tuning.chunk, "STEP": tuning.step}
+    if has_features:
+        group, number = grouped(channels)
+        lists = records, begins, ends, gaussians[4], channels
+        start(composite_features, grid.tiles * number, *lists, *rest, GROUP=group, **cut)
+    else:
+        start(composite, grid.tiles, records, begins, ends, *rest, **cut)
     lists = (order, ends, boxes, begins, records, places)
     drawing = Drawing(tuning, grid, capacity, *lists, transmittances, stops, chunks)
     return Rendering(image, alphas), drawing
@@ -177,6 +191,12 @@ def draw(
 def programs(items: int, each: int) -> int:
     """How many programs of `each` items it takes; also what to multiply `each` by to hold all."""
     return -(-items // each)
+
+
+def grouped(channels: int) -> tuple[int, int]:
+    """How many channels of features a program takes, a power of two, and in how many groups."""
+    group = 16 if channels <= 16 else 32
+    return group, programs(channels, group)
 
 
 def tile_grid(region: Region, tile: int) -> Grid:
@@ -194,9 +214,9 @@ def _numbers(bits: int, dtype: torch.dtype, device: torch.device) -> Int[Tensor,
 
 
 def needed_pairs(
-    gaussians: Gaussians,
+    gaussians: Gaussians | FeatureGaussians,
     pose: Float[Tensor, " 12"],
-    background: Float[Tensor, " 3"],
+    background: Float[Tensor, " C"],
     boxes: Int[Tensor, "4 N"],
     ends: Int[Tensor, " N"],
 ) -> int:

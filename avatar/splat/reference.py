@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 
 from avatar.splat.region import Region
 from avatar.splat.sh import sh_colours
-from avatar.types import Camera, Gaussians, Rendering
+from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
 MAX_EVALUATIONS = 1 << 18  # splats times pixels held at once
 
@@ -32,16 +32,16 @@ class Projected(NamedTuple):
     means: Float[Tensor, "M 2"]  # pixels
     whitening: Float[Tensor, "M 3"]  # 1 / pixels
     opacities: Float[Tensor, " M"]
-    colours: Float[Tensor, "M 3"]
+    colours: Float[Tensor, "M C"]
     half_extents: Float[Tensor, "M 2"]  # pixels; of the box around the ellipse where alpha reaches alpha_min
 
 
 def splat_reference(
-    gaussians: Gaussians,
+    gaussians: Gaussians | FeatureGaussians,
     camera: Camera,
-    background: Float[Tensor, " 3"],
+    background: Float[Tensor, " C"],
     *,
-    sh_degree: int,
+    sh_degree: int | None,
     alpha_min: float,
     alpha_max: float,
     t_min: float,
@@ -53,6 +53,7 @@ def splat_reference(
 ) -> Rendering:
     """`avatar.splat.splat` without its checks, computed in float64 on the tensors' device, returned in their dtype.
 
+    sh_degree None: `gaussians` have features, which are drawn as they are.
     `block` is the side of the squares of pixels that are evaluated at once; the result does not depend on it. The squares
     lie alike in every region (None: the image), so that a pixel gets the same bits in all of them.
     """
@@ -60,7 +61,7 @@ def splat_reference(
     region = region or Region(0, 0, camera.width, camera.height)
     first_column, first_row = region.left // block * block, region.top // block * block
     splats = project(
-        Gaussians(*(t.double() for t in gaussians)),
+        gaussians._make(t.double() for t in gaussians),
         camera,
         sh_degree=sh_degree,
         alpha_min=alpha_min,
@@ -77,7 +78,7 @@ def splat_reference(
             inside = _reaches(splats, left, top, right, bottom)
             arguments = (pixels, *(t[inside] for t in splats[:4]), background.double(), alpha_min, alpha_max, t_min)
             colour, transmittance = checkpoint(_composite, *arguments, use_reentrant=False)  # pyright: ignore
-            images.append(colour.reshape(bottom - top, right - left, 3))
+            images.append(colour.reshape(bottom - top, right - left, -1))
             alphas.append(1 - transmittance.reshape(bottom - top, right - left))
         image_rows.append(torch.cat(images, dim=1))
         alpha_rows.append(torch.cat(alphas, dim=1))
@@ -94,10 +95,10 @@ def splat_reference(
 
 
 def project(
-    gaussians: Gaussians,
+    gaussians: Gaussians | FeatureGaussians,
     camera: Camera,
     *,
-    sh_degree: int,
+    sh_degree: int | None,
     alpha_min: float,
     blur: float,
     near: float,
@@ -110,7 +111,7 @@ def project(
     depth = _row_times(R[2].detach(), gaussians.means.detach()) + t[2].detach()
     visible = (depth >= near).nonzero()[:, 0]
     visible = visible[torch.sort(depth[visible], stable=True).indices]
-    means, quats, scales, opacities, sh = (field[visible] for field in gaussians)
+    means, quats, scales, opacities, looks = (field[visible] for field in gaussians)
 
     x, y, z = (_row_times(R[i], means) + t[i] for i in range(3))
     tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
@@ -135,18 +136,20 @@ def project(
     area = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)
     det = area.square() + blur * (row_x.square().sum(-1) + row_y.square().sum(-1)) + blur**2
     solid = (det > 0) & torch.isfinite(det)  # without blur a splat can be seen edge-on, as nothing
-    x, y, z, cov_xx, cov_xy, cov_yy, area, det, opacities, sh, means = (
-        v[solid] for v in (x, y, z, cov_xx, cov_xy, cov_yy, area, det, opacities, sh, means)
+    x, y, z, cov_xx, cov_xy, cov_yy, area, det, opacities, looks, means = (
+        v[solid] for v in (x, y, z, cov_xx, cov_xy, cov_yy, area, det, opacities, looks, means)
     )
     if antialiased:
         opacities = opacities * area / det.sqrt()
     keep = opacities >= alpha_min
-    x, y, z, cov_xx, cov_xy, cov_yy, det, opacities, sh, means = (
-        v[keep] for v in (x, y, z, cov_xx, cov_xy, cov_yy, det, opacities, sh, means)
+    x, y, z, cov_xx, cov_xy, cov_yy, det, opacities, looks, means = (
+        v[keep] for v in (x, y, z, cov_xx, cov_xy, cov_yy, det, opacities, looks, means)
     )
     whitening = torch.stack(((cov_yy / det).sqrt(), -cov_xy / (cov_yy.sqrt() * det.sqrt()), 1 / cov_yy.sqrt()), dim=-1)
-    centre = -(R.T @ t)
-    directions = torch.nn.functional.normalize(means - centre, dim=-1, eps=0.0)
+    if sh_degree is not None:
+        centre = -(R.T @ t)
+        directions = torch.nn.functional.normalize(means - centre, dim=-1, eps=0.0)
+        looks = sh_colours(looks, directions, sh_degree)
     with torch.no_grad():
         radius = (2 * torch.log(opacities / alpha_min)).sqrt() if alpha_min > 0 else torch.full_like(z, torch.inf)
         half_extents = radius[:, None] * torch.stack((cov_xx, cov_yy), -1).sqrt()
@@ -154,7 +157,7 @@ def project(
         torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), -1),
         whitening,
         opacities,
-        sh_colours(sh, directions, sh_degree),
+        looks,
         half_extents,
     )
 
@@ -199,14 +202,14 @@ def _composite(
     means: Float[Tensor, "m 2"],
     whitening: Float[Tensor, "m 3"],
     opacities: Float[Tensor, " m"],
-    colours: Float[Tensor, "m 3"],
-    background: Float[Tensor, " 3"],
+    colours: Float[Tensor, "m C"],
+    background: Float[Tensor, " C"],
     alpha_min: float,
     alpha_max: float,
     t_min: float,
-) -> tuple[Float[Tensor, "P 3"], Float[Tensor, " P"]]:
+) -> tuple[Float[Tensor, "P C"], Float[Tensor, " P"]]:
     """Front-to-back compositing of m sorted splats at P pixel centres: colour over the background, transmittance."""
-    image = pixels.new_zeros(len(pixels), 3)
+    image = pixels.new_zeros(len(pixels), len(background))
     # Minus an empty sum, so that the outputs have a gradient (zero) where nothing is drawn.
     transmittance = pixels.new_ones(len(pixels)) - opacities[:0].sum()
     stopped: Bool[Tensor, " P"] = torch.zeros(len(pixels), dtype=torch.bool, device=pixels.device)

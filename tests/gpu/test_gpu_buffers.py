@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from interpreter import DEVICE, as_on_a_gpu
+from splat.features import draw, with_features
 from splat.scenes import (
     POSE,
     SCENES,
@@ -80,6 +81,16 @@ def test_a_value_that_is_not_finite_spoils_the_image_where_nobody_waits(field: s
         found = render(scene, "gpu")
     image = found.image[..., -1] if field == "background" else found.image
     assert not torch.isfinite(image).any()
+
+
+def test_a_feature_that_is_not_finite_spoils_the_image_where_nobody_waits() -> None:
+    inputs = with_features(SCENE, 5)
+    inputs["features"][-1, -1] = torch.nan
+    with as_on_a_gpu(10_000):
+        found = draw(SCENE, inputs, "gpu")
+    assert found.image.isnan().all() and found.alpha.isnan().all()
+    with as_on_a_gpu(3):
+        assert draw(SCENE, with_features(SCENE, 5), "gpu").image.isnan().all()
 
 
 @pytest.mark.parametrize("name", POSE)

@@ -13,6 +13,7 @@ from gpu.test_gpu_losses import images
 from gpu.test_gpu_pose import HEAD
 from heads import random_params
 from interpreter import Hostile, hostile_interpreter
+from splat.features import cotangents, everything, with_features
 from splat.scenes import SCENES, gradients, render
 from torch import Tensor
 
@@ -30,6 +31,13 @@ def everything_of(name: str, copy: Callable[[Tensor], Tensor]) -> list[Tensor]:
     cotangents = torch.randn(*size, 3, generator=g), torch.randn(*size, generator=g)
     own = replace(scene, gaussians=Gaussians(*map(copy, scene.gaussians)), background=copy(scene.background))
     return [*render(own, "gpu"), *gradients(own, "gpu", *map(copy, cotangents)).values()]
+
+
+def everything_of_features(copy: Callable[[Tensor], Tensor]) -> list[Tensor]:
+    scene = SCENES["walls"]
+    inputs = {name: copy(tensor) for name, tensor in with_features(scene, 33).items()}
+    drawn, by_name = everything(scene, inputs, "gpu", *map(copy, cotangents(scene, 33)))
+    return [*drawn, *by_name.values()]
 
 
 def everything_placed(copy: Callable[[Tensor], Tensor]) -> list[Tensor]:
@@ -60,6 +68,7 @@ CASES: dict[str, Callable[[Callable[[Tensor], Tensor]], list[Tensor]]] = {
         name: lambda copy, name=name: everything_of(name, copy)
         for name in ("17x33", "opaque", "walls", "thresholds", "needles")
     },
+    "features": everything_of_features,
     "placed": everything_placed,
     "posed": everything_posed,
     "compared": everything_compared,

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from splat import test_splat_features
 from splat.scenes import SCENES, Scene, assert_agrees, camera, random_gaussians
 
 from avatar.compute.device import interpreted
@@ -19,6 +20,14 @@ def test_a_scene_agrees_with_the_reference(name: str, monkeypatch: pytest.Monkey
     g = random_gaussians(60, seed=8)
     scene = Scene(g if name == "small" else g._replace(opacities=torch.ones(60)), camera(19, 21))
     assert_agrees(scene, "gpu")
+
+
+@pytest.mark.parametrize("channels", [3, 33] if interpreted() else [1, 3, 8, 32, 33])
+def test_features_of_64_x_48_pixels_agree_with_the_reference(channels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    from avatar.splat import gpu_draw
+
+    monkeypatch.setattr(gpu_draw, "TUNING", gpu_draw.Tuning())
+    test_splat_features.assert_agrees("opaque", channels, "gpu")
 
 
 # A GPU's compilers would take minutes for the wide steps that are quick in the interpreter.

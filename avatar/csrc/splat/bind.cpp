@@ -5,6 +5,7 @@
 #include <nanobind/stl/unique_ptr.h>
 
 #include <cstring>
+#include <limits>
 
 #include "python/arguments.h"
 #include "splat/splat.h"
@@ -20,7 +21,8 @@ namespace {
 using Floats = Array<float>;
 using ConstFloats = Array<const float>;
 
-// Also of gradients, whose names begin with `prefix`. sh must hold the coefficients of `sh_degree`.
+// Also of gradients, whose names begin with `prefix`. sh must hold the coefficients of `sh_degree`, or, where that is
+// kNoSh, features [N, K].
 template <typename T>
 void check_gaussians(const std::string& prefix, const Array<T>& means, const Array<T>& quats, const Array<T>& scales,
                      const Array<T>& opacities, const Array<T>& sh, int sh_degree, Size& N, Size& K) {
@@ -28,16 +30,23 @@ void check_gaussians(const std::string& prefix, const Array<T>& means, const Arr
     check_shape(prefix + "quats", quats, {N, 4});
     check_shape(prefix + "scales", scales, {N, 3});
     check_shape(prefix + "opacities", opacities, {N});
+    if (sh_degree == kNoSh) {
+        check_shape(prefix + "features", sh, {N, K});
+        avatar::check_within(prefix + "features' channels", K.value, 1, std::numeric_limits<int>::max());
+        return;
+    }
     check_shape(prefix + "sh", sh, {N, K, 3});
     avatar::check_within("sh_degree", sh_degree, 0, 3);
     avatar::check_within(prefix + "sh's coefficients", K.value, (sh_degree + 1) * (sh_degree + 1), 16);
 }
 
 Gaussians gaussians_of(const ConstFloats& means, const ConstFloats& quats, const ConstFloats& scales,
-                       const ConstFloats& opacities, const ConstFloats& sh) {
-    return {means.data(),     quats.data(), scales.data(),
-            opacities.data(), sh.data(),    static_cast<std::int64_t>(means.shape(0)),
-            static_cast<int>(sh.shape(1))};
+                       const ConstFloats& opacities, const ConstFloats& sh, int sh_degree) {
+    const auto count = static_cast<std::int64_t>(means.shape(0));
+    const int values = static_cast<int>(sh.shape(1));
+    if (sh_degree == kNoSh)
+        return {means.data(), quats.data(), scales.data(), opacities.data(), nullptr, count, 0, sh.data(), values};
+    return {means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), count, values};
 }
 
 }  // namespace
@@ -54,8 +63,9 @@ void bind_splat(nb::module_& m) {
            Floats alpha, bool everywhere) {
             Size N("N"), K("K"), H("H"), W("W");
             check_gaussians("", means, quats, scales, opacities, sh, sh_degree, N, K);
-            check_shape("background", background, {3});
-            check_shape("image", image, {H, W, 3});
+            const std::int64_t channels = sh_degree == kNoSh ? K.value : 3;
+            check_shape("background", background, {channels});
+            check_shape("image", image, {H, W, channels});
             check_shape("alpha", alpha, {H, W});
             avatar::check_within("region's left column", region[0], 0, W.value - 1);
             avatar::check_within("region's top row", region[1], 0, H.value - 1);
@@ -70,7 +80,7 @@ void bind_splat(nb::module_& m) {
                                     everywhere};
             const Kernels& kernels = select_kernels(simd.c_str());
             const nb::gil_scoped_release unlocked;
-            return forward(gaussians_of(means, quats, scales, opacities, sh), camera, settings,
+            return forward(gaussians_of(means, quats, scales, opacities, sh, sh_degree), camera, settings,
                            {region[0], region[1], region[2], region[3]}, background.data(), kernels, threads,
                            image.data(), alpha.data());
         },
@@ -94,14 +104,19 @@ void bind_splat(nb::module_& m) {
             const auto drawn = static_cast<std::int64_t>(drawing.lists.slot_begin.size()) - 1;
             avatar::check_within("the number of Gaussians", N.value, drawn, drawn);
             check_gaussians("grad_", grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, sh_degree, N, K);
-            check_shape("grad_background", grad_background, {3});
+            const std::int64_t channels = sh_degree == kNoSh ? K.value : 3;
+            const auto shown = static_cast<std::int64_t>(drawing.background.size());
+            avatar::check_within("the number of channels", channels, shown, shown);
+            check_shape("grad_background", grad_background, {channels});
             if (grad_pose) check_shape("grad_pose", *grad_pose, {kPoseValues});
-            if (grad_image) check_shape("grad_image", *grad_image, {camera.height, camera.width, 3});
+            if (grad_image) check_shape("grad_image", *grad_image, {camera.height, camera.width, channels});
             if (grad_alpha) check_shape("grad_alpha", *grad_alpha, {camera.height, camera.width});
+            const bool has_features = sh_degree == kNoSh;
             const GaussianGradients gradients{grad_means.data(), grad_quats.data(), grad_scales.data(),
-                                              grad_opacities.data(), grad_sh.data()};
+                                              grad_opacities.data(), has_features ? nullptr : grad_sh.data(),
+                                              has_features ? grad_sh.data() : nullptr};
             const nb::gil_scoped_release unlocked;
-            backward(drawing, gaussians_of(means, quats, scales, opacities, sh),
+            backward(drawing, gaussians_of(means, quats, scales, opacities, sh, sh_degree),
                      grad_image ? grad_image->data() : nullptr, grad_alpha ? grad_alpha->data() : nullptr, gradients,
                      grad_background.data(), grad_pose ? grad_pose->data() : nullptr);
         },

@@ -17,6 +17,16 @@ struct Kernels {
                              double* grad_pose);
     void (*forward_tile)(const Raster&, std::int64_t tile, const ForwardTarget&);
     void (*backward_tile)(const Raster&, std::int64_t tile, const BackwardSource&, const BackwardTarget&);
+
+    // The same with features in place of colours. Both tiles need a workspace of so many floats, for one call.
+    void (*project_backward_features)(const View&, const Gaussians&, std::int64_t begin, std::int64_t end,
+                                      const std::uint32_t* slot_begin, const float* moments, const GaussianGradients&,
+                                      double* grad_pose);
+    std::int64_t (*feature_workspace)(int channels);
+    void (*forward_features)(const Raster&, const FeatureChannels&, std::int64_t tile, const ForwardTarget&,
+                             float* workspace);
+    void (*backward_features)(const Raster&, const FeatureChannels&, std::int64_t tile, const BackwardSource&,
+                              const BackwardTarget&, float* workspace);
 };
 
 // The kernels for a name that choose_instruction_set() takes.

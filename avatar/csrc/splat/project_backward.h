@@ -208,45 +208,7 @@ inline void clear(const GaussianGradients& gradients, std::int64_t i, std::int64
     __builtin_memset(gradients.quats + 4 * i, 0, 4 * sizeof(float));
     __builtin_memset(gradients.scales + 3 * i, 0, 3 * sizeof(float));
     gradients.opacities[i] = 0.0f;
-    __builtin_memset(gradients.sh + sh_values * i, 0, sh_values * sizeof(float));
-}
-
-// Writes the gradients of the Gaussians begin .. end - 1. Those whose moments are all 0, hidden or behind all others,
-// have none. What they add to the camera's goes to `grad_pose` [kPoseValues], unless that is null.
-void project_backward(const View& view, const Gaussians& gaussians, std::int64_t begin, std::int64_t end,
-                      const std::uint32_t* slot_begin, const float* moments, const GaussianGradients& gradients,
-                      double* grad_pose) {
-    Sums sums{};
-    PoseSums pose_sums{};
-    PoseSums* const pose = grad_pose != nullptr ? &pose_sums : nullptr;
-    std::int64_t indices[kBatch];
-    int count = 0;
-    for (std::int64_t i = begin; i < end; ++i) {
-        double own[kMoments] = {};
-        for (std::int64_t slot = slot_begin[i]; slot < slot_begin[i + 1]; ++slot)
-            for (int k = 0; k < kMoments; ++k) own[k] += moments[slot * kMoments + k];
-        bool any = false;
-        for (int k = 0; k < kMoments; ++k) any |= own[k] != 0.0;
-        if (!any) {
-            clear(gradients, i, 3 * std::int64_t{gaussians.coefficients});
-            continue;
-        }
-        for (int k = 0; k < kMoments; ++k) sums.moments[k][count] = own[k];
-        indices[count++] = i;
-        if (count < kBatch) continue;
-        batch_backward(view, gaussians, indices, count, sums, gradients, pose);
-        count = 0;
-    }
-    if (count > 0) {
-        for (int k = 0; k < kMoments; ++k)
-            for (int lane = count; lane < kBatch; ++lane) sums.moments[k][lane] = 0.0;
-        batch_backward(view, gaussians, indices, count, sums, gradients, pose);
-    }
-    if (pose == nullptr) return;
-    for (int k = 0; k < kPoseValues; ++k) {
-        grad_pose[k] = 0.0;
-        for (int lane = 0; lane < kBatch; ++lane) grad_pose[k] += pose->values[k][lane];
-    }
+    if (sh_values != 0) __builtin_memset(gradients.sh + sh_values * i, 0, sh_values * sizeof(float));
 }
 
 }  // namespace

@@ -23,7 +23,7 @@ typedef unsigned long long Word;  // of a set of blocks, as bits
 
 // Written at the pixels of the region only.
 struct ForwardTarget {
-    float* image;  // [height * width * 3]
+    float* image;  // [height * width * channels]
     float* alpha;  // [height * width]
     // [tiles * 2 * kTilePixels], in the kernels' own order, the transmittance behind all splats, and the bits of a number:
     // the pair of the tile from which on the pixel shows none, 0 outside the region.
@@ -39,8 +39,15 @@ struct BackwardSource {
 };
 
 struct BackwardTarget {
-    float* moments;           // [pairs * kMoments], by slot
-    double* grad_background;  // [tiles * 3]
+    float* moments;           // [pairs * kMoments], by slot; with features [pairs * (kShapeMoments + channels)]
+    double* grad_background;  // [tiles * channels]
+};
+
+// What both directions read of features beside a Raster, whose background they do not.
+struct FeatureChannels {
+    const float* features;    // [N * channels]
+    const float* background;  // [channels]
+    int channels;
 };
 
 }  // namespace avatar::splat

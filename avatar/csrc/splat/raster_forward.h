@@ -47,25 +47,9 @@ struct Blocks {
 
 void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& target) {
     const TileArea area(r, tile);
-    // A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance; nothing
-    // is drawn there any more.
     enum { kTransmittance, kStops, kRed, kGreen, kBlue, kVectors };
     Pixels<kVectors> pixels;
-    const bool whole = area.is_whole();
-    for (int block = 0; block < kBlocks; ++block) {
-        float* const p = pixels.of(block);
-        store(p, broadcast(whole ? 1.0f : -1.0f));
-        store(p + kStops * kLanes, (Floats)(Ints{} + (whole ? kNeverStops : 0)));
-        for (int k = kRed; k <= kBlue; ++k) store(p + k * kLanes, Floats{});
-    }
-    if (!whole) {
-        area.for_each_row<kVectors>(r.width, [&](int i, std::int64_t, int count) {
-            for (int k = i; k < i + count; ++k) {
-                pixels.values[k] = 1.0f;
-                __builtin_memcpy(pixels.values + k + kStops * kLanes, &kNeverStops, sizeof kNeverStops);
-            }
-        });
-    }
+    begin_pixels(area, r.width, pixels);
     Word alive[kWords];
     area.blocks(alive);
 
@@ -110,12 +94,7 @@ void forward_tile(const Raster& r, std::int64_t tile, const ForwardTarget& targe
     }
     __builtin_memset(blocks_of_pairs + at * kWords, 0, (count - at) * kWords * sizeof(Word));
 
-    float* const ends = target.ends + tile * 2 * kTilePixels;
-    for (int block = 0; block < kBlocks; ++block) {
-        float* const p = pixels.of(block);
-        store(p, (Floats)((Ints)load(p) & ~sign_bits()));
-        for (int k = 0; k < 2; ++k) store_anywhere(ends + (2 * block + k) * kLanes, load(p + k * kLanes));
-    }
+    end_pixels(pixels, target.ends + tile * 2 * kTilePixels);
     area.for_each_row<kVectors>(r.width, [&](int i, std::int64_t pixel, int count) {
         const float* const p = pixels.values + i;
         float *const image = target.image + 3 * pixel, *const alpha = target.alpha + pixel;

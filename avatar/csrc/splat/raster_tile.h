@@ -100,6 +100,37 @@ struct Local {
     float a, b, c, u0, v0;
 };
 
+// The vectors of a tile's pixels from which the forward kernels start: the first is the transmittance, the second where
+// the pixel stops. A pixel that has stopped, or that is outside the region, is marked by the sign bit of its transmittance;
+// nothing is drawn there any more. All other vectors are 0.
+template <int kVectors>
+inline void begin_pixels(const TileArea& area, std::int64_t image_width, Pixels<kVectors>& pixels) {
+    const bool whole = area.is_whole();
+    for (int block = 0; block < kBlocks; ++block) {
+        float* const p = pixels.of(block);
+        store(p, broadcast(whole ? 1.0f : -1.0f));
+        store(p + kLanes, (Floats)(Ints{} + (whole ? kNeverStops : 0)));
+        for (int k = 2; k < kVectors; ++k) store(p + k * kLanes, Floats{});
+    }
+    if (whole) return;
+    area.for_each_row<kVectors>(image_width, [&](int i, std::int64_t, int count) {
+        for (int k = i; k < i + count; ++k) {
+            pixels.values[k] = 1.0f;
+            __builtin_memcpy(pixels.values + k + kLanes, &kNeverStops, sizeof kNeverStops);
+        }
+    });
+}
+
+// Takes the marks off the transmittances, and keeps both vectors for the backward kernels.
+template <int kVectors>
+inline void end_pixels(Pixels<kVectors>& pixels, float* ends) {
+    for (int block = 0; block < kBlocks; ++block) {
+        float* const p = pixels.of(block);
+        store(p, (Floats)((Ints)load(p) & ~sign_bits()));
+        for (int k = 0; k < 2; ++k) store_anywhere(ends + (2 * block + k) * kLanes, load(p + k * kLanes));
+    }
+}
+
 // Times the opacity it is the alpha before clamping.
 inline Floats falloff_at(Floats u, Floats v) { return exp2_negative(fma(-u, u, -(v * v))); }
 

@@ -4,7 +4,8 @@
 // The plain data that the stages of the splatter hand to each other. All matrices are row-major.
 namespace avatar::splat {
 
-// N Gaussians as the caller gives them; `coefficients` is K, the stored spherical-harmonics coefficients a channel.
+// N Gaussians as the caller gives them; `coefficients` is K, the stored spherical-harmonics coefficients a channel. With
+// features they have no coefficients, and the degree is kNoSh.
 struct Gaussians {
     const float* means;      // [N * 3]
     const float* quats;      // [N * 4], (w, x, y, z), any length
@@ -13,7 +14,10 @@ struct Gaussians {
     const float* sh;         // [N * K * 3]
     std::int64_t count;
     int coefficients;
+    const float* features = nullptr;  // [N * channels]
+    int channels = 0;                 // of the features; 0: colours
 };
+constexpr int kNoSh = -1;
 
 struct GaussianGradients {
     float* means;
@@ -21,6 +25,7 @@ struct GaussianGradients {
     float* scales;
     float* opacities;
     float* sh;
+    float* features = nullptr;
 };
 
 struct Camera {
@@ -72,6 +77,7 @@ struct Pair {
 // What the rasteriser's backward pass finds for one splat in one tile, and the sum of that over tiles.
 // `weight` = dL/dalpha * alpha / opacity, summed over pixels; the others are its moments in (u, v).
 enum Moment { kWeight, kU, kUU, kV, kUV, kVV, kRed, kGreen, kBlue, kMoments };
+constexpr int kShapeMoments = kRed;  // those that features have too; dL/dfeature of each channel follows them
 
 // Pixels. Larger tiles repeat less work for a splat; the pixels of one still fit in L1. docs/bench/splat.md has timings.
 constexpr int kTileWidth = 32, kTileHeight = 32, kTilePixels = kTileWidth * kTileHeight;
