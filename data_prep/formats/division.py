@@ -55,7 +55,7 @@ def _divide_shots(
     times = sorted({shot.time for shot in shots})
     if len(times) == 1:
         every = tuple(range(len(shots)))
-        return Split(every, ()), ["the pictures are of a single time: they can drive an avatar, and none can be trained on"]
+        return Split(every, ()), ["the pictures are of a single time: they can drive an avatar, but not train one"]
     tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test"}
     is_own = test_frames is None and bool(tested) and "train" in parts
     notes = ["the folder's own division into training and test times is kept"] if is_own else []
