@@ -56,15 +56,16 @@ def _divide_shots(
     if len(times) == 1:
         every = tuple(range(len(shots)))
         return Split(every, ()), ["the pictures are of a single time: they can drive an avatar, but not train one"]
-    tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test"}
-    is_own = test_frames is None and bool(tested) and "train" in parts
-    notes = ["the folder's own division into training and test times is kept"] if is_own else []
-    if not is_own:
+    trained = {shot.camera for shot, part in zip(shots, parts, strict=True) if part == "train"}
+    is_own = test_frames is None and bool(trained)
+    if held_out is None:
+        held_out = {shot.camera for shot in shots} - trained if is_own else set()
+    tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test" and shot.camera in trained}
+    notes = []
+    if is_own and (tested or ("test" in parts and held_out)):
+        notes.append("the folder's own division into training and test times is kept")
+    else:
         tested = {times[place] for place in split_frames(len(times), test_frames).test}
-    if held_out is None and is_own:
-        trained = {shot.camera for shot, part in zip(shots, parts, strict=True) if part == "train"}
-        held_out = {shot.camera for shot in shots} - trained
-    held_out = held_out or set()
     if held_out == {shot.camera for shot in shots}:
         raise UserError("every camera is held out, and none is left to train on: name fewer in data.test_cameras")
     if held_out:
