@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep.formats import avatar_track, blendshapes, imavatar, insta, refined, vhap
+from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, refined, vhap
 from data_prep.formats.frame_files import find_frame_files
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, matte_notes
@@ -14,7 +14,7 @@ from data_prep.formats.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
 _LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}
-_BY_FILES = {module.NAME: module for module in (blendshapes,)}  # have no listing of frames
+_BY_FILES = {module.NAME: module for module in (blendshapes, nersemble)}  # have no listing of frames
 FORMATS = (METRICAL_TRACKER, *_LISTED, *_BY_FILES, avatar_track.NAME)
 
 
@@ -43,7 +43,7 @@ def open_tracked_folder(
     is_listed = folder.is_dir() and (format is None or format in _LISTED)
     frames = read_listings(folder) if is_listed else []
     name = format or detect_format(folder, frames)
-    if cameras not in (None, vhap.ALL, vhap.FRONT) and name != vhap.NAME:
+    if cameras not in (None, vhap.ALL, vhap.FRONT) and name not in (vhap.NAME, nersemble.NAME):
         raise UserError(f"--cameras is for folders of several cameras, and {folder} is {name}'s, of one")
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)
@@ -63,6 +63,8 @@ def open_tracked_folder(
         raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking {where}")
     if name == vhap.NAME:
         return vhap.open_folder(folder, frames, cameras or vhap.ALL)
+    if name == nersemble.NAME:
+        return nersemble.open_folder(folder, cameras or nersemble.ALL)
     if name == blendshapes.NAME:
         return blendshapes.open_folder(folder)
     return _LISTED[name].open_folder(folder, frames)

@@ -65,6 +65,11 @@ class FrameFiles:
         return self.paired_by or next((path.name for path in self.listings), "")
 
     @cached_property
+    def is_one_folder(self) -> bool:
+        """Whether the images lie in one folder, so that numbers which are missing are missing frames."""
+        return len({path.parent for path in self.images.values()}) == 1
+
+    @cached_property
     def is_transparent(self) -> bool:
         """Whether the images are their own mattes."""
         return any(self.alphas.get(number) == path for number, path in self.images.items())
@@ -115,7 +120,7 @@ class FrameFiles:
 
     def frame_names(self) -> dict[int, str]:
         """The images' stems; with their folders where images lie in several, as the same stem may come twice."""
-        if len({path.parent for path in self.images.values()}) == 1:
+        if self.is_one_folder:
             return {number: path.stem for number, path in self.images.items()}
         inside = {number: path.relative_to(self.folder) for number, path in self.images.items()}
         return {number: "_".join(path.with_suffix("").parts) for number, path in inside.items()}
