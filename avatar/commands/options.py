@@ -17,7 +17,9 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 def add_reading(parser: argparse.ArgumentParser) -> None:
     """How a tracked folder is read."""
     parser.add_argument(
-        "--format", metavar="NAME", help="metrical-tracker, VHAP, INSTA or IMavatar (default: told from the files)"
+        "--format",
+        metavar="NAME",
+        help="metrical-tracker, VHAP, INSTA, IMavatar, GaussianBlendshapes or NeRSemble (default: told from the files)",
     )
     parser.add_argument(
         "--cameras",

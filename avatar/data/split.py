@@ -19,8 +19,13 @@ class Split(NamedTuple):
 
 
 def check_divided(split: Split) -> None:
-    """Raises UserError, as `split_frames` does, for a subject of a single frame, which is enough to drive an avatar."""
+    """Raises UserError for a subject of a single frame or time, which is enough to drive an avatar."""
     if not split.test:
+        if len(split.train) > 1:
+            raise UserError(
+                f"the {len(split.train)} pictures are all of one time; at least 2 times are needed, one to train and one "
+                "to test"
+            )
         split_frames(len(split.train))
 
 

@@ -74,7 +74,8 @@ def evaluate(
     """
     subject = run.subject
     asked = choose_protocols(protocols)
-    indices = {protocol.name: protocol.select(len(subject), subject.split) for protocol in asked}
+    times = [subject.recording.time(i) for i in range(len(subject))]
+    indices = {protocol.name: protocol.select(times, subject.split) for protocol in asked}
     left_out = without_frames(asked, indices, subject.name)
     for sentence in left_out.values():
         say(f"Note: {sentence}")
@@ -105,7 +106,7 @@ def evaluate(
         entries[protocol.name] = entry
     whole = in_order({**before.entries, **entries})
     measured = [protocol_of(name, entry) for name, entry in whole.items()]
-    tracking = describe_tracking(run, sorted({i for p in measured for i in p.select(len(subject), subject.split)}))
+    tracking = describe_tracking(run, sorted({i for p in measured for i in p.select(times, subject.split)}))
     notes = [*left_out.values(), *notes_of(measured, run), *tracking_notes(tracking)]
     summary: dict[str, Any] = {
         **facts,

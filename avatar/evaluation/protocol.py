@@ -73,7 +73,7 @@ class Protocol:
     name: str
     summary: str  # one sentence for people
     source: str  # where the choices come from; what is known of it and what is a reading
-    frames: Literal["held-out"] | int  # held out in training; or of the last so many those not trained on
+    frames: Literal["held-out"] | int  # held out in training; or those not trained on of so many last frames or times
     background: Colour  # under render and truth
     # Main figures: of images x head mask ("multiply") or as they are ("none"), both over the whole frame; or of the head
     # mask alone ("only").
@@ -97,12 +97,15 @@ class Protocol:
         """Every choice by name, for results files."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "name"}
 
-    def select(self, count: int, split: Split) -> tuple[int, ...]:
-        """Indices of the frames evaluated out of `count`: never one that was trained on."""
+    def select(self, times: Sequence[int], split: Split) -> tuple[int, ...]:
+        """Indices of the frames evaluated, never one that was trained on.
+
+        times  of each frame; the pictures of several cameras share them
+        """
         if self.frames == HELD_OUT:
             return split.test
-        trained = set(split.train)
-        return tuple(index for index in range(max(count - self.frames, 0), count) if index not in trained)
+        last, trained = set(sorted(set(times))[-self.frames :]), set(split.train)
+        return tuple(i for i, time in enumerate(times) if time in last and i not in trained)
 
 
 def column(measure: str, region: Region | None) -> str:

@@ -54,8 +54,8 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     print(f"Pictures     {target / 'refinement.png'}")
     if (passes := run.step / max(len(subject.split.train), 1)) > MANY_PASSES:
         print(
-            f"Note: this avatar has seen each frame {passes:.0f} times and may know the tracking's errors by heart; "
-            f"avatar train --refine 1 refines through one that has seen it {FIRST_PASSES} times, often better"
+            f"Note: this avatar was trained for {passes:.0f} passes over the frames and may overfit the tracking's errors; "
+            f"avatar train --refine 1 refines through one trained for {FIRST_PASSES} passes, often better"
         )
     return OK
 

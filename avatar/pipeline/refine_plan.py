@@ -29,9 +29,9 @@ ROUNDS_FOLDER = "rounds"
 WITH_REFINEMENT = ("trainer.pose_rate=0", "trainer.condition_noise=0")
 PLAN_FORMAT = 1
 LEAST_STEPS = 500  # fewer make no avatar
-# An avatar that tells where a head is has seen each training frame some times; later it learns the errors of each frame's
-# tracking by heart. Steps are as many passes over them as this, and no larger share of the run's own; but no fewer than
-# these, where the run takes as many: what is still blurred tells little, however often it has seen a few frames.
+# A round trains for a few passes over the training frames: with more, the avatar overfits the errors of each frame's
+# tracking. Steps are as many passes as this, and no larger share of the run's own; but no fewer than these, where the run
+# takes as many: an avatar that is still blurred refines badly, however many passes a few frames get.
 FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.25, 1000
 PLANNED_SHARE = 0.97  # of the minutes: the rest is for opening and closing the run itself, which nothing before shows
 

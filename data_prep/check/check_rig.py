@@ -7,35 +7,62 @@ from dataclasses import replace
 
 import torch
 
-from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from data_prep.check.findings import Finding
+from data_prep.check.clip import Clip
+from data_prep.check.findings import Finding, frames_phrase
 from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.frame_files import FrameFiles
-from data_prep.formats.frame_track import FrameTrack, fit_coefficients
+from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
 from data_prep.prepare.frame_offset import MIN_FRAMES, detect_offset
 from data_prep.prepare.misfit import refuse_misplaced_cameras
 from data_prep.prepare.rig import find_rig
 
 
-def check_rig(given: Source, assets: HeadAssets, size: tuple[int, int]) -> list[Finding]:
-    """On all cameras of a folder that is known to be readable; empty where it has one.
+def check_rig(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list[Finding]:
+    """On all cameras of a clip, which holds one of them; empty where there is one.
 
     size  of the images, where the listing does not say it
     """
+    given = clip.given
     source = open_tracked_folder(given.folder, given.tracking, given.format, lambda _: None, given.cameras)
     if not source.shots:
         return []
+    findings: list[Finding] = []
     try:
-        tracking = fit_coefficients(source.read(assets, size, lambda _: None), assets)
+        tracking = source.read(assets, size, lambda _: None)
+        findings += _unusable(source, tracking, clip)
+        if tracking.frames:
+            tracking = fit_coefficients(tracking, assets)
     except UserError as error:
-        return [Finding("error", "camera", str(error), "mend it, or leave cameras out with --cameras")]
+        return [*findings, Finding("error", "camera", str(error), "mend it, or leave cameras out with --cameras")]
     tracks = {n: track for n, track in tracking.frames.items() if source.files.images[n].is_file()}
+    if not tracks:
+        return findings
     head = HeadModel(assets, torch.from_numpy(next(iter(tracks.values())).shape))
-    return [*_poses(source, tracks, head), *_clocks(source, tracks, head)]
+    return [*findings, *_poses(source, tracks, head), *_clocks(source, tracks, head)]
+
+
+def _unusable(source: TrackedFolder, tracking: Tracking, clip: Clip) -> Iterator[Finding]:
+    """Tracking that cannot be used in other cameras than the clip's, whose own findings name parameters of all cameras."""
+    images = set(clip.files.images.values())
+    parameters = {clip.tracking.paths[number] for number in clip.tracking.bad}
+    of_camera: dict[str, list[int]] = {}
+    for number in tracking.bad:
+        if source.files.images[number] not in images and tracking.paths[number] not in parameters:
+            of_camera.setdefault(source.shots[number].camera, []).append(number)
+    names = source.files.frame_names()
+    for camera, numbers in of_camera.items():
+        yield Finding(
+            clip.loss_severity(len(tracking.bad), len(source.files.images)),
+            "tracking",
+            f"the tracking of camera {camera} cannot be used in {frames_phrase(numbers, names.__getitem__)}: "
+            f"{tracking.bad[numbers[0]]}",
+            "export these frames again, or leave the camera out with --cameras",
+            tuple(names[number] for number in numbers),
+        )
 
 
 def _poses(source: TrackedFolder, tracks: dict[int, FrameTrack], head: HeadModel) -> Iterator[Finding]:

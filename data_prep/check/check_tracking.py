@@ -39,10 +39,13 @@ def check_tracking(clip: Clip) -> list[Finding]:
 
 
 def _unusable(clip: Clip) -> Iterator[Finding]:
-    for reason, numbers in grouped(clip.tracking.bad).items():
-        first = clip.tracking.paths[numbers[0]]
+    # One finding where the reasons differ only in the name of the frame's own file.
+    paths = clip.tracking.paths
+    reasons = {number: reason.replace(paths[number].name, "\0") for number, reason in clip.tracking.bad.items()}
+    for reason, numbers in grouped(reasons).items():
+        first = paths[numbers[0]]
         keys = [f"{key} ({what})" for key, what in non_finite_values(first).items()]
-        detail = f"not finite: {', '.join(keys)} in {first.name}" if keys else reason
+        detail = f"not finite: {', '.join(keys)} in {first.name}" if keys else reason.replace("\0", first.name)
         yield Finding(
             clip.loss_severity(len(numbers), len(clip.files.tracking)),
             "non-finite" if keys or "is not finite" in reason else "no-face" if "no face" in reason else "tracking",

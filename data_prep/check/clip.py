@@ -163,7 +163,7 @@ def read_clip(
             complaints.append(("head-model", str(error)))
     offset, evidence = given.frame_offset, NOT_SOUGHT if given.frame_offset is None else GIVEN
     if source.is_paired:
-        offset, evidence = 0, f"images and tracking are paired by {source.files.listings[0].name}"
+        offset, evidence = 0, f"images and tracking are paired by {source.files.pairing}"
     clip = Clip(
         given,
         source,

@@ -86,7 +86,7 @@ def check_tracked_folder(
     findings += check_files(clip) + check_tracking(clip) + check_motion(clip) + check_fit(clip)
     findings += check_images(clip)
     if assets is not None and (size := clip.size()) is not None:
-        findings += check_rig(clip.given, assets, size)
+        findings += check_rig(clip, assets, size)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     if not any(finding.severity == "error" for finding in findings):
         findings += lost_frames(clip)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep.formats import avatar_track, imavatar, insta, refined, vhap
+from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, refined, vhap
 from data_prep.formats.frame_files import find_frame_files
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, matte_notes
@@ -14,7 +14,8 @@ from data_prep.formats.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
 _LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}
-FORMATS = (METRICAL_TRACKER, *_LISTED, avatar_track.NAME)
+_BY_FILES = {module.NAME: module for module in (blendshapes, nersemble)}  # have no listing of frames
+FORMATS = (METRICAL_TRACKER, *_LISTED, *_BY_FILES, avatar_track.NAME)
 
 
 def open_tracked_folder(
@@ -39,9 +40,10 @@ def open_tracked_folder(
         if cameras not in (None, vhap.ALL, vhap.FRONT):
             raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
         return refined.open_folder(folder)
-    frames = [] if format == METRICAL_TRACKER or not folder.is_dir() else read_listings(folder)
+    is_listed = folder.is_dir() and (format is None or format in _LISTED)
+    frames = read_listings(folder) if is_listed else []
     name = format or detect_format(folder, frames)
-    if cameras not in (None, vhap.ALL, vhap.FRONT) and name != vhap.NAME:
+    if cameras not in (None, vhap.ALL, vhap.FRONT) and name not in (vhap.NAME, nersemble.NAME):
         raise UserError(f"--cameras is for folders of several cameras, and {folder} is {name}'s, of one")
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)
@@ -51,21 +53,29 @@ def open_tracked_folder(
             lambda head, size, complain: read_tracking(files.tracking, complain),
             notes=matte_notes(files),
         )
-    if not _LISTED[name].recognise(frames):
+    is_one = _BY_FILES[name].recognise(folder) if name in _BY_FILES else _LISTED[name].recognise(frames)
+    if not is_one:
         raise UserError(f"{folder} is not a folder of {name}'s: docs/data.md says which files and values belong to it")
     if name == insta.NAME:
         return insta.open_folder(folder, frames, tracking)
     if tracking is not None:
-        raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking is named by the listing")
+        where = "is in the folder itself" if name in _BY_FILES else "is named by the listing"
+        raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking {where}")
     if name == vhap.NAME:
         return vhap.open_folder(folder, frames, cameras or vhap.ALL)
+    if name == nersemble.NAME:
+        return nersemble.open_folder(folder, cameras or nersemble.ALL)
+    if name == blendshapes.NAME:
+        return blendshapes.open_folder(folder)
     return _LISTED[name].open_folder(folder, frames)
 
 
 def detect_format(folder: Path, frames: list[ListedFrame]) -> str:
-    """A folder with imgs/ is metrical-tracker's; listings are told apart by what their first frame has."""
+    """A folder with imgs/ is metrical-tracker's; listings are told apart by what their first frame has, other folders by
+    their files."""
     found = [METRICAL_TRACKER] if (folder / "imgs").is_dir() else []
     found += [name for name, module in _LISTED.items() if module.recognise(frames)]
+    found += [name for name, module in _BY_FILES.items() if not frames and module.recognise(folder)]
     if len(found) > 1:
         raise UserError(f"{folder} could be a folder of {' or '.join(found)}; say which with --format")
     if not found and frames:

@@ -15,7 +15,7 @@ def divide(
     tracked: TrackedFolder, numbers: Sequence[int], test_frames: int | None = None, test_cameras: str | None = None
 ) -> tuple[Split, list[str]]:
     """Positions in `numbers` by the folder's own division, where it has one and no number of test frames is asked for, else
-    by the rule of `split_frames`; and notes on it. A single frame is all there is to drive with, and not divided
+    by the rule of `split_frames`; and notes on it. A single frame or time is enough to drive with, and not divided
     (`check_divided`). With several cameras, times are divided, and cameras may be held out as well.
 
     test_frames   frames held out at the end; with several cameras, times
@@ -53,15 +53,19 @@ def _divide_shots(
     parts = [division.get(number) for number in numbers]
     held_out = named_cameras(test_cameras, {shot.camera for shot in shots})
     times = sorted({shot.time for shot in shots})
-    tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test"}
-    is_own = test_frames is None and bool(tested) and "train" in parts
-    notes = ["the folder's own division into training and test times is kept"] if is_own else []
-    if not is_own:
+    if len(times) == 1:
+        every = tuple(range(len(shots)))
+        return Split(every, ()), ["the pictures are of a single time: they can drive an avatar, but not train one"]
+    trained = {shot.camera for shot, part in zip(shots, parts, strict=True) if part == "train"}
+    is_own = test_frames is None and bool(trained)
+    if held_out is None:
+        held_out = {shot.camera for shot in shots} - trained if is_own else set()
+    tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test" and shot.camera in trained}
+    notes = []
+    if is_own and (tested or ("test" in parts and held_out)):
+        notes.append("the folder's own division into training and test times is kept")
+    else:
         tested = {times[place] for place in split_frames(len(times), test_frames).test}
-    if held_out is None and is_own:
-        trained = {shot.camera for shot, part in zip(shots, parts, strict=True) if part == "train"}
-        held_out = {shot.camera for shot in shots} - trained
-    held_out = held_out or set()
     if held_out == {shot.camera for shot in shots}:
         raise UserError("every camera is held out, and none is left to train on: name fewer in data.test_cameras")
     if held_out:

@@ -55,8 +55,19 @@ class FrameFiles:
     parsing: dict[int, Path] = field(default_factory=dict)  # class maps that stand in for head and mouth masks
     decode_parsing: Callable[[bytes, Path], np.ndarray] = decode_mask  # to the classes of `face_parsing`
     listings: tuple[Path, ...] = ()  # files that say which image and which tracking belong together
+    paired_by: str = ""  # what says it, where that is not the first listing
     names: KindNames = _NUMBERED_NAMES
     labels: Mapping[str, int] = field(default_factory=dict)  # kinds of label images, and the value that stands for 255
+
+    @property
+    def pairing(self) -> str:
+        """What says which image and which tracking belong together; empty where the offset has to be found."""
+        return self.paired_by or next((path.name for path in self.listings), "")
+
+    @cached_property
+    def is_one_folder(self) -> bool:
+        """Whether the images lie in one folder, so that numbers which are missing are missing frames."""
+        return len({path.parent for path in self.images.values()}) == 1
 
     @cached_property
     def is_transparent(self) -> bool:
@@ -109,7 +120,7 @@ class FrameFiles:
 
     def frame_names(self) -> dict[int, str]:
         """The images' stems; with their folders where images lie in several, as the same stem may come twice."""
-        if len({path.parent for path in self.images.values()}) == 1:
+        if self.is_one_folder:
             return {number: path.stem for number, path in self.images.items()}
         inside = {number: path.relative_to(self.folder) for number, path in self.images.items()}
         return {number: "_".join(path.with_suffix("").parts) for number, path in inside.items()}
@@ -137,11 +148,11 @@ def find_frame_files(
         alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES, complain) or transparent(images),
         head_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_neckhead"),
         mouth_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_mouth"),
-        tracking=_find_tracking(folder, tracking, complain),
+        tracking=find_tracking(folder, tracking, complain),
     )
 
 
-def find_numbered(folder: Path, complain: Callable[[str], object]) -> dict[int, Path]:
+def find_numbered(folder: Path, complain: Callable[[str], object] = refuse) -> dict[int, Path]:
     """The pictures of a folder by the number at the end of their names; `complain` as in `find_frame_files`."""
     return _numbered(folder, IMAGE_SUFFIXES, complain)
 
@@ -158,7 +169,10 @@ def transparent(images: Mapping[int, Path]) -> dict[int, Path]:
     return {}
 
 
-def _find_tracking(folder: Path, given: Path | None, complain: Callable[[str], object]) -> dict[int, Path]:
+def find_tracking(
+    folder: Path, given: Path | None = None, complain: Callable[[str], object] = refuse
+) -> dict[int, Path]:
+    """metrical-tracker's files by number, of `folder` or of the folder that is given; `complain` as above."""
     if given is None:
         found = _numbered(folder / "checkpoint", (".frame",), complain)
         if not found:

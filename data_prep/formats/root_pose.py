@@ -31,6 +31,7 @@ class RootJoint:
 
     def __init__(self, head: HeadAssets) -> None:
         regressor = head.joint_regressor[0].double()
+        self.num_vertices = head.num_vertices
         self._rest = (regressor @ head.template.double()).numpy()
         self._regressor = regressor.numpy()
         self._identity = np.einsum("v,vcs->cs", regressor.numpy(), head.shape_dirs.double().numpy())
@@ -46,7 +47,7 @@ class RootJoint:
         S, E = (min(a.shape[1], len(b)) for a, b in ((self._identity, identity), (self._expression, expression)))
         joint = self._rest + self._identity[:, :S] @ identity[:S] + self._expression[:, :E] @ expression[:E]
         if static_offset is not None:
-            joint = joint + self._regressor @ static_offset[: len(self._regressor)]
+            joint = joint + self._regressor @ static_offset[: self.num_vertices]
         return joint
 
 

@@ -40,13 +40,13 @@ class TrackedFolder:
     @property
     def is_paired(self) -> bool:
         """Whether the folder itself says which image belongs to which tracking, under the same number."""
-        return bool(self.files.listings)
+        return bool(self.files.pairing)
 
     def refuse_offset(self, given: int | None) -> None:
         """Raises UserError for an offset that contradicts the folder's own pairing."""
         if self.is_paired and given:
             raise UserError(
-                f"--frame-offset {given}: {self.files.listings[0].name} itself says which image belongs to which "
+                f"--frame-offset {given}: {self.files.pairing} itself says which image belongs to which "
                 "tracking; leave it out"
             )
 

@@ -74,6 +74,8 @@ class ListedFrame:
         if not is_path(value):
             raise UserError(f"{where} is not a path; export the folder again")
         forms = PurePosixPath(value), PureWindowsPath(value)
+        if not all(form.parts for form in forms):
+            raise UserError(f"{where} is {value!r}, which is a folder, not a file; export the folder again")
         # A UNION set of GaussianAvatars' lists frames of the sequences beside it: ../SEQUENCE/images/00000_00.png
         beside = 1 if is_union(self.listing.parent) and forms[0].parts[0] == ".." and len(forms[0].parts) > 2 else 0
         if any(form.root or form.drive or ".." in form.parts[beside:] for form in forms):

@@ -116,7 +116,9 @@ def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint,
         return vector(raw[key], key, count)
 
     expression, shape = values("expr"), values("shape")
-    offset = values("static_offset").reshape(-1, 3) if _has_offset(raw) else None
+    offset = None
+    if "static_offset" in raw and raw["static_offset"].size:
+        offset = _static_offset(values("static_offset"), root.num_vertices, _parameter_file(frame).name)
     R_cam_world, t_cam_world = _opencv_pose(frame)
     R, t = camera_of_head(
         R_cam_world,
@@ -141,12 +143,17 @@ def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint,
     )
 
 
-def _has_offset(raw: dict[str, np.ndarray]) -> bool:
-    if "static_offset" not in raw or raw["static_offset"].size == 0:
-        return False
-    if raw["static_offset"].size % 3:
-        raise BadFrame(f"static_offset has {raw['static_offset'].size} values, not three for each vertex")
-    return True
+def _static_offset(values: np.ndarray, vertices: int, file: str) -> np.ndarray:
+    """[at least `vertices`, 3]; the tracker's head may have teeth after the vertices of the head model."""
+    if len(values) % 3:
+        raise BadFrame(f"static_offset in {file} has {len(values)} values, not three for each vertex")
+    given = len(values) // 3
+    if not vertices <= given < 2 * vertices:
+        raise BadFrame(
+            f"static_offset in {file} has {given} vertices and the head model {vertices}; give --head the model that the "
+            "tracking was made with"
+        )
+    return values.reshape(-1, 3)
 
 
 def _parameters(frame: ListedFrame) -> dict[str, np.ndarray]:

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.errors import UserError
+from data_prep.ffmpeg import STALL_SECONDS
 from data_prep.track.faces.detect import quiet
-from data_prep.track.footage.ffmpeg import STALL_SECONDS
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Footage, Span, View, check_size, whole
 

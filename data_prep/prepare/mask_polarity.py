@@ -110,6 +110,6 @@ def _frames(
                 size = measured_size(pixels.shape[1], pixels.shape[0])
                 masks[kind] = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         if size is not None:
-            own = tracks.get(number) if files.listings else None  # a listing pairs them; else a head hardly moves
+            own = tracks.get(number) if files.pairing else None  # the folder pairs them; else a head hardly moves
             mesh = project(own or tracked[place], *size)
             yield _Frame(number, masks, silhouette(mesh.screen, mesh.skin_faces, *size) > 0)

@@ -108,11 +108,11 @@ def unusable(
 def _count_notes(files: FrameFiles) -> list[str]:
     notes = []
     for kind, found in files.of_kind().items():
-        missing = gaps(found)
+        missing = gaps(found) if files.is_one_folder else []
         if missing:
-            notes.append(f"{kind} skips the numbers {describe_numbers(missing)}")
+            notes.append(f"{files.title(kind)} skips the numbers {describe_numbers(missing)}")
         if kind != "checkpoint" and found and len(found) != len(files.images):
-            notes.append(f"{kind} has {len(found)} files for {len(files.images)} images")
+            notes.append(f"{files.title(kind)} has {len(found)} files for {len(files.images)} images")
     if len(files.tracking) != len(files.images):
         notes.append(f"there are {len(files.images)} images and {len(files.tracking)} tracking frames")
     return notes

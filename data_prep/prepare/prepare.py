@@ -190,7 +190,7 @@ def _find_offset(
     files, given = tracked.files, source.frame_offset
     tracked.refuse_offset(given)
     if tracked.is_paired:
-        return 0, f"images and tracking are paired by {files.listings[0].name}"
+        return 0, f"images and tracking are paired by {files.pairing}"
     if given is not None:
         return given, f"image offset {given}, given with --frame-offset"
     estimate = detect_offset(model, tracks.frames, files, inspection.bad, source.ignore_misfit)

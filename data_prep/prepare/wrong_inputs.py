@@ -10,7 +10,7 @@ from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE
 from avatar.errors import UserError
 from avatar.head.find import candidates
-from data_prep.formats import avatar_track
+from data_prep.formats import avatar_track, nersemble
 from data_prep.formats.transforms import read_json
 
 _PARTS = ("imgs", "images", "image", "frames", "alpha", "parsing", "checkpoint", "flame_param")  # of tracked folders
@@ -33,6 +33,9 @@ def check_folder(folder: Path) -> None:
     if (folder / MANIFEST_FILE).is_file() and (folder / TRACKS_FILE).is_file():
         source = _value(folder / MANIFEST_FILE, lambda raw: raw["source"])
         raise UserError(f"{folder} is a prepared subject; give the tracked folder that it was made from{source}")
+    person = next((place for place in folder.resolve().parents[:2] if nersemble.recognise(place)), None)
+    if person is not None and folder.resolve().is_relative_to(person / nersemble.SEQUENCES):
+        raise UserError(f"{folder} is a part of {person}, whose calibration belongs to it; give {person}")
     if _looks_tracked(folder):
         return
     inside = sorted(path for path in folder.iterdir() if path.is_dir() and _looks_tracked(path))
@@ -55,7 +58,8 @@ def check_folder(folder: Path) -> None:
 
 def _looks_tracked(folder: Path) -> bool:
     has_part = any((folder / name).is_dir() for name in _PARTS)
-    return has_part or avatar_track.recognise(folder) or any(next(folder.glob(name), None) for name in _LISTINGS)
+    has_layout = avatar_track.recognise(folder) or nersemble.recognise(folder)
+    return has_part or has_layout or any(next(folder.glob(name), None) for name in _LISTINGS)
 
 
 def _value(file: Path, get: Callable[[Any], Any]) -> str:

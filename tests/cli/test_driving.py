@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from rig_folder import SEQUENCES, write_listings, write_sequence
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
@@ -62,6 +64,22 @@ def test_a_single_frame_is_not_trained_on(still: Path, tmp_path: Path, capsys: p
     assert main(["check", str(still), "--frame-offset", "1", "--json"]) == 2
     findings = json.loads(capsys.readouterr().out)["findings"]
     assert [one["check"] for one in findings if one["severity"] == "error"] == ["too-few-frames"]
+
+
+def test_one_time_of_several_cameras_drives_and_is_not_trained_on(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = replace(SEQUENCES[0], times=1)
+    folder = write_listings(tmp_path / sequence.name, {None: write_sequence(tmp_path, sequence)})
+    head = ["--head", str(tmp_path / "head_model")]
+    video = tmp_path / "one.mp4"
+    assert main(["reenact", str(run), "--driver", str(folder), "--out", str(video), *head]) == 0
+    assert len(iio.imread(video)) == 1
+    assert "the pictures are of a single time" in capsys.readouterr().out
+    for held_out in ([], ["data.test_cameras=08"], ["data.test_frames=1"]):
+        assert main(["train", str(folder), "--out", str(tmp_path / "run"), *head, *held_out]) == 1
+        assert "3 pictures are all of one time; at least 2 times are needed" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
 def test_the_frame_rate_of_a_video_stays_with_the_avatar(run: Path, tracked_folder: Path) -> None:

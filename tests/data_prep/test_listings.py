@@ -12,6 +12,7 @@ from exports import write_vhap
 from importing import import_folder
 
 from avatar.errors import UserError
+from avatar.head.assets import load_head_assets
 
 Edit = Callable[[dict], object]
 
@@ -110,3 +111,17 @@ def test_a_file_that_is_no_listing(content: bytes, sentence: str, tracked: Path,
     (tmp_path / "folder" / "transforms.json").write_bytes(content)
     with pytest.raises(UserError, match=sentence):
         import_folder(tmp_path / "folder", tracked, tmp_path / "out")
+
+
+@pytest.mark.parametrize("change", [-1, 1000])
+def test_a_static_offset_of_another_head_is_refused(change: int, tracked: Path, tmp_path: Path) -> None:
+    vertices = load_head_assets(tracked / "head_model").num_vertices
+
+    def of_another_head(_: int, values: dict[str, np.ndarray]) -> None:
+        values["static_offset"] = np.zeros((1, vertices + change, 3))
+
+    folder = write_vhap(tracked, tmp_path / "vhap", divided=False, edit=of_another_head)
+    counts = f"static_offset in 00000.npz has {vertices + change} vertices and the head model {vertices}"
+    with pytest.raises(UserError, match=counts) as error:
+        import_folder(folder, tracked, tmp_path / "out")
+    assert "\n" not in str(error.value)

@@ -110,6 +110,17 @@ def test_times_and_cameras_are_held_out(
     assert {*recording.split.train, *recording.split.test} == set(range(len(recording)))
 
 
+def test_a_listing_without_test_frames_holds_out_its_validation_camera(single: Path, tmp_path: Path) -> None:
+    folder = edited(single, tmp_path / "copy", lambda _: None)
+    (folder / "transforms_test.json").unlink()
+    recording = opened(folder, tmp_path / "out")[0].recording
+    train = {recording.names[i] for i in recording.split.train}
+    assert train == {f"{time:05d}_{name}" for time in range(4) for name in ("07", "12")}
+    assert {recording.names[i] for i in recording.split.test} == {f"{time:05d}_08" for time in range(4)}
+    every = opened(folder, tmp_path / "every", test_cameras="none")[0].recording
+    assert {every.time(i) for i in every.split.train} == set(range(3))  # then the last time is tested
+
+
 def test_cameras_are_chosen(single: Path, tmp_path: Path) -> None:
     two, said = opened(single, tmp_path / "two", cameras="8,12")
     assert [camera.name for camera in two.recording.cameras] == ["08", "12"]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from avatar.errors import UserError
 from data_prep.formats.root_pose import rotation_matrix
 from data_prep.formats.transforms import ListedFrame, camera_pose, pinhole, read_listings
 
@@ -28,6 +29,20 @@ def test_validation_is_held_out_where_no_test_is(tmp_path: Path) -> None:
 
 def listed(**values: Any) -> ListedFrame:
     return ListedFrame(Path("transforms.json"), 0, values, {}, None, Path())
+
+
+@pytest.mark.parametrize("folder", ["person", "UNION_person"])
+@pytest.mark.parametrize("name", [".", "./", "./.", ".\\", "/"])
+def test_a_path_that_is_the_folder_itself_is_refused(name: str, folder: str, tmp_path: Path) -> None:
+    (tmp_path / folder).mkdir()
+    frame = {"file_path": "images/1.png", "flame_param_path": name}
+    (tmp_path / folder / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    (read,) = read_listings(tmp_path / folder)
+    with pytest.raises(UserError, match=r"transforms.json: flame_param_path of frame 0 is '.*', which"):
+        read.path("flame_param_path")
+    (tmp_path / folder / "transforms.json").write_text(json.dumps({"frames": [{"file_path": name}]}))
+    with pytest.raises(UserError, match=r"transforms.json: file_path of frame 0 is '.*', which"):
+        read_listings(tmp_path / folder)
 
 
 def test_a_camera_in_the_world_becomes_the_way_from_the_world_to_it() -> None:

@@ -31,12 +31,24 @@ def test_the_choices_of_the_protocols_that_come_with_the_program() -> None:
 def test_frames_are_never_those_of_the_training() -> None:
     by_name = {protocol.name: protocol for protocol in choose_protocols(None)}
     long = Split(tuple(range(500, 2500)), tuple(range(2500, 3000)))
-    assert by_name["hypergaussians"].select(3000, long) == long.test
-    assert by_name["insta350"].select(3000, long) == tuple(range(2650, 3000))
+    assert by_name["hypergaussians"].select(range(3000), long) == long.test
+    assert by_name["insta350"].select(range(3000), long) == tuple(range(2650, 3000))
     short = Split(tuple(range(800)), tuple(range(800, 1000)))
-    assert by_name["insta350"].select(1000, short) == short.test
+    assert by_name["insta350"].select(range(1000), short) == short.test
     tiny = Split((0,), (1,))
-    assert by_name["insta350"].select(2, tiny) == (1,)
+    assert by_name["insta350"].select(range(2), tiny) == (1,)
+
+
+def test_the_last_frames_of_several_cameras_are_the_last_times() -> None:
+    protocol = read_protocol(builtin_protocols()["insta350"])
+    times = [time for time in range(400) for _ in range(3)]  # three cameras
+    split = Split(tuple(i for i in range(1200) if i % 3), tuple(range(0, 1200, 3)))  # one of them is held out
+    assert protocol.select(times, split) == tuple(range(150, 1200, 3))
+    by_camera = [i % 400 for i in range(1200)]  # the pictures of one camera, then those of the next
+    assert protocol.select(by_camera, Split(tuple(range(400)), tuple(range(400, 1200)))) == (
+        *range(450, 800),
+        *range(850, 1200),
+    )
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])

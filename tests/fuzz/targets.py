@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import pickle
 import zipfile
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 from exports import write_imavatar, write_insta, write_vhap
+from nersemble_folder import HEIGHT, TRAINED, WIDTH, write_person
 from own_targets import make_own_targets
 from scipy import sparse
 from small_runs import run_info
@@ -32,8 +34,11 @@ from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import read_drive, write_drive
 from avatar.runs.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info, write_run_info
+from data_prep.formats import nersemble_tracking
 from data_prep.formats.detect import open_tracked_folder
+from data_prep.formats.frame_track import BadFrame
 from data_prep.formats.metrical_tracker import read_tracking
+from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras
 from data_prep.prepare.prepare import prepare
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
@@ -118,6 +123,17 @@ def make_targets(place: Path) -> dict[str, Target]:
     def in_drive(data: bytes) -> bytes:
         return with_member(drive, "R.npy", data)
 
+    person = write_person(place, cameras=[TRAINED], sequences=["EXP-1-head"])
+    cameras = read_cameras(person, {TRAINED: (WIDTH, HEIGHT)})
+    tracked_sequence = next(person.glob("sequences/*/tracking/*.npz"))
+    rotations = tracked_sequence.read_bytes()
+
+    def sequence(path: Path) -> None:
+        tracking = nersemble_tracking.read_tracking(path)
+        for row in range(len(tracking.pictures(6))):
+            with contextlib.suppress(BadFrame):
+                tracking.frame(row, tracking.shape, cameras[TRAINED])
+
     own = place / "own"
     own.mkdir()
     return {
@@ -134,6 +150,17 @@ def make_targets(place: Path) -> dict[str, Target]:
         "VHAP listing": listing("vhap", 2),
         "INSTA listing": listing("insta", 1),
         "IMavatar listing": listing("imavatar", 2),
+        "NeRSemble calibration": Target(
+            [(person / CALIBRATION).read_bytes()],
+            on_disk(person / CALIBRATION, lambda p: read_cameras(p.parents[1], {TRAINED: (WIDTH, HEIGHT)})),
+        ),
+        "NeRSemble tracking": Target([rotations], on_disk(tracked_sequence, sequence), 0.5),
+        "NeRSemble tracking, checksums right": Target(
+            [member(rotations, "rotation_matrices.npy"), member(rotations, "frames.npy")],
+            on_disk(tracked_sequence, sequence),
+            1,
+            lambda d: with_member(rotations, "frames.npy" if len(d) < 300 else "rotation_matrices.npy", d),
+        ),
         "manifest": Target([manifest.read_bytes()], of_copy(place, manifest, prepared, first_frame), 2),
         "tracks": Target([tracks.read_bytes()], of_copy(place, tracks, prepared, first_frame)),
         "checkpoint": Target([checkpoint.read_bytes()], on_disk(place / "x.safetensors", load_checkpoint)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import subprocess
 
-from data_prep.track.footage.ffmpeg import STALL_SECONDS, executable
+from data_prep.ffmpeg import STALL_SECONDS, executable
 
 HDR_TRANSFERS = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
 _NOMINAL_PEAK = 100  # candela per square metre that become white before the shoulder of the curve

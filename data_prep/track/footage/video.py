@@ -11,7 +11,7 @@ from pathlib import Path
 
 from avatar.errors import UserError
 from avatar.files.opening import open_file
-from data_prep.track.footage.ffmpeg import Decoder, Shown, describe, first_picture
+from data_prep.ffmpeg import Decoder, Shown, describe, first_picture, rate_of
 from data_prep.track.footage.source import (
     LAID_OVER_GREY,
     Box,
@@ -28,7 +28,6 @@ from data_prep.track.footage.tone import HDR_TRANSFERS, tone_filters
 _INPUT = re.compile(r"Input #0, (\S+), from")
 _STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\(\w+\))?: (\w+): (.*)")
 _SIZE = re.compile(r", (\d{1,6})x(\d{1,6})\b")
-_RATE = re.compile(r", ([\d.]+)(k?) (fps|tbr)")
 _DURATION = re.compile(r"Duration: (\d+):(\d\d):(\d\d\.\d+)")
 _FOCAL = re.compile(r"focal_?length\.?(?:_in_)?_?35_?mm\w*(?:\.?\w+)*\s*: ([\d.]+)", re.IGNORECASE)
 _TRANSPARENT = re.compile(r"rgba|bgra|argb|abgr|yuva|gbrap|ya8|ya16|pal8")
@@ -143,7 +142,7 @@ def open_video(path: Path) -> Video:
     first, colour = found
     width, height = _square_size(first)
     check_size(path, width, height)
-    duration, rate = _DURATION.search(said), _rate(rest)
+    duration, rate = _DURATION.search(said), rate_of(rest)
     focal = _FOCAL.search(said)
     return Video(
         path=path,
@@ -196,12 +195,6 @@ def _reason(said: str) -> str:
 def _area(rest: str) -> int:
     size = _SIZE.search(rest)
     return int(size[1]) * int(size[2]) if size else 0
-
-
-def _rate(rest: str) -> float | None:
-    rates = {kind: float(value) * (1000 if kilo else 1) for value, kilo, kind in _RATE.findall(rest)}
-    rate = rates.get("fps") or rates.get("tbr")
-    return rate if rate and rate < 1000 else None
 
 
 def _square_size(first: Shown) -> tuple[int, int]:

@@ -80,3 +80,37 @@ def test_a_camera_whose_clock_is_off_is_named(rig: Path, tmp_path: Path) -> None
     check = checked(copied(rig, tmp_path / "copy", behind), cameras="08,07,12")
     (problem,) = found(check, "camera-clock")
     assert "the pictures of camera 07 are 2 frames late" in problem
+
+
+def test_parameters_that_cannot_be_read_are_one_finding(rig: Path, tmp_path: Path) -> None:
+    folder = copied(rig, tmp_path / "copy", lambda _: None)
+    for path in (folder / "flame_param").iterdir():
+        path.write_bytes(path.read_bytes()[:50])
+    check = checked(folder)
+    (problem,) = found(check, "tracking")
+    assert f"cannot be used in {TIMES} frames" in problem and check.status == 2
+
+
+def test_a_static_offset_of_another_head_is_one_finding(rig: Path, tmp_path: Path) -> None:
+    folder = copied(rig, tmp_path / "copy", lambda _: None)
+    for path in (folder / "flame_param").iterdir():
+        np.savez(path, **np.load(path), static_offset=np.zeros((1, 3, 3), np.float32))
+    (problem,) = found(checked(folder), "tracking")
+    assert f"{TIMES} frames" in problem and "static_offset in 00000.npz has 3 vertices" in problem
+
+
+def test_a_pose_that_cannot_be_used_is_found_in_any_camera(rig: Path, tmp_path: Path) -> None:
+    def spoil(entry: dict[str, Any]) -> None:
+        if entry["camera_id"] == "12":
+            entry["transform_matrix"][0][0] = float("nan")
+
+    check = checked(copied(rig, tmp_path / "copy", spoil))
+    (problem,) = found(check, "tracking")
+    assert "camera 12" in problem and "transform_matrix is not finite" in problem and check.status == 2
+
+
+def test_pictures_that_are_not_there_do_not_stop_the_check(rig: Path, tmp_path: Path) -> None:
+    folder = copied(rig, tmp_path / "copy", lambda _: None)
+    for path in (folder / "images").glob("*_0[78].png"):
+        path.unlink()
+    assert checked(folder).status == 2

@@ -11,7 +11,7 @@ import pytest
 from videos import encode
 
 from avatar.errors import UserError
-from data_prep.track.footage import ffmpeg as decoding
+from data_prep import ffmpeg as decoding
 from data_prep.track.footage.source import Span, whole
 from data_prep.track.footage.video import open_video
 

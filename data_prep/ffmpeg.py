@@ -38,6 +38,8 @@ _OF_DAMAGE = re.compile(
     "premature|truncat",
     re.I,
 )
+_RATE = re.compile(r", ([\d.]+)(k?) (fps|tbr)")
+_COUNT = re.compile(rb"^frame=(\d+)$", re.M)
 _COLOUR = re.compile(r"color_range:(\S+) color_space:(\S+) color_primaries:(\S+) color_trc:(\S+)")
 
 
@@ -83,7 +85,25 @@ def describe(path: Path) -> str:
     return done.stderr[:_MAX_SAID].decode(errors="replace")
 
 
-def first_picture(path: Path, stream: int, seek: Sequence[str] = ()) -> tuple[Shown, tuple[str, ...]] | None:
+def rate_of(said: str) -> float | None:
+    """Pictures a second of the stream in the description."""
+    rates = {kind: float(value) * (1000 if kilo else 1) for value, kilo, kind in _RATE.findall(said)}
+    rate = rates.get("fps") or rates.get("tbr")
+    return rate if rate and rate < 1000 else None
+
+
+def count_pictures(path: Path, stream: str) -> int:
+    """Coded pictures of a stream, which is not decoded; 0 where there are none."""
+    counts = ["-map", f"0:{stream}", "-c", "copy", "-f", "null", "-progress", "pipe:1", "-"]
+    command = [executable(), "-hide_banner", "-nostdin", "-nostats", *opening(path), *counts]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=STALL_SECONDS, check=False)
+    except subprocess.TimeoutExpired:
+        return 0
+    return max((int(number) for number in _COUNT.findall(done.stdout)), default=0)
+
+
+def first_picture(path: Path, stream: int | str, seek: Sequence[str] = ()) -> tuple[Shown, tuple[str, ...]] | None:
     """The first picture that can be decoded of a stream and its (range, space, primaries, transfer); None without one."""
     shows = ["-map", f"0:{stream}", "-frames:v", "1", "-vf", "showinfo=checksum=0", "-f", "null", "-"]
     command = [executable(), "-hide_banner", "-nostdin", "-nostats", *seek, *opening(path), *shows]
@@ -112,6 +132,7 @@ def _shown(found: re.Match[str]) -> Shown:
 class Decoder:
     """One run of ffmpeg over one stream. Iterate once; the process ends with the iteration, however that ends.
 
+    `stream` is a number, or "v:0" for the first stream of pictures.
     `filters` come after the place where time and size of a picture are noted; the last must make pictures of
     `width` x `height` pixels. `errors` are ffmpeg's complaints so far, `error_count` how many there were.
     """
@@ -119,7 +140,7 @@ class Decoder:
     def __init__(
         self,
         path: Path,
-        stream: int,
+        stream: int | str,
         width: int,
         height: int,
         *,

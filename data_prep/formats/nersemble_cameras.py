@@ -1,0 +1,87 @@
+"""NeRSemble's calibration, read as data that may be wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from avatar.errors import UserError
+from avatar.files.opening import read_text
+from data_prep.formats.frame_track import BadFrame, nearest_rotation, vector
+
+CALIBRATION = Path("calibration", "camera_params.json")
+_MAX_BYTES = 2**20  # 16 cameras take 6 KB
+
+
+class CalibratedCamera(NamedTuple):
+    R: np.ndarray  # [3, 3] from the world to the camera, OpenCV's axes
+    t: np.ndarray  # [3]
+    intrinsics: np.ndarray  # [4] = fx, fy, cx, cy in pixels
+    size: tuple[int, int]  # width, height of its videos
+
+
+def read_cameras(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str, CalibratedCamera]:
+    """The cameras whose videos have these (width, height), by serial.
+
+    Raises UserError for a serial that is not calibrated, and for values that no camera has.
+    """
+    path = folder / CALIBRATION
+    raw = _read(path)
+    poses, lenses = (raw.get(key) for key in ("world_2_cam", "intrinsics")) if isinstance(raw, dict) else (None, None)
+    if not isinstance(poses, dict) or lenses is None:
+        raise UserError(f"{path} lacks world_2_cam or intrinsics; download it again")
+    cameras: dict[str, CalibratedCamera] = {}
+    for serial, (width, height) in sizes.items():
+        lens = lenses.get(serial) if isinstance(lenses, dict) else lenses  # one for all
+        if serial not in poses or lens is None:
+            raise UserError(
+                f"{path} has nothing on camera {serial}, of which there are videos; leave it out with --cameras"
+            )
+        try:
+            camera = CalibratedCamera(*_pose(poses[serial]), _intrinsics(lens), (width, height))
+        except BadFrame as error:
+            raise UserError(f"{path}: camera {serial}: {error}; download it again") from None
+        cx, cy = camera.intrinsics[2:]
+        if not (0 <= cx <= width and 0 <= cy <= height):
+            raise UserError(
+                f"{path}: the principal point of camera {serial} is at {cx:g}, {cy:g}, but its videos have "
+                f"{width}x{height} pixels; give the videos for which it was calibrated"
+            )
+        cameras[serial] = camera
+    return cameras
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(read_text(path, _MAX_BYTES), object_pairs_hook=_without_repeats)
+    except BadFrame as error:
+        raise UserError(f"{path}: {error}; download it again") from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({error}); download it again") from None
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise BadFrame(f"{next(name for name in names if names.count(name) > 1)} is there twice")
+    return values
+
+
+def _pose(value: Any) -> tuple[np.ndarray, np.ndarray]:
+    matrix = vector(value, "world_2_cam", 16).reshape(4, 4)
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise BadFrame("the last row of world_2_cam is not 0 0 0 1")
+    return nearest_rotation(matrix[:3, :3], "world_2_cam"), matrix[:3, 3]
+
+
+def _intrinsics(value: Any) -> np.ndarray:
+    K = vector(value, "intrinsics", 9).reshape(3, 3)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if fx <= 0 or fy <= 0 or np.abs(K - [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]).max() > 1e-4 * abs(fx):
+        raise BadFrame("intrinsics are not [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")
+    return np.array([fx, fy, cx, cy])
