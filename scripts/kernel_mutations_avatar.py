@@ -68,4 +68,8 @@ AVATAR_MUTATIONS = [
     Mutation(
         "reduce", "the last programs' shares are left out", "range(0, programs, BLOCK)", "range(0, programs - 1, BLOCK)"
     ),
+    # Adam.
+    Mutation("adam", "the mean square is not corrected", "tl.sqrt(v) / tl.sqrt(spread)", "tl.sqrt(v)"),
+    Mutation("adam", "a step that is to do nothing moves", "tl.load(stop) == 0.0", "tl.load(stop) >= 0.0"),
+    Mutation("adam", "the share of the rate is left out", "rate * tl.load(share)", "rate"),
 ]

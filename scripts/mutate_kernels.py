@@ -64,11 +64,13 @@ FUSED = [
 ]
 POSING = ["tests/gpu/test_gpu_pose.py", HOSTILE + "test_the_same_bits_and_whole_bands[posed]"]
 LOSSES = ["tests/gpu/test_gpu_losses.py", HOSTILE + "test_the_same_bits_and_whole_bands[compared]"]
+ADAM = ["tests/gpu/test_gpu_adam.py"]
 # Of a module; of the others SPLATTER.
 TESTS = {
     **dict.fromkeys(("activations", "hyper", "fused", "fused_backward"), FUSED),
     **dict.fromkeys(("huber", "reduce", "ssim"), LOSSES),
     "pose": POSING,
+    "adam": ADAM,
     "composite_features": FEATURES,
 }
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import pytest
 import torch
+from interpreter import DEVICE
 from splat.features import FIELDS, cotangents, draw, everything, with_features
 from splat.scenes import (
     BACKENDS,
@@ -27,6 +28,7 @@ from splat.scenes import (
 from splat.test_splat_reference import OPTIONS
 from torch import Tensor
 
+from avatar.splat import checked_drawings
 from avatar.splat.reference import splat_reference
 from avatar.splat.sh import C0
 from avatar.types import FeatureGaussians, Rendering
@@ -205,7 +207,10 @@ def test_each_output_has_its_own_gradient(output: str, backend: str) -> None:
     _, wanted = everything(SMALL, inputs, backend, *beside_zeros)
     assert (alone["opacities"] != 0).any()
     assert bool(alone["features"].any()) == (output == "image")
-    assert all(torch.equal(alone[name], wanted[name]) for name in alone)
+    if backend == "gpu" and DEVICE.type == "cuda":  # whose compiler may order one kernel's products differently
+        assert_gradients_close(alone, wanted, 1e-6)
+    else:
+        assert all(torch.equal(alone[name], wanted[name]) for name in alone)
 
 
 def test_strided_features_and_cotangents_are_read_as_what_they_show() -> None:
@@ -225,7 +230,8 @@ def test_non_finite_values_are_named_counted_and_located(name: str, value: float
     inputs = with_features(SMALL, 5)
     inputs[name] = inputs[name].clone()
     inputs[name].view(-1)[-1] = value
-    with pytest.raises(ValueError, match=rf"{name} has 1 non-finite of {inputs[name].numel()} values, the first at"):
+    message = rf"{name} has 1 non-finite of {inputs[name].numel()} values, the first at"
+    with checked_drawings(), pytest.raises(ValueError, match=message):
         draw(SMALL, inputs, backend)
 
 
