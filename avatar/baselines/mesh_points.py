@@ -88,7 +88,8 @@ class MeshPoints(nn.Module):
 
     def turns(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 4"]:
         """The rotation of each point's triangle from the neutral to the posed mesh, (w, x, y, z)."""
-        return quaternion_product(frame_quats(vertices[self._faces[self.face]]), self._inverse_frames[self.face])
+        inverse = self._inverse_frames[self.face]
+        return quaternion_product(frame_quats(vertices[self._faces[self.face]]), inverse)
 
     @torch.no_grad()
     def walk(self, carried: Sequence[Float[Tensor, "N 3"]] = ()) -> int:

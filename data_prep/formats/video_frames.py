@@ -156,7 +156,9 @@ def _identity(path: Path) -> list[int | str]:
 
 
 def _stamp(video: WantedVideo) -> str:
-    return json.dumps({"video": _identity(video.path), "facts": video.facts, "pictures": video.pictures})
+    return json.dumps(
+        {"video": _identity(video.path), "facts": video.facts, "pictures": video.pictures}, allow_nan=False
+    )
 
 
 def _noted(folder: Path) -> tuple[list[int | str], VideoFacts, tuple[int, ...]] | None:
