@@ -14,7 +14,7 @@ from avatar.types import Frame
 
 CACHE_BYTES = 2**30  # for decoded frames; what does not fit is decoded again
 BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8
-FRAMES_AHEAD = 3  # decoded ahead of the training step, in one thread
+FRAMES_AHEAD = 3  # decoded ahead of the training step, for each thread
 GPU_WORKERS = 8  # threads that decode for a GPU, which takes frames faster than one can
 
 

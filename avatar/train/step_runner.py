@@ -147,8 +147,11 @@ class StepRunner:
 
     def _ready(self, kind: Kind, step: int, inputs: StepInputs, judge: Judge) -> Replay[StepOutputs] | None:
         """What replays steps like this one, captured if need be; None: the step has to be launched."""
-        if kind in self._captured or self._launched[kind] < WARM:
-            return self._captured.get(kind)
+        if kind in self._captured:
+            self._captured.move_to_end(kind)  # what was used longest ago makes room
+            return self._captured[kind]
+        if self._launched[kind] < WARM:
+            return None
 
         def play(tensors: Mapping[str, Tensor]) -> StepOutputs:
             return train_step(self._state, step, inputs.with_tensors(tensors), judge)

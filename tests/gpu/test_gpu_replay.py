@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -23,7 +26,7 @@ from avatar.train import objective as objective_module
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import choose_perceptual
-from avatar.train.step_runner import StepRunner
+from avatar.train.step_runner import Kind, StepRunner
 from avatar.train.trainer import train
 from avatar.types import Gaussians
 
@@ -107,6 +110,24 @@ def test_steps_with_lpips_of_the_heads_box_are_replayed(
     assert replaying.replayed == 12 - len(replaying._launched)
     assert same == losses
     assert_same(found, expected)
+
+
+def test_the_kind_that_was_used_longest_ago_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    captured: list[object] = []
+
+    def capture(*_: object) -> object:
+        captured.append(object())
+        return captured[-1]
+
+    monkeypatch.setattr(step_runner_module, "Replay", capture)
+    monkeypatch.setattr(step_runner_module, "KEPT", 2)
+    monkeypatch.setattr(step_runner_module, "WARM", 0)
+    runner: Any = StepRunner.__new__(StepRunner)
+    vars(runner).update(_captured=OrderedDict(), _launched=Counter(), _pool=None)
+    often, *seldom = (Kind((40, 40), 0, None, (side, side)) for side in (32, 40, 48))
+    for kind in (often, seldom[0], often, seldom[1], often):
+        assert runner._ready(kind, 0, SimpleNamespace(tensors=dict), lambda *_: None) in captured
+    assert len(captured) == 3 and list(runner._captured) == [seldom[1], often]
 
 
 def test_what_cannot_be_captured_is_launched_and_said(
