@@ -10,20 +10,21 @@ from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu
 from avatar.compute.gpu_functions import gpu_function
-from avatar.config import HYPER_RATE, NETWORK_RATE, OPACITY_RATE, LearningRates, ModelConfig
+from avatar.config import HYPER_RATE, NETWORK_RATE, OPACITY_RATE, ModelConfig, TrainerConfig
 from avatar.gaussians.apply_offsets import apply_offsets
-from avatar.gaussians.base_model import Avatar, Groups
+from avatar.gaussians.base_model import Groups
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.gaussians.encoding import positional_encoding
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.gaussians.latent_grid import latent_grid
 from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
+from avatar.gaussians.uv_avatar import UVAvatar
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams
 
 
-class FlashAvatar(Avatar):
+class FlashAvatar(UVAvatar):
     """FlashAvatar: a network gives each Gaussian its offsets from a point on the posed head."""
 
     heads: ClassVar[type[Any] | None] = None  # made of the numbers of Gaussians and latent values; None: no latents
@@ -78,8 +79,8 @@ class FlashAvatar(Avatar):
     def compose(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
         return apply_offsets(points, *self.base(), offsets)
 
-    def parameter_groups(self, rates: LearningRates) -> Groups:
-        groups = super().parameter_groups(rates)
+    def parameter_groups(self, trainer: TrainerConfig) -> Groups:
+        groups = super().parameter_groups(trainer)
         if self.skull_logits is not None:
             groups["logits"] = [self.opacity_logits, self.skull_logits], OPACITY_RATE
         groups["network"] = list(self.deformation.parameters()), NETWORK_RATE

@@ -21,7 +21,7 @@ from avatar.config import (
 )
 from avatar.config_values import Range
 from avatar.errors import UserError
-from avatar.gaussians.base_model import SH_DEGREE
+from avatar.gaussians.uv_avatar import SH_DEGREE
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
 from avatar.train.objective import perceptual_start

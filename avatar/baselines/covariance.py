@@ -184,7 +184,7 @@ class CovarianceAvatar(FlashAvatar):
     is_fused = False
 
     @classmethod
-    def step_needs(cls, config: ModelConfig, gaussians: int) -> list[Need]:
+    def step_needs(cls, config: ModelConfig, gaussians: int, size: tuple[int, int]) -> list[Need]:
         """Of each head: the factor as a square, and that of the latent's block."""
         squares = sum((m + config.latent_dim) ** 2 + config.latent_dim**2 for m in HEADS.values())
         return [Need("the covariances", 4 * gaussians * squares, "model.uv_size or model.latent_dim")]

@@ -11,14 +11,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from avatar.baselines.mesh_points import MeshPoints
-from avatar.config import HYPER_RATE, LearningRates, ModelConfig, TrainerConfig
+from avatar.config import HYPER_RATE, ModelConfig, TrainerConfig
 from avatar.gaussians.apply_offsets import quaternion_product
-from avatar.gaussians.base_model import Avatar, Groups
+from avatar.gaussians.base_model import Groups
+from avatar.gaussians.uv_avatar import UVAvatar
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams
 
 
-class SplattingAvatar(Avatar):
+class SplattingAvatar(UVAvatar):
     unknown_to_browsers = "points that have left their texel"
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
@@ -37,8 +38,8 @@ class SplattingAvatar(Avatar):
         means, opacities = self.mesh_points.points(vertices), torch.sigmoid(opacity_logits)
         return Gaussians(means, normalize(turned, dim=-1), torch.exp(log_scales), opacities, sh)
 
-    def parameter_groups(self, rates: LearningRates) -> Groups:
-        groups = super().parameter_groups(rates)
+    def parameter_groups(self, trainer: TrainerConfig) -> Groups:
+        groups = super().parameter_groups(trainer)
         groups["places"] = [self.mesh_points.place], HYPER_RATE
         return groups
 

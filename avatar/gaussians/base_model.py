@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from typing import Any, Self
 
@@ -12,62 +12,60 @@ from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.memory import Need
-from avatar.config import OPACITY_RATE, LearningRates, ModelConfig, TrainerConfig
+from avatar.config import ModelConfig, TrainerConfig
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.head_rotation import VALUES, head_rotation_input, learned_turning
-from avatar.gaussians.mesh_embedding import Embedding, knn_scales
-from avatar.gaussians.uv import UVTexels, bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from avatar.head.teeth import with_teeth
 from avatar.splat import splat
-from avatar.types import Camera, Gaussians, HeadParams, Rendering
+from avatar.types import Camera, FeatureGaussians, Frame, Gaussians, HeadParams, Rendering
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
-SH_DEGREE = 3  # of the view-dependent colour
 
 Groups = dict[str, tuple[Sequence[Tensor], float]]  # parameters and their learning rate, by what they are
 
 
 class Avatar(nn.Module):
-    """One person's avatar: Gaussians that are bound to the UV map of a head model.
+    """One person's avatar.
 
-    A model is a subclass. It gives `forward`, makes its parameters in `make_parameters`, and gives of the other methods
-    those in which it differs. `avatar.runs.model_registry` lists the models by name.
+    A model is a subclass. It makes its parameters in `make_parameters`, gives `forward`, `count_gaussians` and `start_from`, and of
+    the other methods those in which it differs. `avatar.runs.model_registry` lists the models by name; most are an
+    `avatar.gaussians.uv_avatar.UVAvatar`.
 
-    With `config.teeth`, `mesh`, which Gaussians are bound to, goes on after the vertices and triangles of `head`; else it
-    is `head`. `to(device)` moves all that drawing needs. `head` and `mesh` stay on the CPU; cameras and head parameters may
-    be on either side.
+    `mesh` is `head`, or goes on after its vertices and triangles. `to(device)` moves all that drawing needs. `head` and
+    `mesh` stay on the CPU; cameras and head parameters may be on either side.
     """
 
     is_fused = False  # whether a GPU has kernels for all that follows the network, in place of torch's own operations
     is_replayable = True  # whether steps, and frames, do the same operations each time
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
+    has_colours = True  # whether each Gaussian has a colour; else `draw` makes colours of features
+    start_frames = 16  # that `start_from` gets, evenly spread over the training frames
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__()
         self.config = config
-        mesh = with_teeth(assets) if config.teeth else assets
-        self.head = HeadModel(assets, identity)
-        self.mesh = self.head if mesh is assets else HeadModel(mesh, identity)
-        self.embedding = Embedding(mesh, self.ordered(bound_texels(assets, mesh, config.uv_size, config.uv_detail)))
-        self.make_parameters(config, assets.num_expressions, len(self))
-        with torch.no_grad():
-            self.log_scales.copy_(torch.log(knn_scales(self.neutral_points()))[:, None])
+        self.head = self.mesh = HeadModel(assets, identity)
+        self.make_parameters(config, assets.num_expressions, self.count_gaussians(config, assets))
         self.register_load_state_dict_post_hook(lambda avatar, _: avatar.after_load())
 
     def __len__(self) -> int:
         """The number of Gaussians."""
-        return len(self.embedding)
+        return len(self.opacity_logits)
+
+    @classmethod
+    def count_gaussians(cls, config: ModelConfig, assets: HeadAssets) -> int:
+        """How many Gaussians an avatar of this head has. Raises ValueError where there would be none."""
+        raise NotImplementedError
 
     def forward(
         self,
         params: HeadParams,
         vertices: Float[Tensor, "V 3"] | None = None,
         rotation: Float[Tensor, "3 3"] | None = None,
-    ) -> Gaussians:
+    ) -> Gaussians | FeatureGaussians:
         """The Gaussians of one frame, world space.
 
         vertices  the head posed by `params` already, metres
@@ -81,8 +79,10 @@ class Avatar(nn.Module):
         self.log_scales = nn.Parameter(torch.zeros(N, 3))
         self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(N, 1))
         self.opacity_logits = nn.Parameter(torch.logit(torch.tensor(config.initial_opacity)).repeat(N))
-        self.sh_dc = nn.Parameter(torch.zeros(N, 1, 3))
-        self.sh_rest = nn.Parameter(torch.zeros(N, (SH_DEGREE + 1) ** 2 - 1, 3))
+
+    def start_from(self, frames: Iterable[Frame], colours: bool) -> None:
+        """Before training: set from training frames what their pictures say; `colours`: colours too."""
+        raise NotImplementedError
 
     def make_network(self, config: ModelConfig, num_expressions: int, out_size: int) -> DeformationMLP:
         """A network that takes `condition`; for `make_parameters`."""
@@ -91,11 +91,6 @@ class Avatar(nn.Module):
             self.turning, condition_size = torch.zeros(VALUES, 9), condition_size + VALUES
             self._turning_on_cpu = self.turning
         return DeformationMLP(encoded_size(), condition_size, out_size, config.mlp_width, config.mlp_layers)
-
-    @staticmethod
-    def ordered(texels: UVTexels) -> UVTexels:
-        """The order of the Gaussians."""
-        return texels
 
     @classmethod
     def shapes(cls, config: ModelConfig, num_expressions: int, gaussians: int) -> dict[str, tuple[int, ...]]:
@@ -112,19 +107,13 @@ class Avatar(nn.Module):
         return gaussians
 
     @classmethod
-    def step_needs(cls, config: ModelConfig, gaussians: int) -> list[Need]:
-        """What a training step takes beside what those of all models take."""
+    def step_needs(cls, config: ModelConfig, gaussians: int, size: tuple[int, int]) -> list[Need]:
+        """What a training step on frames of `size` (width, height) takes beside what those of all models take."""
         return []
 
-    def parameter_groups(self, rates: LearningRates) -> Groups:
+    def parameter_groups(self, trainer: TrainerConfig) -> Groups:
         """Adam's groups of parameters with their learning rates."""
-        return {
-            "colour": ([self.sh_dc], rates.sh_dc),
-            "view-dependent colour": ([self.sh_rest], rates.sh_rest),
-            "logits": ([self.opacity_logits], OPACITY_RATE),
-            "scale": ([self.log_scales], rates.scale),
-            "rotation": ([self.quats], rates.rotation),
-        }
+        raise NotImplementedError
 
     def after_step(self, optimizer: torch.optim.Adam, steps: int, config: TrainerConfig) -> None:
         """Called after `steps` steps. A function of parameters, step and seed, so that a resumed run repeats them."""
@@ -137,23 +126,21 @@ class Avatar(nn.Module):
     def frozen(self) -> Self:
         """A copy for inference, the same to rounding: without gradients, and what never changes is computed once."""
         shared = {id(part): part for part in (self.head, self.mesh)}
-        copy = deepcopy(self, shared | {id(part): other for part, other in self.folded().items()}).requires_grad_(False)
-        base = copy.base()
-        copy.base = lambda: base
-        del copy.sh_dc, copy.sh_rest  # which `base` has in one
-        return copy
+        return deepcopy(self, shared | {id(part): other for part, other in self.folded().items()}).requires_grad_(False)
 
     def folded(self) -> dict[Any, Any]:
         """Parts, and what takes their place in a frozen copy."""
         return {}
 
-    def base(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Quaternions, log-scales, logits of the opacities and colours of the Gaussians that are drawn."""
-        return self.quats, self.log_scales, self.opacity_logits, torch.cat((self.sh_dc, self.sh_rest), dim=1)
-
-    def draw(self, gaussians: Gaussians, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
-        """`splat` with this avatar's blur; `options` as there."""
+    def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
+        """A picture of what `forward` gave; `options` as those of `splat`."""
         return splat(gaussians, camera, background, **{"blur": self.config.blur, **options})
+
+    def training_images(
+        self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], sh_degree: int
+    ) -> list[Float[Tensor, "_ _ 3"]]:
+        """What a training step compares with the frame: the picture, then smaller ones where the model draws any."""
+        return [self.draw(gaussians, camera, background, sh_degree=sh_degree).image]
 
     @property
     def device(self) -> torch.device:
@@ -165,10 +152,6 @@ class Avatar(nn.Module):
             if hasattr(part, "move"):  # it is no module
                 part.move(self.device)
         return self
-
-    def neutral_points(self) -> Float[Tensor, "N 3"]:
-        """Where the Gaussians are bound to the neutral mesh, metres; on the CPU, before the avatar is moved."""
-        return self.embedding.points(self.mesh.neutral_vertices())
 
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
         """The posed mesh where the avatar is, metres, the head model's vertices first; on a GPU without gradients."""

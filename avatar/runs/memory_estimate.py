@@ -12,9 +12,7 @@ from avatar.config import Config, ModelConfig
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES, FRAMES_AHEAD
 from avatar.errors import UserError
 from avatar.gaussians.encoding import encoded_size
-from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
-from avatar.head.teeth import with_teeth
 from avatar.runs.model_registry import MODELS
 
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
@@ -38,9 +36,8 @@ _OTHERS = ("colours and shapes of the Gaussians", "model.uv_size")
 
 def count_gaussians(config: ModelConfig, assets: HeadAssets) -> int:
     """How many Gaussians an avatar of this head has. Raises UserError where the UV raster is too coarse to have any."""
-    mesh = with_teeth(assets) if config.teeth else assets
     try:
-        return len(bound_texels(assets, mesh, config.uv_size, config.uv_detail).face)
+        return MODELS[config.name].count_gaussians(config, assets)
     except ValueError as error:
         raise UserError(f"model.uv_size={config.uv_size} is too small: {error}") from None
 
@@ -71,7 +68,7 @@ def training_needs(
             "model.mlp_width, model.mlp_layers or model.latent_grid",
         ),
         Need("drawing", FLOAT * gaussians * (STEP_FLOATS + 3 * model.latent_dim), "model.uv_size"),
-        *MODELS[model.name].step_needs(model, gaussians),
+        *MODELS[model.name].step_needs(model, gaussians, size),
     ]
     saving = parameter_needs(shapes, SAVING_COPIES, UNPACKING_COPIES)
     return [*lasting, *max(step, saving, key=lambda needs: sum(need.size for need in needs))]

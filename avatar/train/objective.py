@@ -15,7 +15,8 @@ from torch import Tensor
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.gaussians.base_model import SH_DEGREE, Avatar
+from avatar.gaussians.base_model import Avatar
+from avatar.gaussians.uv_avatar import SH_DEGREE
 from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import MIN_SIZE
 from avatar.losses.metrics import SSIM_WINDOW

@@ -25,7 +25,7 @@ def make_optimizer(
     avatar: Avatar, config: TrainerConfig, pose_corrections: PoseCorrections | None = None
 ) -> torch.optim.Adam:
     """Adam with the model's groups of parameters, and that of the pose corrections."""
-    named = list(avatar.parameter_groups(config.learning_rates).values())
+    named = list(avatar.parameter_groups(config).values())
     if pose_corrections is not None:
         named.append(([pose_corrections.moves], config.pose_rate))
     groups: list[dict[str, Any]] = [{"params": params, "lr": rate, "full_lr": rate} for params, rate in named]

@@ -13,6 +13,7 @@ from avatar.compute.interruption import interruption
 from avatar.config import Config
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.motion.rest import find_neutral
@@ -20,7 +21,6 @@ from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw, checked_drawings
 from avatar.train.condition_noise import make_noise
-from avatar.train.init_colours import colour_from_frames
 from avatar.train.log import TrainingLog
 from avatar.train.objective import Objective, PerceptualTerm
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
@@ -55,8 +55,8 @@ def train(
     if resume is not None:
         load_module(avatar, resume.tensors, run)
         start = resume.step
-    elif trainer.initial_colours == "frames":
-        colour_from_frames(avatar, subject, config.data.size)
+    else:
+        start_from_frames(avatar, subject, config)
     recording = subject.recording
     if resume is None:
         avatar.learn_head_rotation(recording.tracks["R"][recording.times(recording.split.train)])
@@ -124,6 +124,13 @@ def train(
         if step > saved:
             save(step)
     return step
+
+
+def start_from_frames(avatar: Avatar, subject: Subject, config: Config) -> None:
+    """Set what the avatar takes from training frames before its first step: `Avatar.start_from`."""
+    chosen = evenly_spread(subject.split.train, avatar.start_frames)
+    frames = (subject.frame(index, config.data.size) for index in chosen)
+    avatar.start_from(frames, colours=config.trainer.initial_colours == "frames")
 
 
 def save_avatar(

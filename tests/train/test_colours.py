@@ -10,12 +10,23 @@ from heads import grid_head, rest_params
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
-from avatar.gaussians.base_model import Avatar
+from avatar.gaussians import seen_colours as colours_module
+from avatar.gaussians.uv_avatar import UVAvatar
+from avatar.data.subject import Subject
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
-from avatar.train import init_colours as colours_module
-from avatar.train.init_colours import colour_from_frames, seen_colours
+from avatar.train.trainer import start_from_frames
 from avatar.types import Camera, Frame
+
+
+def seen_colours(avatar: UVAvatar, frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
+    return colours_module.seen_colours(avatar.mesh, avatar.embedding, frame)
+
+
+def colour_from_frames(avatar: UVAvatar, subject: Subject) -> int:
+    """How many Gaussians got another colour than grey."""
+    start_from_frames(avatar, subject, small_config("trainer.initial_colours=frames"))
+    return int((avatar.sh_dc[:, 0] != 0).any(dim=-1).sum())
 
 
 def test_a_head_of_one_colour_gives_that_colour_where_it_is_seen(tracked_folder: Path) -> None:
@@ -43,7 +54,7 @@ def test_coloured_gaussians_start_closer_to_the_frames(tracked_folder: Path) -> 
     frame = subject.frame(subject.split.train[0])
     truth, seen = seen_colours(avatar, frame)
     before = float((((avatar.sh_dc[:, 0] * C0 + 0.5) - truth).square().sum(-1) * seen).sum().detach())
-    count = colour_from_frames(avatar, subject, None)
+    count = colour_from_frames(avatar, subject)
     after = float((((avatar.sh_dc[:, 0] * C0 + 0.5) - truth).square().sum(-1) * seen).sum().detach())
     assert 0 < count <= len(avatar)
     assert after < 0.5 * before
@@ -57,12 +68,12 @@ def test_first_colours_are_those_of_training_frames(tracked_folder: Path) -> Non
     found = []
     for one in (subject, poisoned(subject)):
         avatar = new_avatar(assets, subject, config)
-        assert colour_from_frames(avatar, one, 24) > 0
+        assert colour_from_frames(avatar, one) > 0
         found.append(avatar.sh_dc)
     assert torch.equal(*found)
 
 
-def two_sheets(apart: float) -> tuple[Avatar, Frame]:
+def two_sheets(apart: float) -> tuple[UVAvatar, Frame]:
     """A flat sheet of 20 x 20 cm that faces the camera at 1 m, and another one `apart` metres behind it, of another colour.
 
     Half of the Gaussians, the first, lie on the front sheet; the picture shows a gradient, so that places differ.
@@ -93,7 +104,7 @@ def two_sheets(apart: float) -> tuple[Avatar, Frame]:
     return avatar, Frame(0, "00000", camera, rest_params(), ramp, ones, ones, ones)
 
 
-def on_back(avatar: Avatar) -> torch.Tensor:
+def on_back(avatar: UVAvatar) -> torch.Tensor:
     return avatar.embedding.corners[:, 0] >= avatar.head.assets.num_vertices // 2
 
 
@@ -145,8 +156,9 @@ def test_several_frames_are_averaged_by_how_well_they_show_a_place(
     N = len(avatar)
     looks = iter([(torch.full((N, 3), 0.2), torch.full((N,), 0.25)), (torch.full((N, 3), 0.6), torch.full((N,), 0.75))])
     monkeypatch.setattr(colours_module, "seen_colours", lambda *_: next(looks))
-    assert colour_from_frames(avatar, subject, None, frames=2) == N
-    torch.testing.assert_close(avatar.sh_dc[:, 0] * C0 + 0.5, torch.full((N, 3), 0.5))
+    mean, shown = colours_module.mean_colours(avatar.mesh, avatar.embedding, [subject.frame(i) for i in (0, 1)])
+    assert bool(shown.all())
+    torch.testing.assert_close(mean, torch.full((N, 3), 0.5))
 
 
 def test_the_matte_and_the_head_mask_are_weights(tracked_folder: Path) -> None:
