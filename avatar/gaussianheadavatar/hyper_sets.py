@@ -24,7 +24,7 @@ from torch.autograd.function import once_differentiable
 
 
 class Attributes(NamedTuple):
-    """What five latents decide; the first four fields go on where the networks' own outputs would."""
+    """What the five latents decide, in the place of the networks' own outputs."""
 
     position: Float[Tensor, "N 3"]
     colour: Float[Tensor, "N C"]
