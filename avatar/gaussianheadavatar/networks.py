@@ -22,7 +22,7 @@ from avatar.gaussians.encoding import encoded_size, positional_encoding
 OCTAVES = 4
 SLOPE = 0.01  # of the leaky ReLU below 0
 ATTRIBUTES = 8  # scale 3, rotation 4, opacity 1
-CHUNK = 16_384  # points whose distances to all landmarks are in memory at a time
+CHUNK = 2048  # points whose distances to all landmarks are computed at a time, in the cache
 
 
 class PointNetwork(nn.Module):
