@@ -1,0 +1,1 @@
+"""Gaussian Head Avatar: a head of free Gaussians with feature colours that a network draws at a larger size."""

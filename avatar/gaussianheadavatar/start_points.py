@@ -1,0 +1,118 @@
+"""Geometry to start from: the surface that the masks of many views leave, points in the mouth, and their first sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from skimage.measure import marching_cubes
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from avatar.gaussians.mesh_embedding import knn_scales
+from avatar.types import Camera
+
+View = tuple[Camera, Tensor]  # and its mask [H, W], 1 inside, of any size
+MOUTH_SIZE = 0.8  # the box reaches so many extents of the lips to both sides of its centre
+JITTER = 1e-3  # of the points' extent, between points that are taken twice
+HALVINGS = 20  # of the search for a voxel's size
+
+
+def visual_hull(
+    views: Sequence[View], low: Float[Tensor, 3], high: Float[Tensor, 3], cells: int = 64, agree: float = 0.9
+) -> Float[Tensor, "M 3"]:
+    """The surface of what lies in the masks of at least the share `agree` of the views that see it; metres.
+
+    The box from `low` to `high`, in the head's own space, is cut into cubes, `cells` along its longest side; what no
+    view sees is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987). Raises ValueError for no
+    views, and where the masks leave nothing.
+    """
+    if not views:
+        raise ValueError("a visual hull needs at least one view")
+    size = float((high - low).max()) / cells
+    counts = torch.ceil((high - low) / size - 1e-4).long().tolist()
+    axes = [low[i] + size * (torch.arange(count) + 0.5) for i, count in enumerate(counts)]
+    places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
+    share = _share_inside(views, places).reshape(counts)
+    if not bool((share > agree).any()):
+        raise ValueError(f"no place in the box lies in the masks of {agree:.0%} of the views")
+    # A layer outside of the box closes the surface.
+    volume = np.pad(share.numpy(), 1)
+    vertices = marching_cubes(volume, level=agree)[0]
+    return low + size * (torch.from_numpy(vertices.astype(np.float32)) - 0.5)
+
+
+def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+    """The masks' mean over the views whose image holds the place; 0 where there is none."""
+    inside, seen = torch.zeros(len(places)), torch.zeros(len(places))
+    for camera, mask in views:
+        x, y, depth = camera.project(places).unbind(-1)
+        place = torch.stack((2.0 * x / camera.width - 1.0, 2.0 * y / camera.height - 1.0), dim=-1)
+        is_seen = (depth > 0) & (place.abs() <= 1.0).all(dim=-1)
+        place = place[is_seen][None, None]
+        values = grid_sample(mask[None, None].float().cpu(), place, padding_mode="border", align_corners=False)
+        inside[is_seen] += values[0, 0, 0]
+        seen += is_seen
+    return inside / seen.clamp(min=1.0)
+
+
+def spread_points(points: Float[Tensor, "M 3"], count: int) -> Float[Tensor, "count 3"]:
+    """`count` of the points, evenly spread and always the same ones: one in each voxel, near its centre.
+
+    More than there are: all of them, then again from the first, moved by a thousandth of their extent. Raises ValueError
+    for no points.
+    """
+    if len(points) == 0:
+        raise ValueError("there are no points to choose from")
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
+    if count > len(points):
+        more = points[torch.arange(count - len(points)) % len(points)]
+        moves = torch.rand(more.shape, generator=torch.Generator().manual_seed(0)) - 0.5
+        return torch.cat((points, more + JITTER * extent * moves.to(points)))
+    cloud = points.detach().cpu().double().numpy()
+    cloud = (cloud - cloud.min(axis=0)) / (extent or 1.0)
+    chosen, small, large = np.arange(len(cloud)), 0.0, 2.0  # the voxels' size, of the extent
+    for _ in range(HALVINGS):
+        middle = 0.5 * (small + large)
+        candidates = _one_in_each_voxel(cloud, middle)
+        if len(candidates) < count:
+            large = middle
+        else:
+            small, chosen = middle, candidates
+    # The surplus is small; where points coincide, it is all of them.
+    kept = chosen[np.arange(count) * len(chosen) // max(count, 1)]
+    return points[torch.from_numpy(kept).to(points.device)]
+
+
+def _one_in_each_voxel(cloud: NDArray[np.float64], size: float) -> NDArray[np.int64]:
+    """Of each voxel that holds points in [0, 1], the one nearest to its centre, in the order of the voxels."""
+    scaled = cloud / size
+    voxels = np.floor(scaled)
+    x, y, z = voxels.astype(np.int64).T
+    along = int(voxels.max()) + 1  # at most 2^(HALVINGS - 1) + 1, so that its cube fits
+    order = np.argsort(np.square(scaled - voxels - 0.5).sum(axis=1), kind="stable")
+    return order[np.unique(((x * along + y) * along + z)[order], return_index=True)[1]]
+
+
+def mouth_box(lips: Float[Tensor, "L 3"], count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+    """Points at random in a box around the lips, which reaches 0.8 of their extent to both sides of its centre.
+
+    The centre is that of the lips' extent, but in depth it is at their back, the smallest z.
+    """
+    low, high = lips.amin(dim=0), lips.amax(dim=0)
+    centre = torch.cat((0.5 * (low + high)[:2], low[2:]))
+    random = 2.0 * torch.rand((count, 3), generator=generator).to(lips) - 1.0
+    return centre + MOUTH_SIZE * (high - low) * random
+
+
+def landmarks(vertices: Float[Tensor, "V 3"], face: Int[Tensor, " K"], count: int = 424) -> Float[Tensor, "count 3"]:
+    """Evenly spread vertices of the face, whose indices `face` holds: what `nearness` measures distances to."""
+    return spread_points(vertices[face], count)
+
+
+def knn_log_scales(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """The logarithm of the root mean squared distance to the three nearest neighbours, for all three axes; metres."""
+    return knn_scales(points).to(points.device).log()[:, None].repeat(1, 3)
