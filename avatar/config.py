@@ -45,7 +45,16 @@ class ModelConfig:
     """The avatar's architecture; the checkpoint holds it, and it cannot change afterwards."""
 
     name: Annotated[
-        Literal["hypergaussians", "flashavatar", "covariance", "ndgs", "splattingavatar", "monogaussianavatar"],
+        Literal[
+            "hypergaussians",
+            "flashavatar",
+            "covariance",
+            "ndgs",
+            "splattingavatar",
+            "monogaussianavatar",
+            "gaussianheadavatar",
+            "gaussianheadavatar_hyper",
+        ],
         "the method; model=NAME sets it",
     ] = "hypergaussians"
     uv_size: Annotated[int, Range(2, 2048), "texels a side of the UV raster; one Gaussian per covered texel"] = 128
@@ -60,6 +69,9 @@ class ModelConfig:
     blur: Annotated[float, Range(0, 100), "pixels^2 added to both variances of a projected Gaussian"] = 0.05
     skull_binding: Annotated[bool, "learn how far each Gaussian moves with the skull instead of the skin"] = True
     head_rotation: Annotated[bool, "give the network the head's rotation relative to the camera"] = True
+    upsampling: Annotated[
+        Literal[1, 2, 4], "of gaussianheadavatar: how many times larger the picture is than the splatted image"
+    ] = 2
     teeth: Annotated[bool, "add two rows of Gaussians behind the lips that move with skull and jaw"] = True
 
 
@@ -92,11 +104,9 @@ class TrainerConfig:
         Literal["grey", "frames"], "grey, or frames: the mean colour that training frames show at each Gaussian"
     ] = "frames"
     perceptual: Annotated[
-        Literal["auto", "lpips", "dssim", "none"], "perceptual loss; auto: LPIPS if its weights are there, else D-SSIM"
+        Literal["auto", "lpips-squeeze", "lpips-vgg", "lpips-alex", "dssim", "none"],
+        "perceptual loss; auto: LPIPS of SqueezeNet if its weights are there, else D-SSIM",
     ] = "auto"
-    lpips_net: Annotated[Literal["vgg", "alex", "squeeze"], "backbone of the LPIPS loss: vgg, alex or squeeze"] = (
-        "squeeze"
-    )
     sparse_lpips: Annotated[bool, "LPIPS of the head's box in every tenth step; false: of the frame in every step"] = (
         True
     )

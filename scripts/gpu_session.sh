@@ -63,7 +63,7 @@ recipes)
 paper)
   for table in table1 ablation; do
     run "$table" python3 scripts/paper/table.py "$table" "$@" ${HEAD:+--head "$HEAD"} --out "$out/paper" --gpus 0.25 \
-      trainer.perceptual=lpips trainer.lpips_net=squeeze ${EXTRA:-}
+      trainer.perceptual=lpips-squeeze ${EXTRA:-}
   done
   ;;
 *) sed -n '2,9p' "$0"; exit 2 ;;

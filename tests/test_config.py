@@ -21,16 +21,20 @@ from avatar.config import (
 )
 from avatar.config_values import Range
 from avatar.errors import UserError
-from avatar.gaussians.uv_avatar import SH_DEGREE
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
+from avatar.gaussians.uv_avatar import SH_DEGREE
 from avatar.train.objective import perceptual_start
 
 
 def test_the_papers_recipe() -> None:
     config = load_config(["experiment=paper"])
     assert (config.model.latent_grid, config.trainer.initial_colours) == (None, "grey")
-    assert (config.trainer.lr_decay, config.trainer.sparse_lpips, config.trainer.lpips_net) == (False, False, "vgg")
+    assert (config.trainer.lr_decay, config.trainer.sparse_lpips, config.trainer.perceptual) == (
+        False,
+        False,
+        "lpips-vgg",
+    )
     assert (config.model.name, config.model.latent_dim, config.model.uv_size) == ("hypergaussians", 8, 128)
     assert (config.model.mlp_width, config.model.mlp_layers, FREQUENCIES, SH_DEGREE) == (256, 6, 8, 3)
     rates = config.trainer.learning_rates
@@ -87,8 +91,7 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "trainer.learning_rates.rotation": (4e-3, 1e-3),
         "trainer.lr_decay": (True, False),
         "trainer.initial_colours": ("frames", "grey"),
-        "trainer.perceptual": ("auto", "lpips"),
-        "trainer.lpips_net": ("squeeze", "vgg"),
+        "trainer.perceptual": ("auto", "lpips-vgg"),
         "trainer.sparse_lpips": (True, False),
         "trainer.dssim_weight": (0.2, 0.05),
         "trainer.dssim_early": (0.1, 0.0),

@@ -24,6 +24,7 @@ from avatar.pipeline import OK
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
+from avatar.runs.model_registry import refuse_features
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
@@ -41,6 +42,8 @@ def run_export(arguments: Namespace) -> int:
     motion = Path(arguments.motion) if arguments.motion else None
     written = [out, out.with_name(PACK)] if arguments.webcam else [out]
     check_outputs(written, [arguments.run, trained.source, arguments.head, motion])
+    if format in ("ply", "glb"):
+        refuse_features(trained.config.model, f"--format {format}")
     WRITERS[format](trained, out, arguments)
     return OK
 

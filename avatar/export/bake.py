@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 import torch
@@ -10,6 +12,7 @@ from torch import Tensor
 
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import painted, uv_texels
+from avatar.gaussians.uv_avatar import UVAvatar
 from avatar.head.rasterize import rasterize_mesh
 from avatar.head.sample_image import sample_image
 from avatar.motion.orbit import orbited
@@ -86,7 +89,7 @@ def _normals(vertices: Float[Tensor, "V 3"], faces: Tensor) -> Float[Tensor, "F 
 
 def _fill_from_gaussians(trained: TrainedAvatar, texture: np.ndarray, is_known: np.ndarray) -> None:
     """Give texels that nobody has seen the mean colour of the Gaussian of that place."""
-    model = trained.avatar
+    model = cast(UVAvatar, trained.avatar)  # others are refused before
     with torch.no_grad():
         values = (model.sh_dc[:, 0] * C0 + 0.5).clamp(0, 1).numpy()
     coarse, covered = painted(model.embedding.texels, values)

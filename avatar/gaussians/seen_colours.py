@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from avatar.gaussians.mesh_embedding import Embedding
@@ -43,14 +43,28 @@ def seen_colours(
     """The frame's colour at each place on the mesh, and how far the frame shows that place, in [0, 1]."""
     vertices = mesh.vertices(frame.params)
     points = embedding.points(vertices)
-    camera = frame.camera
-    screen = camera.project(points)
     corners = vertices[embedding.corners]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return seen_at(points, normals, vertices, mesh.faces, frame)
+
+
+def seen_at(
+    points: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"],
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    frame: Frame,
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
+    """The frame's colour at points with these normals (of any length), and how far the frame shows each, in [0, 1].
+
+    vertices, faces  a posed mesh that hides what is behind it, metres
+    """
+    camera = frame.camera
+    screen = camera.project(points)
     eye = -camera.R_cam_world.T @ camera.t_cam_world
     facing = torch.nn.functional.cosine_similarity(normals, eye - points, dim=-1).clamp(min=0)
 
-    raster = rasterize_mesh(camera.project(vertices).numpy(), mesh.faces.numpy(), camera.height, camera.width)
+    raster = rasterize_mesh(camera.project(vertices).numpy(), faces.numpy(), camera.height, camera.width)
     surface = torch.from_numpy(raster.depth).where(torch.from_numpy(raster.face_id) >= 0, torch.inf)
     nearest = sample_image(surface[..., None], screen, "nearest")[:, 0]  # 0 outside the image: nothing is seen there
     in_front = (screen[:, 2] > 0) & (screen[:, 2] <= nearest + DEPTH_TOLERANCE)

@@ -15,6 +15,7 @@ from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import FIRST_PASSES
 from avatar.pose_refinement.record import frames_csv, sheet, summary
 from avatar.pose_refinement.refine import fingerprint, refine_subject
+from avatar.runs.model_registry import refuse_features
 from avatar.runs.run import Run
 from data_prep.formats.refined import check_target, frame_numbers, write_folder
 
@@ -26,6 +27,7 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     """Write the run's subject with refined tracking to `target`; `device` stands in for the configuration's."""
     check_target(target)
     run.subject.refuse_several_cameras("the refinement of a tracking")
+    refuse_features(run.config.model, "the refinement of a tracking")
     run.avatar.to(choose_device(device or run.config.device, print))
     subject, config = run.subject, run.config
     background = torch.tensor(config.data.background)

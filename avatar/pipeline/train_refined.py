@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.files.lock import locked
 from avatar.files.names import safe_name
@@ -20,6 +21,7 @@ from avatar.pipeline.refine import refine_run
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Pace, Plan, steps_in_time
 from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
+from avatar.runs.model_registry import refuse_features
 from avatar.runs.run import RUN_FILE
 
 
@@ -27,6 +29,7 @@ def begin_rounds(
     run: Path, rounds: int, minutes: float | None, source: Source, overrides: list[str], begin: float
 ) -> int:
     """The minutes are counted from `begin` on, of `time.monotonic`: they include the tracking of a video."""
+    refuse_features(load_config(overrides).model, "--refine")
     iterations, in_rounds = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
     plan = Plan(rounds, source, tuple(overrides), minutes, iterations, in_rounds, time.monotonic() - begin)
     with locked(run / ROUNDS_FOLDER):

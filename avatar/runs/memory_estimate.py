@@ -94,6 +94,12 @@ def parameter_needs(shapes: Shapes, copies: int, more_of_heads: int = 0) -> list
     """What the parameters take, `copies` times; `more_of_heads`: and the HyperGaussians so many times more."""
     sizes = dict.fromkeys((_NETWORK, _HEADS, _OTHERS), 0)
     for name, shape in shapes.items():
-        part = _NETWORK if name.startswith("deformation.") else _HEADS if name.startswith("hyper.") else _OTHERS
+        part = (
+            _NETWORK
+            if name.startswith(("deformation.", "networks.", "upsampler."))
+            else _HEADS
+            if name.startswith("hyper.")
+            else _OTHERS
+        )
         sizes[part] += FLOAT * math.prod(shape) * (copies + more_of_heads * (part is _HEADS))
     return [Need(what, size, lower) for (what, lower), size in sizes.items()]

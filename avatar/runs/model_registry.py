@@ -10,6 +10,8 @@ from avatar.baselines.monogaussianavatar import MonoGaussianAvatar
 from avatar.baselines.ndgs import NdgsAvatar
 from avatar.baselines.splattingavatar import SplattingAvatar
 from avatar.config import ModelConfig
+from avatar.errors import UserError
+from avatar.gaussianheadavatar.model import GaussianHeadAvatar, HyperGaussianHeadAvatar
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.model import FlashAvatar, HyperGaussianAvatar
@@ -21,7 +23,18 @@ MODELS: dict[str, type[Avatar]] = {
     "ndgs": NdgsAvatar,
     "splattingavatar": SplattingAvatar,
     "monogaussianavatar": MonoGaussianAvatar,
+    "gaussianheadavatar": GaussianHeadAvatar,
+    "gaussianheadavatar_hyper": HyperGaussianHeadAvatar,
 }
+
+
+def refuse_features(config: ModelConfig, what: str) -> None:
+    """Raise UserError for a model whose Gaussians have features in place of colours, which `what` cannot use."""
+    if not MODELS[config.name].has_colours:
+        raise UserError(
+            f"{what} needs Gaussians that have colours, those of model={config.name} have features for a network; train with "
+            "model=hypergaussians"
+        )
 
 
 def make_avatar(assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> Avatar:

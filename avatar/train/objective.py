@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import interpolate, l1_loss
 
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
-from avatar.gaussians.base_model import Avatar
 from avatar.gaussians.uv_avatar import SH_DEGREE
 from avatar.losses.lpips import MissingWeights, load_lpips
-from avatar.losses.lpips_network import MIN_SIZE
+from avatar.losses.lpips_network import MIN_SIZE, Net
 from avatar.losses.metrics import SSIM_WINDOW
 from avatar.losses.photometric import (
     LPIPS_WEIGHT,
@@ -29,7 +29,7 @@ from avatar.losses.photometric import (
     on_head,
     photometric_loss,
 )
-from avatar.types import Camera, Frame, Gaussians
+from avatar.types import Frame
 
 SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part
 PERCEPTUAL_START = 0.5  # share of the steps after which the perceptual term takes part (15,000 of 30,000)
@@ -92,13 +92,15 @@ class Objective:
         image: Float[Tensor, "H W 3"],
         target: Tensor,
         crop: tuple[Tensor, Tensor] | None = None,
+        smaller: Sequence[Float[Tensor, "_ _ 3"]] = (),
     ) -> PhotometricLoss:
-        """`crop`, rows and columns, takes the place of the frame's box of the head."""
+        """`crop`, rows and columns, takes the place of the frame's box of the head. Each of the `smaller` images adds
+        its L1 distance to the target at its size."""
         term = self.term(step)
         function = term and term.function
         if term and term.crops:
             function = partial(term.function, box=frame.head_box, crop=crop)
-        return photometric_loss(
+        loss = photometric_loss(
             image,
             target,
             frame.mouth_mask,
@@ -106,9 +108,15 @@ class Objective:
             perceptual=function,
             perceptual_weight=term.weight if term else 0.0,
         )
+        for other in smaller:
+            distance = l1_loss(other, at_size(target, other))
+            loss = loss._replace(total=loss.total + distance, frame=loss.frame + distance)
+        return loss
 
-    def draw(self, step: int, gaussians: Gaussians, camera: Camera, avatar: Avatar) -> Float[Tensor, "H W 3"]:
-        return avatar.draw(gaussians, camera, self.background, sh_degree=sh_degree(step)).image
+
+def at_size(image: Float[Tensor, "H W 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """`image` at the size of `other`: means over the area of each pixel."""
+    return interpolate(image.permute(2, 0, 1)[None], size=tuple(other.shape[:2]), mode="area")[0].permute(1, 2, 0)
 
 
 def choose_perceptual(
@@ -131,12 +139,13 @@ def choose_perceptual(
         return PerceptualTerm("none")
     in_its_place = Weighted(dssim, config.dssim_weight)
     before = Weighted(dssim, config.dssim_early) if config.dssim_early else None
-    lpips_name = f"lpips-{config.lpips_net}"
-    if config.perceptual in ("lpips", "auto") and recorded in (None, lpips_name):
+    is_auto = config.perceptual == "auto"
+    lpips_name = "lpips-squeeze" if is_auto else config.perceptual
+    if lpips_name.startswith("lpips-") and recorded in (None, lpips_name):
         try:
             if size is not None and min(size) < MIN_SIZE:
                 raise UserError(too_small("LPIPS", MIN_SIZE, size))
-            lpips = load_lpips(config.lpips_net, download=config.perceptual == "lpips").on(device)
+            lpips = load_lpips(cast(Net, lpips_name.removeprefix("lpips-")), download=not is_auto).on(device)
             crops = config.sparse_lpips
             function = on_head(masked_lpips(lpips)) if crops else masked_lpips(lpips)
             every = SPARSE_EVERY if config.sparse_lpips else 1
@@ -144,9 +153,9 @@ def choose_perceptual(
         except UserError as error:
             if recorded is not None:
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
-            if config.perceptual == "lpips":
+            if not is_auto:
                 raise UserError(
-                    f"{error}. This configuration trains with LPIPS (trainer.perceptual=lpips); trainer.perceptual=dssim "
+                    f"{error}. This configuration trains with LPIPS (trainer.perceptual={lpips_name}); trainer.perceptual=dssim "
                     "trains without, and its figures do not compare"
                 ) from None
             said = error.brief if isinstance(error, MissingWeights) else error

@@ -18,7 +18,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.losses.photometric import PhotometricLoss
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
-from avatar.train.objective import Objective
+from avatar.train.objective import Objective, sh_degree
 from avatar.train.pose_corrections import PoseCorrections
 from avatar.types import Frame, HeadParams
 
@@ -98,13 +98,13 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
         camera = state.pose_corrections(camera, inputs.row, inputs.pose_jacobian)
     try:
         gaussians = avatar(params, inputs.vertices, camera.head_rotation.detach())
-        image = objective.draw(step, gaussians, camera, avatar)
+        image, *smaller = avatar.training_images(gaussians, camera, objective.background, sh_degree(step))
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
     crop = None
     if inputs.crop_rows is not None and inputs.crop_columns is not None:
         crop = inputs.crop_rows, inputs.crop_columns
-    loss = objective.loss(step, frame, image, target, crop)
+    loss = objective.loss(step, frame, image, target, crop, smaller)
     state.optimizer.zero_grad()
     loss.total.backward()
     gradients = gradients_of(state)

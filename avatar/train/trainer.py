@@ -103,7 +103,7 @@ def train(
                 outcome = steps.make(step, frame, progress.judge)
                 step += 1
                 progress.note(step, outcome)
-                if step == prune_step(trainer):
+                if avatar.has_colours and step == prune_step(trainer):
                     progress.settle()
                     prune_background_gaussians(avatar, loader, subject.split.train, trainer.prune_share, step)
                 saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations

@@ -51,7 +51,7 @@ def test_frames_under_eleven_pixels_are_refused_before_the_first_step(
 @pytest.mark.usefixtures("weights")
 def test_lpips_on_frames_under_32_pixels_is_refused_by_name_and_replaced_by_itself(wide: Path, tmp_path: Path) -> None:
     options = ("--frame-offset", 1, "--size", 40, *QUICK)
-    output = avatar("train", wide, "--out", tmp_path / "a", *options, "trainer.perceptual=lpips", status=1)
+    output = avatar("train", wide, "--out", tmp_path / "a", *options, "trainer.perceptual=lpips-squeeze", status=1)
     assert "LPIPS needs frames of at least 32x32 pixels, these have 40x22; train with --size 60 or more" in output
     assert not (tmp_path / "a").exists()
     output = avatar("train", wide, "--out", tmp_path / "b", *options)

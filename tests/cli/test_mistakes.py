@@ -61,7 +61,7 @@ MISTAKES = {
         "was tracked with another head model",
     ),
     "LPIPS without weights": (
-        ["train", "{data}", "--frame-offset", "1", "--out", "{tmp}/l", "trainer.perceptual=lpips", *QUICK],
+        ["train", "{data}", "--frame-offset", "1", "--out", "{tmp}/l", "trainer.perceptual=lpips-squeeze", *QUICK],
         "fetch it by other means to",
     ),
 }

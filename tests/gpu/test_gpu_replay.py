@@ -102,7 +102,7 @@ def test_steps_with_lpips_of_the_heads_box_are_replayed(
     lpips = Lpips("squeeze").on(DEVICE)
     monkeypatch.setattr(objective_module, "load_lpips", lambda *_, **__: lpips)
     monkeypatch.setattr(objective_module, "SPARSE_EVERY", 2)
-    tiny = ("data.size=40", "trainer.perceptual=lpips", "trainer.iterations=12", "trainer.checkpoint_every=12")
+    tiny = ("data.size=40", "trainer.perceptual=lpips-squeeze", "trainer.iterations=12", "trainer.checkpoint_every=12")
     expected, _, losses = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, *tiny, warm=99)
     found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, *tiny, warm=1)
     sizes = {kind.crop for kind in replaying._captured if kind.crop}

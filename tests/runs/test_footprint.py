@@ -29,6 +29,8 @@ PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
         ("model=ndgs", "model.latent_dim=5"),
         ("model=splattingavatar",),
         ("model=monogaussianavatar", "model.uv_size=9"),
+        ("model=gaussianheadavatar", "model.upsampling=4"),
+        ("model=gaussianheadavatar_hyper", "model.mlp_width=40", "model.latent_dim=3"),
     ],
 )
 def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, ...]) -> None:

@@ -9,7 +9,7 @@ import torch
 from heads import grid_head, random_params
 from small_runs import small_config
 
-from avatar.config import LearningRates, ModelConfig
+from avatar.config import ModelConfig
 from avatar.runs.model_registry import MODELS, make_avatar
 
 
@@ -19,8 +19,9 @@ def test_the_models_are_those_of_the_configuration() -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_each_parameter_has_one_learning_rate(model: str) -> None:
-    avatar = make_avatar(grid_head(), torch.zeros(3), small_config(f"model={model}").model)
-    groups = avatar.parameter_groups(LearningRates()).values()
+    config = small_config(f"model={model}")
+    avatar = make_avatar(grid_head(), torch.zeros(3), config.model)
+    groups = avatar.parameter_groups(config.trainer).values()
     grouped = [id(parameter) for parameters, rate in groups for parameter in parameters if rate > 0]
     assert sorted(grouped) == sorted(map(id, avatar.parameters()))
 

@@ -10,9 +10,9 @@ from heads import grid_head, rest_params
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
+from avatar.data.subject import Subject
 from avatar.gaussians import seen_colours as colours_module
 from avatar.gaussians.uv_avatar import UVAvatar
-from avatar.data.subject import Subject
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
 from avatar.train.trainer import start_from_frames

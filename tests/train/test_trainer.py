@@ -265,7 +265,7 @@ def test_lpips_by_name_without_weights_fails_before_training(tracked_folder: Pat
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective_module, "load_lpips", _no_weights)
         with pytest.raises(UserError, match="no weights"):
-            train_small(tracked_folder, tmp_path / "run", ["trainer.perceptual=lpips"])
+            train_small(tracked_folder, tmp_path / "run", ["trainer.perceptual=lpips-squeeze"])
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 

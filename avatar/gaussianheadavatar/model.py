@@ -1,0 +1,253 @@
+"""Gaussian Head Avatar: free Gaussians with features, moved and coloured by networks, drawn small and enlarged.
+
+    head parameters -> networks, blended by the distance to the face -> [HyperGaussians] -> Gaussians at rest
+                    -> turned with the neck -> splatted features -> upsampler -> picture
+
+Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
+
+Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. What differs from them is in
+docs/cameras.md: there is no first stage, so `start_from` takes the geometry from mesh and masks, and the first colours
+from the frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle, rotation_matrix_to_quaternion
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, normalize
+
+from avatar.compute.device import to_device
+from avatar.compute.memory import Need
+from avatar.config import ModelConfig, TrainerConfig
+from avatar.gaussianheadavatar.hyper_sets import Attributes, HyperSets
+from avatar.gaussianheadavatar.networks import Blended, Networks, encode, nearness
+from avatar.gaussianheadavatar.start import starting_points
+from avatar.gaussianheadavatar.start_points import landmarks
+from avatar.gaussianheadavatar.upsampler import Upsampler
+from avatar.gaussians.apply_offsets import quaternion_product
+from avatar.gaussians.base_model import CONDITION_EXTRAS, Avatar, Groups
+from avatar.gaussians.uv import bound_texels
+from avatar.head.assets import HeadAssets
+from avatar.head.model import matrix_from_6d, nearest_rotation
+from avatar.splat import splat_features
+from avatar.types import IDENTITY_6D, Camera, FeatureGaussians, Frame, HeadParams, Rendering
+
+FEATURES = 128  # of a point, which networks for colour and shape take
+NEAR, FAR = math.sqrt(0.1), math.sqrt(0.25)  # to the nearest landmark, half head lengths: what follows the expression
+SHIFT, CHANGE = 0.3, 0.2  # factors of the deformation, and of the changes of scale, rotation and opacity
+BEYOND = 2  # one Gaussian beyond the mesh for so many on it
+STEPS = 600_000  # published; with fewer steps all rates are higher, by the root of the ratio
+MOST_BOOST = 10.0
+POINT_RATE, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, NETWORK_RATE = 1e-5, 1e-5, 3e-5, 1e-4, 1e-4
+FIT_STEPS, FIT_POINTS, FIT_RATE = 300, 4096, 1e-3  # of the colour networks to the first colours
+
+
+class GaussianHeadAvatar(Avatar):
+    """`model.mlp_width` is the networks' width, as published 256; a Gaussian has an eighth of it as feature channels.
+    The splatted image is `model.upsampling` times smaller than the picture."""
+
+    is_replayable = False  # each path of the networks runs on the points that it counts for
+    has_colours = False
+    unknown_to_browsers = "its upsampling network"
+    start_frames = 48
+    has_latents = False
+    centre: Tensor  # of the head at rest, metres
+    joint: Tensor  # of its neck, metres
+    places: Tensor  # landmarks, half head lengths from the centre
+    mean_rotation: Tensor  # of the head before the reference camera in training
+
+    def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
+        super().__init__(assets, identity, config)
+        vertices, (joint, turned) = self.head.neutral_vertices(), self.head.neck()
+        skull = vertices[turned > 0.5]
+        low, high = skull.amin(dim=0), skull.amax(dim=0)
+        self.unit = 0.5 * float((high - low)[1])
+        face = assets.regions.get("face", torch.arange(len(vertices)))
+        self.register_buffer("centre", 0.5 * (low + high), persistent=False)
+        self.register_buffer("joint", joint, persistent=False)
+        self.register_buffer("places", (landmarks(vertices, face) - self.centre) / self.unit, persistent=False)
+
+    @classmethod
+    def count_gaussians(cls, config: ModelConfig, assets: HeadAssets) -> int:
+        on_mesh = len(bound_texels(assets, assets, config.uv_size, config.uv_detail).face)
+        return on_mesh + on_mesh // BEYOND
+
+    def make_parameters(self, config: ModelConfig, num_expressions: int, N: int) -> None:
+        super().make_parameters(config, num_expressions, N)
+        channels, latents = channels_of(config), config.latent_dim if self.has_latents else None
+        self.positions = nn.Parameter(torch.zeros(N, 3))  # metres, head at rest
+        self.features = nn.Parameter(torch.zeros(N, FEATURES))
+        theta = num_expressions + CONDITION_EXTRAS
+        self.networks = Networks(theta, 6, config.mlp_width, channels, FEATURES, latents)
+        self.hyper = None if latents is None else HyperSets(N, channels, latents)
+        self.upsampler = Upsampler(channels, config.upsampling)
+        self.register_buffer("mean_rotation", torch.eye(3))
+
+    @torch.no_grad()
+    def start_from(self, frames: Iterable[Frame], colours: bool) -> None:
+        """Put the Gaussians on the mesh, the masks' visual hull and into the mouth. Raises UserError for masks that have
+        nothing in common."""
+        config, shown = self.config, list(frames)
+        texels = bound_texels(self.head.assets, self.head.assets, config.uv_size, config.uv_detail)
+        start = starting_points(self.head, texels, shown, len(self), self.centre, self.unit)
+        self.positions.copy_(start.positions)
+        self.log_scales.copy_(start.log_scales)
+        self.features.copy_(first_features((start.positions - self.centre) / self.unit))
+        first = self.features.new_zeros(len(self), channels_of(config))
+        first[:, :3] = start.colours if colours else 0.5
+        self.start_colours(first, shown)
+
+    def start_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
+        """Fit the colour networks to these, whatever the frame's parameters."""
+        branches = self.networks.expression, self.networks.pose
+        optimizer = torch.optim.Adam([p for b in branches for p in b.colour.parameters()], FIT_RATE)
+        near = self.nearness()
+        for step in range(FIT_STEPS):
+            rows = torch.randint(len(self), (min(FIT_POINTS, len(self)),))
+            params = frames[step % len(frames)].params
+            given = self.condition(params), self.pose(params, None)
+            with torch.enable_grad():
+                places = (self.positions[rows] - self.centre) / self.unit
+                blended = self.networks(places, self.features[rows], *given, near[rows])
+                loss = (blended.colour - colours[rows]).square().mean()
+                optimizer.zero_grad()
+                loss.backward()
+            optimizer.step()
+        self.zero_grad()
+
+    def forward(self, params: HeadParams, vertices=None, rotation=None) -> FeatureGaussians:
+        places = (self.positions - self.centre) / self.unit
+        given = self.condition(params), self.pose(params, rotation)
+        changes = self.attributes(self.networks(places, self.features, *given, self.nearness()))
+        means = self.positions + SHIFT * self.unit * changes.position
+        quats = normalize(self.quats + CHANGE * changes.rotation, dim=-1)
+        scales = torch.exp(self.log_scales + CHANGE * changes.scale)
+        opacities = torch.sigmoid(self.opacity_logits + CHANGE * changes.opacity[:, 0])
+        return FeatureGaussians(*self.turned(means, quats, params.neck), scales, opacities, changes.colour)
+
+    def attributes(self, blended: Blended) -> Attributes:
+        """What the networks change."""
+        scale, rotation, opacity = blended.attributes.split((3, 4, 1), dim=1)
+        return Attributes(blended.deformation, blended.colour, rotation, scale, opacity)
+
+    def nearness(self) -> Float[Tensor, " N"]:
+        """How far each Gaussian follows the expression; the others follow the pose."""
+        return nearness((self.positions.detach() - self.centre) / self.unit, self.places, NEAR, FAR)
+
+    def pose(self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None) -> Float[Tensor, " 6"]:
+        """The pose's input: how the head is turned, against its mean, and the neck, both as axis times angle."""
+        neck = to_device(matrix_from_6d(params.neck), self.device)
+        mean = self.mean_rotation
+        turn = (
+            torch.eye(3, device=self.device) if rotation is None else mean.T @ to_device(rotation.float(), self.device)
+        )
+        return rotation_matrix_to_axis_angle(torch.stack((turn, neck))).flatten()
+
+    def turned(
+        self, means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"], neck: Float[Tensor, 6]
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
+        """All points turned rigidly about the neck's joint."""
+        if neck.is_cpu and tuple(neck.tolist()) == IDENTITY_6D:
+            return means, quats
+        turn = to_device(matrix_from_6d(neck), self.device)
+        turned = quaternion_product(rotation_matrix_to_quaternion(turn).expand_as(quats), quats)
+        return (means - self.joint) @ turn.T + self.joint, turned
+
+    def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
+        return self.enlarged(self.splatted(gaussians, camera, **options), camera, background)
+
+    def training_images(
+        self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], sh_degree: int
+    ) -> list[Float[Tensor, "_ _ 3"]]:
+        """The picture, and the first three channels of the splatted features, which are a small picture."""
+        small = self.splatted(gaussians, camera)
+        rgb = Rendering(small.image[..., :3], small.alpha)
+        return [self.enlarged(small, camera, background).image, over(rgb, background).image]
+
+    def splatted(self, gaussians: FeatureGaussians, camera: Camera, **options: Any) -> Rendering:
+        """The features over white, at the small size."""
+        options.pop("sh_degree", None)  # there is no view-dependent colour
+        white = gaussians.features.new_ones(gaussians.features.shape[1])
+        return splat_features(
+            *gaussians, small_camera(camera, self.config.upsampling), white, blur=self.config.blur, **options
+        )
+
+    def enlarged(self, small: Rendering, camera: Camera, background: Float[Tensor, 3]) -> Rendering:
+        height, width, factor = camera.height, camera.width, self.config.upsampling
+        image = self.upsampler(small.image)[:height, :width]
+        alpha = interpolate(small.alpha[None, None], scale_factor=factor, mode="bilinear")[0, 0, :height, :width]
+        return over(Rendering(image, alpha), background)
+
+    def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:
+        self.mean_rotation.copy_(nearest_rotation(rotations.mean(dim=0)))
+
+    def parameter_groups(self, trainer: TrainerConfig) -> Groups:
+        """The published rates; a training of fewer steps has higher ones."""
+        boost = min(math.sqrt(STEPS / trainer.iterations), MOST_BOOST)
+        networks = [*self.networks.parameters(), *self.upsampler.parameters()]
+        groups: Groups = {
+            "positions": ([self.positions], boost * POINT_RATE * self.unit),
+            "features": ([self.features], boost * POINT_RATE),
+            "logits": ([self.opacity_logits], boost * OPACITY_RATE),
+            "scale": ([self.log_scales], boost * SCALE_RATE),
+            "rotation": ([self.quats], boost * ROTATION_RATE),
+            "network": (networks, boost * NETWORK_RATE),
+        }
+        if self.hyper is not None:
+            groups["heads"] = list(self.hyper.parameters()), boost * NETWORK_RATE
+        return groups
+
+    @classmethod
+    def step_needs(cls, config: ModelConfig, gaussians: int, size: tuple[int, int]) -> list[Need]:
+        """The upsampler's images: at each size four of the width there, with gradients, and what autograd keeps."""
+        pixels, channels = size[0] * size[1] / config.upsampling**2, channels_of(config)
+        stages = range(config.upsampling.bit_length())
+        values = sum(pixels * 4**i * 6 * (4 * channels >> i) for i in stages)
+        networks = gaussians * (10 * config.mlp_width + 2 * FEATURES) * 2
+        return [
+            Need("the upsampler's images", round(4 * values), "--size or model.mlp_width"),
+            Need("the networks' layers", 4 * networks, "model.uv_size or model.mlp_width"),
+        ]
+
+
+class HyperGaussianHeadAvatar(GaussianHeadAvatar):
+    """With HyperGaussians: the networks give five latents, which condition what the networks gave before."""
+
+    has_latents = True
+
+    def attributes(self, blended: Blended) -> Attributes:
+        assert self.hyper is not None
+        return self.hyper(*blended)
+
+    def start_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
+        assert self.hyper is not None
+        self.hyper.start_colour(colours)
+
+
+def channels_of(config: ModelConfig) -> int:
+    return max(config.mlp_width // 8, 4)
+
+
+def first_features(places: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
+    """Random functions of the place: points beside each other have alike features."""
+    codes = encode(places)
+    weights = torch.randn(codes.shape[1], FEATURES, generator=torch.Generator().manual_seed(0)).to(codes)
+    return codes @ weights * codes.shape[1] ** -0.5
+
+
+def small_camera(camera: Camera, factor: int) -> Camera:
+    """The camera of an image `factor` times smaller, with a row and column more where sides are no multiples."""
+    lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
+    return replace(camera, **lens, width=-(-camera.width // factor), height=-(-camera.height // factor))
+
+
+def over(white: Rendering, background: Float[Tensor, 3]) -> Rendering:
+    """What was drawn over white, over another background."""
+    return Rendering(white.image + (1.0 - white.alpha)[..., None] * (background - 1.0), white.alpha)

@@ -1,0 +1,93 @@
+"""Where the Gaussians begin: on the mesh, on the visual hull of the training masks beyond it, and in the mouth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from avatar.errors import UserError
+from avatar.gaussianheadavatar.start_points import knn_log_scales, mouth_box, spread_points, visual_hull
+from avatar.gaussians.mesh_embedding import Embedding
+from avatar.gaussians.seen_colours import mean_colours, seen_at
+from avatar.gaussians.uv import UVTexels
+from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.types import Camera, Frame
+
+REACH = 1.8  # of the hull's box from the head's centre, half head lengths
+APART = 0.004  # metres from the mesh from which the hull counts as beyond it
+MOUTH_SHARE = 0.1  # of the points beyond the mesh
+MOUTH_COLOUR = 0.3  # dark: a mouth's inside
+UNSEEN = 0.5  # grey
+
+
+class Start(NamedTuple):
+    positions: Float[Tensor, "N 3"]  # metres, head at rest
+    log_scales: Float[Tensor, "N 3"]
+    colours: Float[Tensor, "N 3"]  # in [0, 1]
+
+
+def starting_points(
+    head: HeadModel, texels: UVTexels, frames: Sequence[Frame], count: int, centre: Float[Tensor, 3], half: float
+) -> Start:
+    """`count` points, those of `texels` first; `centre` and `half` say where the head is and half its length, metres.
+
+    Raises UserError for masks that leave no common hull.
+    """
+    embedding = Embedding(head.assets, texels)
+    on_mesh = embedding.points(head.neutral_vertices())
+    colours, seen = mean_colours(head, embedding, frames)
+    colours[~seen] = UNSEEN
+    rest = count - len(on_mesh)
+    in_mouth = round(MOUTH_SHARE * rest)
+    hull = beyond_mesh(head, on_mesh, frames, centre, half)
+    outside = spread_points(hull, rest - in_mouth)
+    lips = head.neutral_vertices()[head.assets.regions.get("lips", torch.arange(head.assets.num_vertices))]
+    mouth = mouth_box(lips, in_mouth, torch.Generator().manual_seed(0))
+    positions = torch.cat((on_mesh, outside, mouth))
+    shown = (colours, hull_colours(head, outside, frames, centre), torch.full_like(mouth, MOUTH_COLOUR))
+    return Start(positions, knn_log_scales(positions), torch.cat(shown))
+
+
+def beyond_mesh(
+    head: HeadModel, on_mesh: Float[Tensor, "M 3"], frames: Sequence[Frame], centre: Float[Tensor, 3], half: float
+) -> Float[Tensor, "H 3"]:
+    """Points of the hull that are not on the mesh; all of its points where it is nowhere beyond it."""
+    views = [(at_rest(head, frame), frame.alpha * frame.head_mask) for frame in frames]
+    reach = torch.full((3,), REACH * half)
+    try:
+        hull = visual_hull(views, centre - reach, centre + reach)
+    except ValueError as error:
+        raise UserError(
+            f"the Gaussians have nowhere to start: {error}. The tracking and the masks of the training frames do not "
+            "belong together; run avatar check on the folder"
+        ) from None
+    distance, _ = KDTree(on_mesh.numpy()).query(hull.numpy())
+    beyond = hull[torch.from_numpy(distance) > APART]
+    return beyond if len(beyond) else hull
+
+
+def at_rest(head: HeadModel, frame: Frame) -> Camera:
+    """The camera before which the head at rest stands as the frame's head does, its neck's turn included."""
+    joint, _ = head.neck()
+    turn = matrix_from_6d(frame.params.neck)
+    R, t = frame.camera.R_cam_world, frame.camera.t_cam_world
+    return replace(frame.camera, R_cam_world=R @ turn, t_cam_world=t + R @ (joint - turn @ joint))
+
+
+def hull_colours(
+    head: HeadModel, points: Float[Tensor, "H 3"], frames: Sequence[Frame], centre: Float[Tensor, 3]
+) -> Float[Tensor, "H 3"]:
+    """The mean colour that the frames show at points beyond the mesh; outwards is away from the head's centre."""
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    for frame in frames:
+        still = replace(frame, camera=at_rest(head, frame))
+        pixels, shown = seen_at(points, points - centre, head.neutral_vertices(), head.faces, still)
+        total += pixels * shown[:, None]
+        weight += shown
+    return torch.where(weight[:, None] > 1e-3, total / weight.clamp(min=1e-3)[:, None], torch.tensor(UNSEEN))
