@@ -32,8 +32,8 @@ def refuse_features(config: ModelConfig, what: str) -> None:
     """Raise UserError for a model whose Gaussians have features in place of colours, which `what` cannot use."""
     if not MODELS[config.name].has_colours:
         raise UserError(
-            f"{what} needs Gaussians that have colours, those of model={config.name} have features for a network; train with "
-            "model=hypergaussians"
+            f"{what} needs Gaussians that have colours, those of model={config.name} have features for a network; train "
+            "with model=hypergaussians"
         )
 
 

@@ -155,8 +155,8 @@ def choose_perceptual(
                 raise UserError(f"the run began with LPIPS and cannot go on without it: {error}") from None
             if not is_auto:
                 raise UserError(
-                    f"{error}. This configuration trains with LPIPS (trainer.perceptual={lpips_name}); trainer.perceptual=dssim "
-                    "trains without, and its figures do not compare"
+                    f"{error}. This configuration trains with LPIPS (trainer.perceptual={lpips_name}); "
+                    "trainer.perceptual=dssim trains without, and its figures do not compare"
                 ) from None
             said = error.brief if isinstance(error, MissingWeights) else error
             say(f"Training with D-SSIM in place of LPIPS: {said}")
