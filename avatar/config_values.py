@@ -70,11 +70,11 @@ def _of_type(key: str, value: Any, kind: Any) -> Any:
         return None
     if get_origin(wanted) is tuple:
         return checked_colour(key, value)
-    choices: tuple[str, ...] = get_args(wanted) if get_origin(wanted) is Literal else ()
-    wanted = str if choices else wanted
+    choices: tuple[Any, ...] = get_args(wanted) if get_origin(wanted) is Literal else ()
+    wanted = type(choices[0]) if choices else wanted
     if isinstance(value, wanted) and isinstance(value, bool) == (wanted is bool):
         if choices and value not in choices:
-            raise UserError(f"{key}={shown(value)} is not one of {', '.join(choices)}")
+            raise UserError(f"{key}={shown(value)} is not one of {', '.join(map(str, choices))}")
         return value
     if wanted is str and not choices and isinstance(value, int) and not isinstance(value, bool):
         return str(value)  # a name that is a number

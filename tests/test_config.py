@@ -132,7 +132,7 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("iterations=3", "the nearest is 'trainer.iterations'"),
         (
             "model=flashavtar",
-            "configs/model/ has covariance, flashavatar, hypergaussians, monogaussianavatar, ndgs, splat",
+            "configs/model/ has covariance, flashavatar, gaussianheadavatar, gaussianheadavatar_hyper, hypergaussians, monogaussianavatar, ndgs, splat",
         ),
         ("trainer.iterations=many", "trainer.iterations=many is not valid: it must be a whole number"),
         ("trainer.iterations=1.5", "trainer.iterations=1.5 is not valid: it must be a whole number"),
@@ -148,7 +148,10 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("trainer.dssim_weight=inf", "trainer.dssim_weight=inf is out of range: it must be from 0 to 1000000"),
         ("trainer.dssim_weight=1e400", "trainer.dssim_weight=inf is out of range"),
         (f"trainer.dssim_weight={10**400}", "trainer.dssim_weight=1e+300 is out of range"),
-        ("trainer.perceptual=vgg", "trainer.perceptual=vgg is not one of auto, lpips, dssim, none"),
+        (
+            "trainer.perceptual=vgg",
+            "trainer.perceptual=vgg is not one of auto, lpips-squeeze, lpips-vgg, lpips-alex, dssim, none",
+        ),
         ("trainer.perceptual=null", "trainer.perceptual=null is not valid: it must be a word"),
         ("trainer.learning_rates.scale=-1", "trainer.learning_rates.scale=-1 is out of range: it must be from 0 to 10"),
         ("trainer.learning_rates.scale=nan", "trainer.learning_rates.scale=nan is out of range"),

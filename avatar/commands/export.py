@@ -42,8 +42,6 @@ def run_export(arguments: Namespace) -> int:
     motion = Path(arguments.motion) if arguments.motion else None
     written = [out, out.with_name(PACK)] if arguments.webcam else [out]
     check_outputs(written, [arguments.run, trained.source, arguments.head, motion])
-    if format in ("ply", "glb"):
-        refuse_features(trained.config.model, f"--format {format}")
     WRITERS[format](trained, out, arguments)
     return OK
 
@@ -103,6 +101,7 @@ def write_web_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> N
 
 
 def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    refuse_features(trained.config.model, "--format ply")
     licence = licence_of(NOTHING)
     clip = chosen_clip(trained, arguments)
     if clip is None:
@@ -116,6 +115,7 @@ def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> Non
 
 
 def write_mesh(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
+    refuse_features(trained.config.model, "--format glb")
     licence = licence_of(MESH)
     data, targets = encode_glb(trained, chosen_pose(trained, arguments)[0], arguments.texture or TEXTURE, licence)
     write_atomically(out, data)
