@@ -30,6 +30,10 @@ def lively_avatar(folder: Path, run: Path, *overrides: str, seed: int = 3) -> Tr
         "hyper": 0.02,
         "mesh_points": 0.002,
         "skull_logits": 2.0,
+        "positions": 0.002,
+        "features": 0.1,
+        "networks": 0.02,
+        "upsampler": 0.02,
     }
     with torch.no_grad():
         for name, parameter in trained.avatar.named_parameters():

@@ -52,6 +52,8 @@ def trained_looking(*overrides: str) -> Avatar:
         ("model=ndgs",),
         ("model=splattingavatar",),
         ("model=monogaussianavatar",),
+        ("model=gaussianheadavatar",),
+        ("model=gaussianheadavatar_hyper",),
     ],
     ids=lambda overrides: overrides[0].removeprefix("model"),
 )

@@ -46,6 +46,7 @@ BEYOND = 2  # one Gaussian beyond the mesh for so many on it
 STEPS = 600_000  # published; with fewer steps all rates are higher, by the root of the ratio
 MOST_BOOST = 10.0
 POINT_RATE, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, NETWORK_RATE = 1e-5, 1e-5, 3e-5, 1e-4, 1e-4
+LAYERS = 46  # widths of floats that a Gaussian's networks keep in a step, measured
 FIT_STEPS, FIT_POINTS, FIT_RATE = 300, 4096, 1e-3  # of the colour networks to the first colours
 
 
@@ -210,10 +211,9 @@ class GaussianHeadAvatar(Avatar):
         pixels, channels = size[0] * size[1] / config.upsampling**2, channels_of(config)
         stages = range(config.upsampling.bit_length())
         values = sum(pixels * 4**i * 6 * (4 * channels >> i) for i in stages)
-        networks = gaussians * (10 * config.mlp_width + 2 * FEATURES) * 2
         return [
             Need("the upsampler's images", round(4 * values), "--size or model.mlp_width"),
-            Need("the networks' layers", 4 * networks, "model.uv_size or model.mlp_width"),
+            Need("the networks' layers", 4 * LAYERS * config.mlp_width * gaussians, "model.uv_size or model.mlp_width"),
         ]
 
 

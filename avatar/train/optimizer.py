@@ -78,5 +78,7 @@ def load_optimizer(
         for key, value in own.items():
             if key in state:  # where a GPU's kernels read it
                 state[key].copy_(value)
+            elif value.shape == parameter.shape:  # in the parameter's order in memory, which a fused step relies on
+                state[key] = torch.empty_like(parameter).copy_(value)
             else:
                 state[key] = value.to(parameter.device, copy=True)

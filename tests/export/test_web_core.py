@@ -105,8 +105,8 @@ def test_opacities_that_change_are_refused_in_a_sentence(tracked_folder: Path, t
     assert not (tmp_path / "a.avatar").exists()
 
 
-@pytest.mark.parametrize("model", ["splattingavatar", "monogaussianavatar"])
-def test_points_that_left_their_texel_are_refused_in_a_sentence(
+@pytest.mark.parametrize("model", ["splattingavatar", "monogaussianavatar", "gaussianheadavatar"])
+def test_models_that_the_page_does_not_know_are_refused_in_a_sentence(
     tracked_folder: Path, tmp_path: Path, model: str
 ) -> None:
     trained = lively_avatar(tracked_folder, tmp_path / "run", f"model={model}")

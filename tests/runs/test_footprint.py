@@ -90,8 +90,9 @@ print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
         ("model.mlp_width=1800", "model.mlp_layers=5"),  # the network, likewise
         ("model=covariance", "model.uv_size=200", "model.latent_dim=8"),
         ("model=ndgs", "model.uv_size=160", "model.latent_dim=30"),
+        ("model=gaussianheadavatar_hyper", "model.uv_size=128", "model.mlp_width=256"),
     ],
-    ids=["activations", "heads", "network", "covariances", "n-dimensional"],
+    ids=["activations", "heads", "network", "covariances", "n-dimensional", "features"],
 )
 def test_training_takes_what_is_foretold(overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path) -> None:
     script = MEASURE.format(path=[str(p) for p in (Path(__file__).parents[1], Path(__file__).parents[1] / "data_prep")])

@@ -16,6 +16,7 @@ from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
+from avatar.runs.model_registry import MODELS
 from avatar.train import objective as objective_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import Objective, PerceptualTerm, Weighted, choose_perceptual
@@ -55,9 +56,11 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
         *([f"model={name}"] for name in ("hypergaussians", "flashavatar", "covariance", "ndgs")),
         ["model=splattingavatar"],
         ["model=monogaussianavatar"],
+        ["model=gaussianheadavatar"],
+        ["model=gaussianheadavatar_hyper"],
         PAPER,  # without the grid and the schedules of the default recipe
     ],
-    ids=["hypergaussians", "flashavatar", "covariance", "ndgs", "splattingavatar", "monogaussianavatar", "paper"],
+    ids=[*MODELS, "paper"],
 )
 def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(
     tracked_folder: Path, tmp_path: Path, overrides: Sequence[str]

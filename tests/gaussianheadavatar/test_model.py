@@ -1,0 +1,183 @@
+"""Gaussian Head Avatar as a model: what moves its Gaussians, how they are drawn, and where they start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from heads import grid_head, random_params, rest_params
+from poison import poisoned
+from small_runs import new_avatar, open_small, small_config
+
+from avatar.errors import UserError
+from avatar.gaussianheadavatar.model import GaussianHeadAvatar, small_camera
+from avatar.gaussianheadavatar.start import at_rest
+from avatar.head.model import matrix_from_6d
+from avatar.runs.model_registry import make_avatar
+from avatar.splat import splat_features
+from avatar.train.trainer import start_from_frames
+from avatar.types import Camera
+
+NAMES = ["gaussianheadavatar", "gaussianheadavatar_hyper"]
+CAMERA = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0, 1]), 150, 150, 27, 20, 51, 43)
+WHITE = torch.ones(3)
+
+
+def lively(name: str, *overrides: str) -> GaussianHeadAvatar:
+    """An avatar none of whose parameters is as at the start."""
+    torch.manual_seed(1)
+    avatar = make_avatar(grid_head(), torch.zeros(3), small_config(f"model={name}", *overrides).model)
+    assert isinstance(avatar, GaussianHeadAvatar)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape)
+        avatar.positions *= 2.0
+        avatar.log_scales -= 4.0
+    return avatar
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_parameter_has_a_gradient(name: str) -> None:
+    avatar = lively(name)
+    images = avatar.training_images(avatar(random_params(), None, torch.eye(3)), CAMERA, WHITE, 0)
+    sum((image * torch.rand(image.shape)).sum() for image in images).backward()
+    missing = [n for n, p in avatar.named_parameters() if p.grad is None or not bool(p.grad.any())]
+    assert not missing
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_expression_moves_what_is_near_the_face_alone(name: str) -> None:
+    avatar = lively(name)
+    with torch.no_grad():
+        avatar.positions[: len(avatar) // 2] = avatar.centre + avatar.unit * avatar.places[:1]
+        avatar.positions[len(avatar) // 2 :] += 10.0
+    near = avatar.nearness()
+    assert set(near.tolist()) == {0.0, 1.0}
+    params = random_params()
+    other = replace(params, expression=params.expression + 1.0)
+    moved = (avatar(params).means != avatar(other).means).any(dim=1)
+    assert torch.equal(moved, near > 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_neck_turns_all_gaussians_about_its_joint(name: str) -> None:
+    avatar = lively(name)
+    with torch.no_grad():  # so that the neck is no input of the networks
+        for network in (avatar.networks.pose.deformation, avatar.networks.pose.attributes, avatar.networks.pose.colour):
+            network.layers[0].weight.zero_()
+            network.layers[network.again].weight.zero_()
+    rest = replace(random_params(), neck=rest_params().neck)
+    turned = replace(rest, neck=random_params(3).neck)
+    before, after, R = avatar(rest), avatar(turned), matrix_from_6d(turned.neck)
+    expected = (before.means - avatar.joint) @ R.T + avatar.joint
+    torch.testing.assert_close(after.means, expected, rtol=0, atol=1e-5)
+
+    def covariance(g: object) -> torch.Tensor:
+        from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+        axes = quaternion_to_rotation_matrix(g.quats) * g.scales[:, None, :]  # type: ignore[attr-defined]
+        return axes @ axes.mT
+
+    torch.testing.assert_close(covariance(after), R @ covariance(before) @ R.T, rtol=1e-3, atol=1e-9)
+
+
+def test_a_camera_at_rest_sees_the_turned_head() -> None:
+    avatar = lively("gaussianheadavatar")
+    params = random_params()
+    frame = type("F", (), {"params": params, "camera": CAMERA})()
+    R, joint = matrix_from_6d(params.neck), avatar.joint
+    points = torch.randn(9, 3) * 0.1
+    turned = (points - joint) @ R.T + joint
+    torch.testing.assert_close(at_rest(avatar.head, frame).project(points), CAMERA.project(turned))
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_the_small_image_is_the_cameras_own_and_sides_need_be_no_multiples(factor: int) -> None:
+    avatar = lively("gaussianheadavatar", f"model.upsampling={factor}")
+    gaussians = avatar(random_params())
+    small = small_camera(CAMERA, factor)
+    assert (small.width, small.height) == (-(-51 // factor), -(-43 // factor))
+    points = torch.randn(5, 3) * 0.1
+    torch.testing.assert_close(small.project(points)[:, :2] * factor, CAMERA.project(points)[:, :2])
+    image, rgb = avatar.training_images(gaussians, CAMERA, WHITE, 0)
+    assert image.shape == (43, 51, 3) and rgb.shape == (small.height, small.width, 3)
+    white = torch.ones(gaussians.features.shape[1])
+    reference = splat_features(*gaussians, small, white, backend="reference", blur=avatar.config.blur)
+    torch.testing.assert_close(rgb, reference.image[..., :3], rtol=0, atol=1e-4)
+
+
+def test_another_background_shows_where_the_avatar_is_not() -> None:
+    avatar = lively("gaussianheadavatar")
+    gaussians, other = avatar(random_params()), torch.tensor([0.2, 0.5, 0.9])
+    white, coloured = (avatar.draw(gaussians, CAMERA, colour) for colour in (WHITE, other))
+    torch.testing.assert_close(
+        coloured.image, white.image + (1 - white.alpha)[..., None] * (other - 1.0), rtol=0, atol=1e-6
+    )
+    assert 0.1 < float(white.alpha.detach().mean()) < 1.0
+
+
+def test_the_networks_see_the_heads_turn_against_its_mean() -> None:
+    avatar = lively("gaussianheadavatar")
+    mean = matrix_from_6d(random_params(4).neck)
+    avatar.learn_head_rotation(mean[None])
+    params = rest_params()
+    torch.testing.assert_close(avatar.pose(params, mean), torch.zeros(6), rtol=0, atol=1e-3)
+    torch.testing.assert_close(avatar.pose(params, None), torch.zeros(6), rtol=0, atol=1e-6)
+    half_turn = mean @ torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
+    torch.testing.assert_close(avatar.pose(params, half_turn)[:3].norm(), torch.tensor(torch.pi), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_starts_on_the_mesh_and_on_the_hull_in_the_colours_of_training_frames(
+    name: str, tracked_folder: Path
+) -> None:
+    config = small_config(f"model={name}")
+    _, subject, assets = open_small(tracked_folder, config)
+    found = []
+    for one in (subject, poisoned(subject)):
+        avatar = new_avatar(assets, subject, config)
+        assert isinstance(avatar, GaussianHeadAvatar)
+        start_from_frames(avatar, one, config)
+        found.append(avatar)
+    first, second = found
+    for key, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[key]), f"{key} has seen held-out frames"
+    assert bool(torch.isfinite(first.log_scales).all())
+    frame = subject.frame(subject.split.train[0])
+    screen = frame.camera.project(first(frame.params).means.detach())
+    inside = (screen[:, 0] > 0) & (screen[:, 0] < frame.camera.width)
+    assert float(inside.float().mean()) > 0.9
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_head_of_one_colour_starts_in_that_colour(name: str, tracked_folder: Path) -> None:
+    config = small_config(f"model={name}")
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar, colour = new_avatar(assets, subject, config), torch.tensor([0.8, 0.1, 0.3])
+    frames = [subject.frame(i) for i in subject.split.train[::4]]
+    avatar.start_from([replace(f, image=colour.expand_as(f.image)) for f in frames], True)
+    gaussians = avatar(frames[0].params)
+    screen = frames[0].camera.project(gaussians.means.detach())
+    nearest = screen[:, 2] < screen[:, 2].median()  # the side that faces the camera
+    error = (gaussians.features[nearest, :3] - colour).abs().median()
+    assert float(error) < 0.05
+
+
+def test_masks_that_have_nothing_in_common_get_a_sentence(tracked_folder: Path) -> None:
+    config = small_config("model=gaussianheadavatar")
+    _, subject, assets = open_small(tracked_folder, config)
+    avatar = new_avatar(assets, subject, config)
+    frames = [subject.frame(i) for i in subject.split.train[:4]]
+    with pytest.raises(UserError, match="nowhere to start.*avatar check"):
+        avatar.start_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], True)
+
+
+def test_fewer_steps_have_higher_rates() -> None:
+    avatar = lively("gaussianheadavatar")
+
+    def rate(iterations: int) -> float:
+        return avatar.parameter_groups(small_config(f"trainer.iterations={iterations}").trainer)["network"][1]
+
+    assert rate(600_000) == 1e-4 and rate(150_000) == pytest.approx(2e-4) and rate(10) == pytest.approx(1e-3)
