@@ -30,6 +30,9 @@ run() { # NAME COMMAND...: its output goes to OUT/NAME.log
 }
 self_test='import torch; from avatar.pipeline.self_test import self_test; print(max(self_test(torch.device("cuda", 0)).values()))'
 
+# Jobs side by side: their kernels run at the same time where NVIDIA's MPS is installed.
+case $part in recipes | paper) command -v nvidia-cuda-mps-control >/dev/null && nvidia-cuda-mps-control -d ;; esac
+
 case $part in
 checks)
   run device nvidia-smi

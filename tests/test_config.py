@@ -163,7 +163,7 @@ def test_a_configuration_says_where_it_computes() -> None:
         ("data.background=", "data.background= is not valid: it must be a colour"),
         ("data.background=null", "data.background=null is not valid: it must be a colour"),
         ("preset=fast", "no configuration key 'preset'"),
-        ("experiment=papr", "configs/experiment/ has demo, mlp_256x40, mlp_512x11, paper"),
+        ("experiment=papr", "configs/experiment/ has demo, gha_paper, mlp_256x40, mlp_512x11, paper"),
         ("device=gpu", "device=gpu is not one of auto, cpu, cuda, cuda:N"),
         ("protocol=strict", "no configuration key 'protocol'"),
         ("trainer.learning_rates=1", "no configuration key 'trainer.learning_rates'"),

@@ -6,7 +6,7 @@
 Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
 
 Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. What differs from them is in
-docs/cameras.md: there is no first stage, so `start_from` takes the geometry from mesh and masks, and the first colours
+docs/bench/cameras.md: there is no first stage, so `start_from` takes the geometry from mesh and masks, and the first colours
 from the frames.
 """
 
