@@ -54,6 +54,7 @@ class ModelConfig:
             "monogaussianavatar",
             "gaussianheadavatar",
             "gaussianheadavatar_hyper",
+            "gaussianheadavatar_ndgs",
         ],
         "the method; model=NAME sets it",
     ] = "hypergaussians"

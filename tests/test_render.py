@@ -54,6 +54,7 @@ def trained_looking(*overrides: str) -> Avatar:
         ("model=monogaussianavatar",),
         ("model=gaussianheadavatar",),
         ("model=gaussianheadavatar_hyper",),
+        ("model=gaussianheadavatar_ndgs",),
     ],
     ids=lambda overrides: overrides[0].removeprefix("model"),
 )

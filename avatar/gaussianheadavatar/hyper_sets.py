@@ -31,6 +31,7 @@ class Attributes(NamedTuple):
     rotation: Float[Tensor, "N 4"]
     scale: Float[Tensor, "N 3"]
     opacity: Float[Tensor, "N 1"]
+    density: Float[Tensor, " N"] | None = None  # a factor of the opacity
 
 
 def triangle_rows(triangle: Float[Tensor, "T N"], m: int) -> tuple[Tensor, ...]:

@@ -5,9 +5,9 @@
 
 Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
 
-Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. What differs from them is in
-docs/bench/cameras.md: there is no first stage, so `start_from` takes the geometry from mesh and masks, and the first colours
-from the frames.
+Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. docs/bench/cameras.md lists
+what differs from them: there is no first stage, so `start_from` takes geometry from mesh and masks, and first colours
+from frames.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -23,11 +23,12 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle, rotation_
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize
 
+from avatar.baselines.ndgs import NdGaussians
 from avatar.compute.device import to_device
 from avatar.compute.memory import Need
 from avatar.config import ModelConfig, TrainerConfig
 from avatar.gaussianheadavatar.hyper_sets import Attributes, HyperSets
-from avatar.gaussianheadavatar.networks import Blended, Networks, encode, nearness
+from avatar.gaussianheadavatar.networks import ATTRIBUTES, Blended, Networks, Outputs, encode, nearness
 from avatar.gaussianheadavatar.start import starting_points
 from avatar.gaussianheadavatar.start_points import landmarks
 from avatar.gaussianheadavatar.upsampler import Upsampler
@@ -58,7 +59,7 @@ class GaussianHeadAvatar(Avatar):
     has_colours = False
     unknown_to_browsers = "its upsampling network"
     start_frames = 48
-    has_latents = False
+    hyper_class: ClassVar[type[nn.Module] | None] = None  # made of the numbers of Gaussians, channels and latent values
     centre: Tensor  # of the head at rest, metres
     joint: Tensor  # of its neck, metres
     places: Tensor  # landmarks, half head lengths from the centre
@@ -82,14 +83,19 @@ class GaussianHeadAvatar(Avatar):
 
     def make_parameters(self, config: ModelConfig, num_expressions: int, N: int) -> None:
         super().make_parameters(config, num_expressions, N)
-        channels, latents = channels_of(config), config.latent_dim if self.has_latents else None
+        channels, outputs = channels_of(config), self.outputs(config)
         self.positions = nn.Parameter(torch.zeros(N, 3))  # metres, head at rest
         self.features = nn.Parameter(torch.zeros(N, FEATURES))
         theta = num_expressions + CONDITION_EXTRAS
-        self.networks = Networks(theta, 6, config.mlp_width, channels, FEATURES, latents)
-        self.hyper = None if latents is None else HyperSets(N, channels, latents)
+        self.networks = Networks(theta, 6, config.mlp_width, FEATURES, outputs, bounded=self.hyper_class is None)
+        self.hyper = None if self.hyper_class is None else self.hyper_class(N, channels, config.latent_dim)
         self.upsampler = Upsampler(channels, config.upsampling)
         self.register_buffer("mean_rotation", torch.eye(3))
+
+    @staticmethod
+    def outputs(config: ModelConfig) -> Outputs:
+        """How many values the networks give."""
+        return Outputs(3, channels_of(config), ATTRIBUTES)
 
     @torch.no_grad()
     def start_from(self, frames: Iterable[Frame], colours: bool) -> None:
@@ -131,6 +137,7 @@ class GaussianHeadAvatar(Avatar):
         quats = normalize(self.quats + CHANGE * changes.rotation, dim=-1)
         scales = torch.exp(self.log_scales + CHANGE * changes.scale)
         opacities = torch.sigmoid(self.opacity_logits + CHANGE * changes.opacity[:, 0])
+        opacities = opacities if changes.density is None else opacities * changes.density
         return FeatureGaussians(*self.turned(means, quats, params.neck), scales, opacities, changes.colour)
 
     def attributes(self, blended: Blended) -> Attributes:
@@ -220,15 +227,43 @@ class GaussianHeadAvatar(Avatar):
 class HyperGaussianHeadAvatar(GaussianHeadAvatar):
     """With HyperGaussians: the networks give five latents, which condition what the networks gave before."""
 
-    has_latents = True
+    hyper_class = HyperSets
+
+    @staticmethod
+    def outputs(config: ModelConfig) -> Outputs:
+        n = config.latent_dim
+        return Outputs(n, n, 3 * n)
 
     def attributes(self, blended: Blended) -> Attributes:
-        assert self.hyper is not None
+        assert isinstance(self.hyper, HyperSets)
         return self.hyper(*blended)
 
     def start_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
-        assert self.hyper is not None
+        assert isinstance(self.hyper, HyperSets)
         self.hyper.start_colour(colours)
+
+
+class MovedAndFaded(NdGaussians):
+    """`NdGaussians` for any number of feature channels, which they do not touch."""
+
+    def __init__(self, num_gaussians: int, _: int, latents: int) -> None:
+        super().__init__(num_gaussians, latents)
+
+
+class NdgsHeadAvatar(GaussianHeadAvatar):
+    """With N-dimensional Gaussians, which the latent moves and fades; colours and shapes are the networks' own."""
+
+    hyper_class = MovedAndFaded
+
+    @staticmethod
+    def outputs(config: ModelConfig) -> Outputs:
+        return Outputs(config.latent_dim, channels_of(config), ATTRIBUTES)
+
+    def attributes(self, blended: Blended) -> Attributes:
+        assert self.hyper is not None
+        moved = self.hyper(blended.deformation)
+        own = super().attributes(blended._replace(deformation=moved.position))
+        return own._replace(density=moved.density)
 
 
 def channels_of(config: ModelConfig) -> int:

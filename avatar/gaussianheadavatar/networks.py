@@ -71,6 +71,9 @@ class Outputs(NamedTuple):
     attributes: int
 
 
+PUBLISHED = Outputs(3, 32, ATTRIBUTES)
+
+
 class Branch(nn.Module):
     """Three networks with one condition, a vector that all points share. The sizes are those of their hidden layers."""
 
@@ -102,8 +105,7 @@ class Branch(nn.Module):
 class Networks(nn.Module):
     """The six networks, for an expression of `theta` values, a pose of `beta` and points of `features` values.
 
-    Without `latents` they give a deformation (3, through tanh), a colour (`channels`) and changes of scale, rotation and
-    opacity (8). With `latents` n they give the latents of HyperGaussians: n, n and 3 n (rotation, scale, opacity).
+    `outputs` are how many values they give; `bounded` puts the deformation through tanh.
     """
 
     def __init__(
@@ -111,14 +113,13 @@ class Networks(nn.Module):
         theta: int,
         beta: int = 6,
         width: int = 256,
-        channels: int = 32,
         features: int = 128,
-        latents: int | None = None,
+        outputs: Outputs = PUBLISHED,
+        bounded: bool = True,
     ) -> None:
         super().__init__()
-        half, n = width // 2, latents
-        self.outputs = Outputs(3, channels, ATTRIBUTES) if n is None else Outputs(n, n, 3 * n)
-        last = "tanh" if n is None else None
+        half, self.outputs = width // 2, outputs
+        last = "tanh" if bounded else None
         of_pose = beta // 3 * encoded_size(OCTAVES)
         self.expression = Branch(theta, features, self.outputs, last, (width,) * 5, (width,) * 2, (width,) * 3)
         self.pose = Branch(of_pose, features, self.outputs, last, (width,) * 2, (half,), (half,) * 2)

@@ -11,7 +11,7 @@ from avatar.baselines.ndgs import NdgsAvatar
 from avatar.baselines.splattingavatar import SplattingAvatar
 from avatar.config import ModelConfig
 from avatar.errors import UserError
-from avatar.gaussianheadavatar.model import GaussianHeadAvatar, HyperGaussianHeadAvatar
+from avatar.gaussianheadavatar.model import GaussianHeadAvatar, HyperGaussianHeadAvatar, NdgsHeadAvatar
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.model import FlashAvatar, HyperGaussianAvatar
@@ -25,6 +25,7 @@ MODELS: dict[str, type[Avatar]] = {
     "monogaussianavatar": MonoGaussianAvatar,
     "gaussianheadavatar": GaussianHeadAvatar,
     "gaussianheadavatar_hyper": HyperGaussianHeadAvatar,
+    "gaussianheadavatar_ndgs": NdgsHeadAvatar,
 }
 
 

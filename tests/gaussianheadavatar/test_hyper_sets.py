@@ -63,10 +63,10 @@ def test_at_the_start_all_is_zero_and_only_the_cross_term_and_the_mean_can_move(
     latents = [latent.requires_grad_() for latent in latents_of(5, 8)]
     attributes = sets(*latents)
     sizes = [3, 6, 4, 3, 1]
-    for m, field in zip(sizes, attributes, strict=True):
+    for m, field in zip(sizes, attributes[:5], strict=True):
         assert torch.equal(field, torch.zeros(5, m))
-    sum(field.sum() for field in attributes).backward()
-    for name, m in zip(Attributes._fields, sizes, strict=True):
+    sum(field.sum() for field in attributes[:5]).backward()
+    for name, m in zip(Attributes._fields[:5], sizes, strict=True):
         part = getattr(sets, name)
         assert bool((part.cross.grad != 0).all()) and bool((part.mean.grad[:m] != 0).all())
         assert not bool(part.lower.grad.any()) and not bool(part.mean.grad[m:].any())
@@ -76,7 +76,7 @@ def test_at_the_start_all_is_zero_and_only_the_cross_term_and_the_mean_can_move(
 def test_values_are_counted_as_in_the_paper() -> None:
     """The paper's code keeps L11 as a square; its upper triangle, which nothing reads, is not stored here."""
     sets = HyperSets(10, 32, 8)
-    counts = [sum(p.numel() for p in getattr(sets, name).parameters()) // 10 for name in Attributes._fields]
+    counts = [sum(p.numel() for p in getattr(sets, name).parameters()) // 10 for name in Attributes._fields[:5]]
     assert counts == [41, 824, 54, 41, 18]
     upper = [m * (m - 1) // 2 for m in (3, 32, 4, 3, 1)]
     assert [a + b for a, b in zip(counts, upper, strict=True)] == [44, 1320, 60, 44, 18]
@@ -95,9 +95,11 @@ def test_every_attribute_follows_its_own_latent_and_gaussian() -> None:
         moved = [latent.clone() for latent in latents]
         moved[which][3, column] += 1.0
         after = sets(*moved)
-        changed = {name: bool((a != b).any()) for name, a, b in zip(Attributes._fields, after, before, strict=True)}
+        changed = {
+            name: bool((a != b).any()) for name, a, b in zip(Attributes._fields[:5], after[:5], before[:5], strict=True)
+        }
         assert {name for name, is_changed in changed.items() if is_changed} == names
-        for a, b in zip(after, before, strict=True):
+        for a, b in zip(after[:5], before[:5], strict=True):
             assert torch.equal(a[[0, 1, 2, 4]], b[[0, 1, 2, 4]])
 
 

@@ -20,7 +20,7 @@ from avatar.splat import splat_features
 from avatar.train.trainer import start_from_frames
 from avatar.types import Camera
 
-NAMES = ["gaussianheadavatar", "gaussianheadavatar_hyper"]
+NAMES = ["gaussianheadavatar", "gaussianheadavatar_hyper", "gaussianheadavatar_ndgs"]
 CAMERA = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0, 1]), 150, 150, 27, 20, 51, 43)
 WHITE = torch.ones(3)
 

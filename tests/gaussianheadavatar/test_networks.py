@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from avatar.gaussianheadavatar import networks
-from avatar.gaussianheadavatar.networks import Blended, Networks, PointNetwork, encode, nearness
+from avatar.gaussianheadavatar.networks import Blended, Networks, Outputs, PointNetwork, encode, nearness
 
 
 def small_networks(latents: int | None = None) -> Networks:
-    return Networks(theta=5, width=16, channels=4, features=7, latents=latents).double()
+    outputs = Outputs(3, 4, 8) if latents is None else Outputs(latents, latents, 3 * latents)
+    return Networks(theta=5, width=16, features=7, outputs=outputs, bounded=latents is None).double()
 
 
 def inputs(num: int, near: torch.Tensor | None = None) -> list[torch.Tensor]:

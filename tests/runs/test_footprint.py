@@ -31,6 +31,7 @@ PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
         ("model=monogaussianavatar", "model.uv_size=9"),
         ("model=gaussianheadavatar", "model.upsampling=4"),
         ("model=gaussianheadavatar_hyper", "model.mlp_width=40", "model.latent_dim=3"),
+        ("model=gaussianheadavatar_ndgs",),
     ],
 )
 def test_the_shapes_are_those_of_the_avatar_that_is_made(overrides: tuple[str, ...]) -> None:

@@ -58,6 +58,7 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
         ["model=monogaussianavatar"],
         ["model=gaussianheadavatar"],
         ["model=gaussianheadavatar_hyper"],
+        ["model=gaussianheadavatar_ndgs"],
         PAPER,  # without the grid and the schedules of the default recipe
     ],
     ids=[*MODELS, "paper"],
