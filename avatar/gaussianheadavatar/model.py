@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle, rotation_matrix_to_quaternion
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import interpolate, max_pool2d, normalize
 
 from avatar.baselines.ndgs import NdGaussians
 from avatar.compute.device import to_device
@@ -189,8 +189,11 @@ class GaussianHeadAvatar(Avatar):
 
     def enlarged(self, small: Rendering, camera: Camera, background: Float[Tensor, 3]) -> Rendering:
         height, width, factor = camera.height, camera.width, self.config.upsampling
-        image = self.upsampler(small.image)[:height, :width]
-        alpha = interpolate(small.alpha[None, None], scale_factor=factor, mode="bilinear")[0, 0, :height, :width]
+        alphas = small.alpha[None, None]
+        alpha = interpolate(alphas, scale_factor=factor, mode="bilinear")[0, 0, :height, :width]
+        reached = max_pool2d((alphas > 0).float(), 3, stride=1, padding=1)  # the others show the background
+        reached = interpolate(reached, scale_factor=factor)[0, 0, :height, :width, None] > 0
+        image = torch.where(reached, self.upsampler(small.image)[:height, :width], 1.0)
         return over(Rendering(image, alpha), background)
 
     def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:

@@ -26,8 +26,8 @@ def visual_hull(
 ) -> Float[Tensor, "M 3"]:
     """The surface of what lies in the masks of at least the share `agree` of the views that see it; metres.
 
-    The box from `low` to `high`, in the head's own space, is cut into cubes, `cells` along its longest side; what no
-    view sees is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987). Raises ValueError for no
+    The box from `low` to `high`, in the head's own space, is cut into cubes, `cells` along its longest side; what
+    fewer than half of the views see is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987). Raises ValueError for no
     views, and where the masks leave nothing.
     """
     if not views:
@@ -46,7 +46,7 @@ def visual_hull(
 
 
 def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """The masks' mean over the views whose image holds the place; 0 where there is none."""
+    """The masks' mean over the views whose image holds the place; 0 where these are fewer than half."""
     inside, seen = torch.zeros(len(places)), torch.zeros(len(places))
     for camera, mask in views:
         x, y, depth = camera.project(places).unbind(-1)
@@ -56,7 +56,7 @@ def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[
         values = grid_sample(mask[None, None].float().cpu(), place, padding_mode="border", align_corners=False)
         inside[is_seen] += values[0, 0, 0]
         seen += is_seen
-    return inside / seen.clamp(min=1.0)
+    return torch.where(2.0 * seen >= len(views), inside / seen.clamp(min=1.0), 0.0)
 
 
 def spread_points(points: Float[Tensor, "M 3"], count: int) -> Float[Tensor, "count 3"]:
