@@ -27,8 +27,8 @@ def visual_hull(
     """The surface of what lies in the masks of at least the share `agree` of the views that see it; metres.
 
     The box from `low` to `high`, in the head's own space, is cut into cubes, `cells` along its longest side; what
-    fewer than half of the views see is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987). Raises ValueError for no
-    views, and where the masks leave nothing.
+    fewer than half of the views see is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987).
+    Raises ValueError for no views, and where the masks leave nothing.
     """
     if not views:
         raise ValueError("a visual hull needs at least one view")
