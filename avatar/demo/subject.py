@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from avatar.compute.workers import in_order
 from avatar.demo.head import NUM_EXPRESSION, NUM_IDENTITY, demo_head
 from avatar.demo.head_files import write_head_model
 from avatar.demo.identity import sample_identity
@@ -137,24 +136,12 @@ def rendered(
     renderer: Renderer, performance: Performance, size: int
 ) -> Iterator[tuple[HeadParams, Camera, RenderedFrame]]:
     """Frames in order, rendered a few ahead, by as many threads as there are cores."""
-    threads = os.cpu_count() or 1
 
     def one(frame: int) -> tuple[HeadParams, Camera, RenderedFrame]:
         params, camera = frame_params(performance, frame), frame_camera(performance, frame, size)
         return params, camera, renderer.render(params, camera)
 
-    with ThreadPoolExecutor(threads) as pool:
-        pending: deque[Future] = deque()
-        try:
-            for frame in range(len(performance.jaw)):
-                pending.append(pool.submit(one, frame))
-                if len(pending) > 2 * threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()
+    return in_order(one, range(len(performance.jaw)), os.cpu_count() or 1)
 
 
 def _write_frame(
