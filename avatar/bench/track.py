@@ -57,7 +57,7 @@ class Scale:
     iterations: int
 
 
-USUAL, QUICK = Scale(120, 512, 160, 1000), Scale(20, 192, 48, 20)
+USUAL, QUICK = Scale(120, 512, 160, 1000), Scale(14, 192, 48, 8)
 
 
 @dataclass(frozen=True)
