@@ -15,8 +15,7 @@ from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import available_simd, limited_to
-from avatar.bench.plain import splat_plain
-from avatar.bench.splat_gpu import ON_GPU, device_of, gpu_backends, settle, splat_gsplat
+from avatar.bench.splat_gpu import device_of, gpu_backends, settle, splat_gsplat
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
@@ -34,7 +33,7 @@ OWN_SIZE = 128  # pixels, at most, where a variant with its own cut-offs is comp
 
 @dataclass(frozen=True)
 class Variant:
-    backend: Literal["cpu", "gpu", "gsplat", "plain", "reference"]
+    backend: Literal["cpu", "gpu", "gsplat", "reference"]
     count: int  # splats
     size: int  # pixels, width and height
     threads: int
@@ -104,15 +103,13 @@ def all_variants(
     *,
     count: int = HEAD_SPLATS,
     size: int = 512,
-    plain_sizes: Sequence[int] = (256, 512),
     all_threads: bool = False,
 ) -> list[Variant]:
     """What is measured, by default with all threads and the best instruction set.
 
     Every size with `count` splats and every count at `size`, with one thread and with all; at (`count`, `size`) also the
     numbers of threads between (with `all_threads`), the other instruction sets, other cut-offs, and the float64 reference.
-    The plain splatter draws `count` splats with one thread: its many small operations have little for a second one. Where
-    there is a GPU, every scene is drawn there too.
+    Where there is a GPU, every scene is drawn there too.
     """
     *others, best = available_simd()
     most = torch.get_num_threads()
@@ -125,7 +122,6 @@ def all_variants(
     variants += [Variant("cpu", count, size, most, best, alpha_min=value) for value in OTHER_ALPHA_MINS]
     variants += [Variant("cpu", count, size, most, best, t_min=value) for value in OTHER_T_MINS]
     variants += [Variant(backend, n, s, most, "") for backend in gpu_backends() for n, s in scenes]  # type: ignore[arg-type]
-    variants += [Variant("plain", count, s, 1, "") for s in plain_sizes]
     return [*variants, Variant("reference", count, size, most, "")]
 
 
@@ -207,11 +203,10 @@ def accuracy_of(variant: Variant, gaussians: Gaussians, size: int, truth: Truth)
 
 
 def time_in_turns(variants: Sequence[Variant], gaussians: Gaussians, size: int, repeats: int) -> list[Timing]:
-    """All variants in turns; the plain ones and the reference, seconds long, have three rounds of their own after them."""
-    fast = [v for v in variants if v.backend in ("cpu", *ON_GPU)]
-    slow = [v for v in variants if v not in fast]
+    """All variants in turns; the reference, seconds long, has three rounds of its own after them."""
     times: dict[tuple[Variant, str], Time] = {}
-    for group, rounds in ((fast, repeats), (slow, min(repeats, 3))):
+    for is_slow, rounds in ((False, repeats), (True, min(repeats, 3))):
+        group = [v for v in variants if (v.backend == "reference") == is_slow]
         functions = {
             (variant, name): part for variant in group for name, part in passes_of(variant, gaussians, size).items()
         }
@@ -249,8 +244,6 @@ def draw(variant: Variant, gaussians: Gaussians, size: int) -> Rendering:
     with limited_to(threads=variant.threads, simd=variant.simd):
         if variant.backend == "gsplat":
             return splat_gsplat(gaussians, camera)
-        if variant.backend == "plain":
-            return splat_plain(gaussians, camera, black, alpha_min=variant.alpha_min, t_min=variant.t_min)
         return splat(
             gaussians, camera, black, backend=variant.backend, alpha_min=variant.alpha_min, t_min=variant.t_min
         )

@@ -22,9 +22,7 @@ def run(request: Request) -> None:
     """Measure, print and write; `quick` takes scenes too small to say anything. A GPU is measured beside the CPU."""
     is_left_out = ON_GPU if request.device == "cpu" else ()
     if request.quick:
-        variants = all_variants(
-            QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE, plain_sizes=QUICK_SIZES, all_threads=True
-        )
+        variants = all_variants(QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE, all_threads=True)
         repeats, validation_size = 3, QUICK_SIZE
     else:
         sizes, counts = (FULL_SIZES, FULL_COUNTS) if request.full else (USUAL_SIZES, USUAL_COUNTS)

@@ -57,7 +57,7 @@ class Scale:
     iterations: int
 
 
-USUAL, QUICK = Scale(120, 512, 160, 1000), Scale(20, 192, 48, 20)
+USUAL, QUICK = Scale(120, 512, 160, 1000), Scale(14, 192, 48, 8)
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,10 @@ def as_filmed(folder: Path, request: Request, config: Config) -> Filmed:
     head = find_head(folder, request.head)
     source = Source(folder, head, request.tracking, request.frame_offset)
     truth, assets = open_subject(source, config.data.test_frames)
-    if truth.width % 2 or truth.height % 2:
-        raise UserError(f"{folder} has frames of {truth.width}x{truth.height} pixels; a video's are even both ways")
+    if truth.recording.width % 2 or truth.recording.height % 2:
+        raise UserError(
+            f"{folder} has frames of {truth.recording.width}x{truth.recording.height} pixels; a video's are even both ways"
+        )
     return Filmed(truth, assets, head, (truth.pixels(index).image for index in range(len(truth))))
 
 
@@ -161,7 +163,7 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
     first = tracked_by_landmarks(tracked, filmed.head, own.recording, assets)
     return Result(
         name=truth.name,
-        size=(truth.width, truth.height),
+        size=(truth.recording.width, truth.recording.height),
         frames=len(truth),
         first_vertices=placement(assets, first, truth.recording, pairs),
         vertices=placement(assets, own.recording, truth.recording, pairs),

@@ -20,7 +20,7 @@ def run_prepare(arguments: Namespace) -> int:
     prepared = prepare(source, load_head_assets(source.head), out=arguments.out)
     subject = Subject.open(prepared)
     print(
-        f"{subject.name}: {len(subject)} frames of {subject.width}x{subject.height}, "
+        f"{subject.name}: {len(subject)} frames of {subject.recording.width}x{subject.recording.height}, "
         f"{len(subject.split.train)} to train, {len(subject.split.test)} to test"
     )
     print(f"Prepared in {prepared}")

@@ -82,18 +82,6 @@ class Subject:
         return self.recording.name
 
     @property
-    def fps(self) -> float:
-        return self.recording.fps
-
-    @property
-    def width(self) -> int:
-        return self.recording.width
-
-    @property
-    def height(self) -> int:
-        return self.recording.height
-
-    @property
     def split(self) -> Split:
         return self.recording.split
 

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +14,14 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from avatar.compute.workers import in_order
 from avatar.demo.head import NUM_EXPRESSION, NUM_IDENTITY, demo_head
 from avatar.demo.head_files import write_head_model
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import MOTIONS, Motion, Performance, frame_camera, frame_params, perform
 from avatar.demo.render import RenderedFrame, Renderer
 from avatar.errors import UserError
+from avatar.files.atomic import check_target, whole_folder
 from avatar.types import Camera, HeadParams
 
 MAX_FRAMES, MIN_SIZE, MAX_SIZE = 100_000, 64, 1024
@@ -48,6 +46,7 @@ def make_subject(
     check_arguments(frames, size, seed, motion)
     if not 0.0 <= neutral_bias <= 1.0:
         raise UserError(f"neutral_bias must be from 0 to 1, not {neutral_bias}")
+    check_target(out)
     with whole_folder(out) as folder:
         _write_subject(folder, frames, size, seed, motion, neutral_bias)
     return out
@@ -59,30 +58,10 @@ def make_head_model(out: Path) -> Path:
     Returns `out`. Raises UserError for a folder that is not empty.
     """
     out = Path(out)
+    check_target(out)
     with whole_folder(out) as folder:
         write_head_model(folder, demo_head())
     return out
-
-
-@contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that takes its place when nothing went wrong, and else is removed."""
-    _check_place(out)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise UserError(
-            f"cannot write to {out.parent}: {error.strerror or error}; choose another output folder"
-        ) from error
-    try:
-        yield partial
-        partial.chmod(0o755)
-        partial.replace(out)
-    except OSError as error:
-        raise UserError(f"writing {out} failed: {error.strerror or error}; nothing was left behind") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 class TrackingBias(NamedTuple):
@@ -125,13 +104,6 @@ def check_number(name: str, value: int, low: int, high: int = MAX_FRAMES) -> Non
         raise UserError(f"{name} must be from {low} to {high}, not {value}")
 
 
-def _check_place(out: Path) -> None:
-    if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise UserError(f"{out} exists and is not a folder; choose another output folder")
-    if out.is_dir() and any(out.iterdir()):
-        raise UserError(f"{out} is not empty; choose another output folder or remove it first")
-
-
 def _write_subject(folder: Path, frames: int, size: int, seed: int, motion: Motion, neutral_bias: float) -> None:
     for name in ("imgs", "alpha", "parsing", "checkpoint"):
         (folder / name).mkdir()
@@ -164,24 +136,12 @@ def rendered(
     renderer: Renderer, performance: Performance, size: int
 ) -> Iterator[tuple[HeadParams, Camera, RenderedFrame]]:
     """Frames in order, rendered a few ahead, by as many threads as there are cores."""
-    threads = os.cpu_count() or 1
 
     def one(frame: int) -> tuple[HeadParams, Camera, RenderedFrame]:
         params, camera = frame_params(performance, frame), frame_camera(performance, frame, size)
         return params, camera, renderer.render(params, camera)
 
-    with ThreadPoolExecutor(threads) as pool:
-        pending: deque[Future] = deque()
-        try:
-            for frame in range(len(performance.jaw)):
-                pending.append(pool.submit(one, frame))
-                if len(pending) > 2 * threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()
+    return in_order(one, range(len(performance.jaw)), os.cpu_count() or 1)
 
 
 def _write_frame(

@@ -32,7 +32,8 @@ from avatar.demo.head_files import write_head_model
 from avatar.demo.motion import FPS, Motion, Performance, frame_camera, frame_params, perform
 from avatar.demo.render import VIEW_AXES, Renderer, Stage, renderer_of
 from avatar.demo.studio import World, front_camera, root_joint, studio_cameras, world_of
-from avatar.demo.subject import check_arguments, check_number, single_threads, whole_folder, write_image
+from avatar.demo.subject import check_arguments, check_number, single_threads, write_image
+from avatar.files.atomic import check_target, whole_folder
 from avatar.head.model import matrix_from_6d
 from avatar.types import Camera, HeadParams
 
@@ -62,6 +63,7 @@ def make_camera_folder(out: Path, cameras: int, frames: int = 100, size: int = 2
     check_number("with several cameras, frames", frames, 2)
     check_number("cameras", cameras, 2, MAX_CAMERAS)
     union = f"UNION_demo{seed}"
+    check_target(out)
     with whole_folder(out) as folder:
         renderer = renderer_of(seed)
         head_model = folder / "head_model"

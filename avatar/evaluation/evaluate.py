@@ -91,14 +91,14 @@ def evaluate(
     for protocol in chosen:
         clear_pictures(folder / protocol.name)
     is_shown = any(protocol.name == shown for protocol in chosen)
-    with video_writer(video, subject.fps) if is_shown else nullcontext() as add_to_video:
+    with video_writer(video, subject.recording.fps) if is_shown else nullcontext() as add_to_video:
         results = measure(run, renderer, chosen, indices, lpips, write_frames, {shown: add_to_video})
 
     entries: dict[str, Any] = {}
     seen = views(subject.recording, numbers_of(subject), sorted(set().union(*indices.values())))
     for protocol in chosen:
         by_drive: dict[Drive, list[FrameResult]] = {drive: found[protocol.name] for drive, found in results.items()}
-        entry = summarise(protocol, by_drive, networks[protocol.lpips_net], subject.fps, seen)
+        entry = summarise(protocol, by_drive, networks[protocol.lpips_net], subject.recording.fps, seen)
         for drive, part in parts(entry).items():
             rows = frames_csv(protocol.columns, by_drive[drive], seen).encode()
             write_atomically(folder / protocol.name / part.table, rows)

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files and folders that are there whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import itertools
 import os
 import platform
 import re
-from contextlib import suppress
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from avatar.errors import UserError
@@ -35,6 +38,39 @@ def write_atomically(path: Path, data: bytes) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise UserError(f"{path} cannot be written ({error.strerror}); what was there before is untouched") from None
+
+
+def check_target(target: Path) -> None:
+    """Raise UserError where a new folder may not be written: nothing is overwritten."""
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        raise UserError(f"{target} exists already and is not a folder; choose another --out")
+    if target.is_dir() and any(target.iterdir()):
+        raise UserError(f"{target} exists already and is not empty; choose another --out, or remove it")
+
+
+@contextmanager
+def whole_folder(
+    target: Path, put: Callable[[Path, Path], object] = Path.replace, advice: str = "choose another --out"
+) -> Iterator[Path]:
+    """A folder beside `target` that takes its place when nothing went wrong, and else is removed.
+
+    put      gives the folder its name; by default `target` must not be there, or be an empty folder
+    advice   what to do where nothing can be written
+    Raises UserError when the disk refuses.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        building = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}-", dir=target.parent))
+    except OSError as error:
+        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); {advice}") from None
+    try:
+        yield building
+        building.chmod(0o755)
+        put(building, target)
+    except OSError as error:
+        raise UserError(f"{target} cannot be written ({error.strerror or error}); nothing was left behind") from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
 
 
 def temporary_name(path: Path) -> Path:

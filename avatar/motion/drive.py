@@ -39,7 +39,7 @@ def subject_drive(subject: Subject, size: int | None) -> Drive:
     frames = all_moments(subject)
     return Drive(
         subject.name,
-        subject.fps,
+        subject.recording.fps,
         tuple(subject.recording.names[i] for i in frames),
         [subject.params(i) for i in frames],
         [subject.camera(i, size) for i in frames],

@@ -14,8 +14,8 @@ from avatar.compute.device import on_gpu
 from avatar.compute.gpu_functions import gpu_function
 from avatar.splat.cpu import CannotDraw, splat_cpu
 from avatar.splat.gpu_buffers import checked_drawings, is_checked
+from avatar.splat.options import Options, check_region
 from avatar.splat.reference import splat_reference
-from avatar.splat.region import check_region
 from avatar.splat.sh import sh_degree_of
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
@@ -80,22 +80,9 @@ def splat(
     the "gpu" backend image and alpha are NaN instead wherever it draws, also where the scene needs more memory than the
     first of its kind fixed; within `checked_drawings()` it waits for the GPU, and raises.
     """
-    chosen = backend or _backend_for(gaussians.means)
-    options = _checked_options(
-        gaussians,
-        camera,
-        background,
-        backend=chosen,
-        sh_degree=sh_degree,
-        alpha_min=alpha_min,
-        alpha_max=alpha_max,
-        t_min=t_min,
-        blur=blur,
-        near=near,
-        antialiased=antialiased,
-        region=region,
-    )
-    return _draw(chosen, gaussians, camera, background, options)
+    pixels = check_region(region, camera.width, camera.height)
+    options = Options(sh_degree, alpha_min, alpha_max, t_min, blur, near, antialiased, pixels)
+    return _draw(backend, gaussians, camera, background, options)
 
 
 def splat_features(
@@ -126,58 +113,34 @@ def splat_features(
     whose image this is where its colours are the features.
     """
     gaussians = FeatureGaussians(means, quats, scales, opacities, features)
-    chosen = backend or _backend_for(means)
-    options = _checked_options(
-        gaussians,
-        camera,
-        background,
-        backend=chosen,
-        sh_degree=None,
-        alpha_min=alpha_min,
-        alpha_max=alpha_max,
-        t_min=t_min,
-        blur=blur,
-        near=near,
-        antialiased=antialiased,
-        region=region,
-    )
-    return _draw(chosen, gaussians, camera, background, options)
+    pixels = check_region(region, camera.width, camera.height)
+    options = Options(None, alpha_min, alpha_max, t_min, blur, near, antialiased, pixels)
+    return _draw(backend, gaussians, camera, background, options)
 
 
 def _draw(
-    backend: str, gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Tensor, options: dict[str, Any]
+    backend: Backend | None,
+    gaussians: Gaussians | FeatureGaussians,
+    camera: Camera,
+    background: Tensor,
+    options: Options,
 ) -> Rendering:
-    if backend == "reference":
+    means: Any = gaussians.means
+    chosen = backend or ("gpu" if isinstance(means, Tensor) and on_gpu(means) else "cpu")
+    options = check_options(gaussians, camera, background, chosen, options)
+    if chosen == "reference":
         try:
             check_finite(**gaussians._asdict(), background=background)
         except ValueError as error:
             raise CannotDraw(str(error)) from None
-        return splat_reference(gaussians, camera, background, **options)
-    if backend == "gpu":
-        return gpu_function("splat")(gaussians, camera, background, **options)
-    return splat_cpu(gaussians, camera, background, **options)
+        return splat_reference(gaussians, camera, background, options)
+    return (gpu_function("splat") if chosen == "gpu" else splat_cpu)(gaussians, camera, background, options)
 
 
-def _backend_for(tensor: Any) -> str:
-    return "gpu" if isinstance(tensor, Tensor) and on_gpu(tensor) else "cpu"
-
-
-def _checked_options(
-    gaussians: Gaussians | FeatureGaussians,
-    camera: Camera,
-    background: Tensor,
-    *,
-    backend: str,
-    sh_degree: int | None,
-    alpha_min: float,
-    alpha_max: float,
-    t_min: float,
-    blur: float,
-    near: float,
-    antialiased: bool,
-    region: tuple[slice, slice] | None,
-) -> dict[str, Any]:
-    """Check everything, and give the options of `splat` as the backends take them; features have no degree."""
+def check_options(
+    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Tensor, backend: str, options: Options
+) -> Options:
+    """Check everything, and give the options as the backends take them."""
     if isinstance(gaussians, Gaussians):
         shown, channels = {"sh": (gaussians.sh, "N K 3")}, "3"
     else:
@@ -194,6 +157,7 @@ def _checked_options(
     )
     if sizes.get("C") == 0:
         raise ValueError(f"features must have one channel or more, got {list(shown['features'][0].shape)}")
+    sh_degree, alpha_min, alpha_max, t_min, blur, near, *_ = options
     _check_dtype_and_device(gaussians, background, backend)
     _check_camera(camera, gaussians.means.device, backend)
     if isinstance(gaussians, Gaussians):
@@ -212,20 +176,9 @@ def _checked_options(
         raise ValueError(f"blur must be finite and not negative, got {blur}")
     if not (near > 0 and math.isfinite(near)):
         raise ValueError(f"near must be finite and above 0, got {near}")
-    pixels = check_region(region, camera.width, camera.height)
-
     # A cut-off means the same float32 value in all backends, so that an alpha that equals it is treated alike.
     alpha_min, alpha_max, t_min = struct.unpack("3f", struct.pack("3f", alpha_min, alpha_max, max(t_min, T_MIN)))
-    return {
-        "sh_degree": sh_degree,
-        "alpha_min": alpha_min,
-        "alpha_max": alpha_max,
-        "t_min": t_min,
-        "blur": blur,
-        "near": near,
-        "antialiased": antialiased,
-        "region": pixels,
-    }
+    return options._replace(sh_degree=sh_degree, alpha_min=alpha_min, alpha_max=alpha_max, t_min=t_min)
 
 
 def _check_dtype_and_device(gaussians: Gaussians | FeatureGaussians, background: Tensor, backend: str) -> None:

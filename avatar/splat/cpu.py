@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 
 from avatar import _core
 from avatar.compute.native import instruction_set, thread_count
+from avatar.splat.options import Options
 from avatar.splat.pose import pose_of
-from avatar.splat.region import Region
 from avatar.tensors import describe_non_finite
 from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
@@ -22,38 +22,27 @@ class CannotDraw(ValueError):
 
 
 def splat_cpu(
-    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Float[Tensor, " C"], **options: Any
+    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Float[Tensor, " C"], options: Options
 ) -> Rendering:
     """`avatar.splat.splat` and `splat_features` without their checks of shape and type; float32 tensors on the CPU."""
-    pose, settings = pose_of(camera, gaussians.means.device), _settings(camera, **options)
+    pose, settings = pose_of(camera, gaussians.means.device), _settings(camera, options)
     size = camera.height, camera.width
     image, alpha = _Splat.apply(gaussians._make, *gaussians, background, pose, size, settings)  # pyright: ignore
     return Rendering(image, alpha)
 
 
-def _settings(
-    camera: Camera,
-    *,
-    sh_degree: int | None,
-    alpha_min: float,
-    alpha_max: float,
-    t_min: float,
-    blur: float,
-    near: float,
-    antialiased: bool,
-    region: Region,
-) -> dict[str, Any]:
+def _settings(camera: Camera, options: Options) -> dict[str, Any]:
     """All arguments of the compiled function that are not tensors."""
     return {
         "rotation": camera.R_cam_world.flatten().tolist(),
         "translation": camera.t_cam_world.tolist(),
         "intrinsics": (camera.fx, camera.fy, camera.cx, camera.cy),
-        "sh_degree": -1 if sh_degree is None else sh_degree,  # -1: features
-        "cutoffs": (alpha_min, alpha_max, t_min),
-        "blur": blur,
-        "near": near,
-        "antialiased": antialiased,
-        "region": region,
+        "sh_degree": -1 if options.sh_degree is None else options.sh_degree,  # -1: features
+        "cutoffs": (options.alpha_min, options.alpha_max, options.t_min),
+        "blur": options.blur,
+        "near": options.near,
+        "antialiased": options.antialiased,
+        "region": options.region,
         "simd": instruction_set(),
         "threads": thread_count(),
     }

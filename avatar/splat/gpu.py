@@ -18,25 +18,23 @@ from torch.autograd.function import once_differentiable
 from avatar.compute.device import to_device
 from avatar.splat.gpu_backward import backward
 from avatar.splat.gpu_draw import Settings, draw
+from avatar.splat.options import Options
 from avatar.splat.pose import pose_of
-from avatar.splat.region import Region
 from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
 
 def splat_gpu(
-    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Float[Tensor, " C"], **options: Any
+    gaussians: Gaussians | FeatureGaussians, camera: Camera, background: Float[Tensor, " C"], options: Options
 ) -> Rendering:
     """`avatar.splat.splat` and `splat_features` without their checks of shape and type; float32 tensors on a GPU."""
     device = gaussians.means.device
-    pose, settings = pose_on(camera, device), settings_of(camera, device, **options)
+    pose, settings = pose_on(camera, device), settings_of(camera, device, options)
     image, alpha = _Splat.apply(gaussians._make, *gaussians, background, pose, settings)  # pyright: ignore
     return Rendering(image, alpha)
 
 
-def settings_of(
-    camera: Camera, device: torch.device, *, blur: float, near: float, region: Region, **options: Any
-) -> Settings:
-    return Settings(intrinsics_on(camera, blur, near, device), camera.width, camera.height, region, **options)
+def settings_of(camera: Camera, device: torch.device, options: Options) -> Settings:
+    return Settings(intrinsics_on(camera, options.blur, options.near, device), camera.width, camera.height, options)
 
 
 def pose_on(camera: Camera, device: torch.device) -> Float[Tensor, " 12"]:

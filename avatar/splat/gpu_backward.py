@@ -27,14 +27,14 @@ def backward(
     wants_pose: bool,
 ) -> tuple[Gaussians | FeatureGaussians, Float[Tensor, " 12"] | None]:
     """The gradients of all fields, and that of the pose if it is wanted; four launches, and one more for the pose."""
-    s, d, N, tuning = settings, drawing, len(gaussians.means), drawing.tuning
+    s, o, d, N, tuning = settings, settings.options, drawing, len(gaussians.means), drawing.tuning
     stride = d.records.shape[1]
     moments = torch.empty((stride, MOMENTS.value), dtype=torch.float32, device=background.device)
     # The moments stand for a cotangent that the kernel does not read.
     by_image, by_alpha = (moments if g is None else g.contiguous() for g in (grad_image, grad_alpha))
     lists = d.records, d.begins, d.chunks
     rest = (background, d.transmittances, d.stops, by_image, by_alpha)
-    rest += (s.alpha_min, s.alpha_max, stride, s.width, *d.grid.place, *s.region, moments)
+    rest += (o.alpha_min, o.alpha_max, stride, s.width, *d.grid.place, *o.region, moments)
     cut = {"HAS_IMAGE": grad_image is not None, "HAS_ALPHA": grad_alpha is not None, "TILE": tuning.tile}
     cut |= {"CHUNK": tuning.chunk, "STEP": tuning.backward_step, "FORWARD_STEP": tuning.step}
     gradients = gaussians._make(torch.empty_like(t) for t in gaussians)
@@ -75,7 +75,7 @@ def backward(
         start(
             colour_of_backward,
             programs(N, tuning.backward_lanes),
-            *(gaussians.means, gaussians.sh, pose, sums, s.sh_degree, N, gradients[0], gradients[4]),
+            *(gaussians.means, gaussians.sh, pose, sums, o.sh_degree, N, gradients[0], gradients[4]),
             warps=warps,
             STORED=gaussians.sh.shape[1],
             BLOCK=tuning.backward_lanes,
@@ -89,7 +89,7 @@ def backward(
         number,
         *(*gaussians[:4], pose, s.intrinsics, sums, N, *gradients[:4], by_pose),  # by_pose is not written without POSE
         warps=warps,
-        ANTIALIASED=s.antialiased,
+        ANTIALIASED=o.antialiased,
         POSE=wants_pose,
         BLOCK=tuning.backward_lanes,
     )

@@ -17,7 +17,7 @@ from avatar.kernels.launch import start
 from avatar.kernels.project import POISON, project
 from avatar.splat.cpu import CannotDraw
 from avatar.splat.gpu_buffers import MAX_PAIRS, Kind, capacity_of
-from avatar.splat.region import Region
+from avatar.splat.options import Options, Region
 from avatar.tensors import check_finite
 from avatar.types import FeatureGaussians, Gaussians, Rendering
 
@@ -55,21 +55,16 @@ TUNING = Tuning()
 
 
 class Settings(NamedTuple):
-    """The options of `avatar.splat.splat`, checked, and what they need of the camera but for its pose."""
+    """Checked options, and what they need of the camera but for its pose."""
 
     intrinsics: Float[Tensor, " 10"]  # float64, see avatar.kernels.geometry
     width: int
     height: int
-    region: Region
-    sh_degree: int | None  # None: features
-    alpha_min: float
-    alpha_max: float
-    t_min: float
-    antialiased: bool
+    options: Options
 
     @property
     def is_whole(self) -> bool:
-        return self.region == (0, 0, self.width, self.height)
+        return self.options.region == (0, 0, self.width, self.height)
 
 
 class Grid(NamedTuple):
@@ -113,11 +108,11 @@ def draw(
     settings: Settings,
 ) -> tuple[Rendering, Drawing]:
     """Draw contiguous tensors of at least one Gaussian, seen from `pose` (float64, see avatar.splat.pose)."""
-    device, s = gaussians.means.device, settings
+    device, s, o = gaussians.means.device, settings, settings.options
     N, channels, stored = len(gaussians.means), len(background), gaussians[4].shape[1]
-    has_features = s.sh_degree is None
+    has_features = o.sh_degree is None
     tuning = TUNING.for_features if has_features else TUNING
-    grid, warps = tile_grid(s.region, tuning.tile), tuning.lanes // 32
+    grid, warps = tile_grid(o.region, tuning.tile), tuning.lanes // 32
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
@@ -127,17 +122,17 @@ def draw(
     start(
         project,
         programs(N, tuning.lanes),
-        *(*gaussians, pose, s.intrinsics, s.alpha_min, s.sh_degree or 0, channels, N, s.width, s.height, *grid),
+        *(*gaussians, pose, s.intrinsics, o.alpha_min, o.sh_degree or 0, channels, N, s.width, s.height, *grid),
         *(depths, ellipses, looks, boxes),
         warps=warps,
         STORED=0 if has_features else stored,
-        ANTIALIASED=s.antialiased,
+        ANTIALIASED=o.antialiased,
         TILE=tuning.tile,
         BLOCK=tuning.lanes,
     )
     order = torch.sort(depths, stable=True).indices
     ends = boxes[3].index_select(0, order).cumsum(0)
-    kind = Kind(device, N, grid.tiles, s.alpha_min, channels if has_features else 0)
+    kind = Kind(device, N, grid.tiles, o.alpha_min, channels if has_features else 0)
     capacity = capacity_of(kind, lambda: needed_pairs(gaussians, pose, background, boxes, ends))
 
     stride = programs(programs(capacity, tuning.chunk) * tuning.chunk + grid.tiles * tuning.chunk, ALIGNED) * ALIGNED
@@ -174,7 +169,7 @@ def draw(
         image, alphas = background.repeat(*size, 1), torch.zeros(size, device=device)
         transmittances = torch.ones(size, device=device)
     stops, chunks = empty(*size, dtype=torch.int32), empty(grid.tiles, dtype=torch.int32)
-    rest = (background, s.alpha_min, s.alpha_max, s.t_min, N, capacity, stride, s.width, *grid.place, *s.region)
+    rest = (background, o.alpha_min, o.alpha_max, o.t_min, N, capacity, stride, s.width, *grid.place, *o.region)
     rest += (image, alphas, transmittances, stops, chunks)
     cut = {"warps": tuning.warps, "TILE": tuning.tile, "CHUNK": tuning.chunk, "STEP": tuning.step}
     if has_features:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from avatar.splat.region import Region
+from avatar.splat.options import Options
 from avatar.splat.sh import sh_colours
 from avatar.types import Camera, FeatureGaussians, Gaussians, Rendering
 
@@ -40,35 +40,19 @@ def splat_reference(
     gaussians: Gaussians | FeatureGaussians,
     camera: Camera,
     background: Float[Tensor, " C"],
-    *,
-    sh_degree: int | None,
-    alpha_min: float,
-    alpha_max: float,
-    t_min: float,
-    blur: float,
-    near: float,
-    antialiased: bool,
-    region: Region | None = None,
+    options: Options,
     block: int = 16,
 ) -> Rendering:
     """`avatar.splat.splat` without its checks, computed in float64 on the tensors' device, returned in their dtype.
 
-    sh_degree None: `gaussians` have features, which are drawn as they are.
+    Without options.sh_degree `gaussians` have features, which are drawn as they are.
     `block` is the side of the squares of pixels that are evaluated at once; the result does not depend on it. The squares
-    lie alike in every region (None: the image), so that a pixel gets the same bits in all of them.
+    lie alike in every region, so that a pixel gets the same bits in all of them.
     """
     dtype = gaussians.means.dtype
-    region = region or Region(0, 0, camera.width, camera.height)
+    region = options.region
     first_column, first_row = region.left // block * block, region.top // block * block
-    splats = project(
-        gaussians._make(t.double() for t in gaussians),
-        camera,
-        sh_degree=sh_degree,
-        alpha_min=alpha_min,
-        blur=blur,
-        near=near,
-        antialiased=antialiased,
-    )
+    splats = project(gaussians._make(t.double() for t in gaussians), camera, options)
     image_rows, alpha_rows = [], []
     for top in range(first_row, region.bottom, block):
         images, alphas = [], []
@@ -76,7 +60,7 @@ def splat_reference(
             bottom, right = min(top + block, camera.height), min(left + block, camera.width)
             pixels = _pixel_centres(left, top, right, bottom, splats.means)
             inside = _reaches(splats, left, top, right, bottom)
-            arguments = (pixels, *(t[inside] for t in splats[:4]), background.double(), alpha_min, alpha_max, t_min)
+            arguments = (pixels, *(t[inside] for t in splats[:4]), background.double(), *options[1:4])
             colour, transmittance = checkpoint(_composite, *arguments, use_reentrant=False)  # pyright: ignore
             images.append(colour.reshape(bottom - top, right - left, -1))
             alphas.append(1 - transmittance.reshape(bottom - top, right - left))
@@ -94,22 +78,14 @@ def splat_reference(
     return Rendering(image.to(dtype), alpha.to(dtype))
 
 
-def project(
-    gaussians: Gaussians | FeatureGaussians,
-    camera: Camera,
-    *,
-    sh_degree: int | None,
-    alpha_min: float,
-    blur: float,
-    near: float,
-    antialiased: bool,
-) -> Projected:
+def project(gaussians: Gaussians | FeatureGaussians, camera: Camera, options: Options) -> Projected:
     """Project float64 Gaussians, leave out those that cannot show anywhere, sort by depth and then by index."""
+    sh_degree, alpha_min, blur = options.sh_degree, options.alpha_min, options.blur
     R = camera.R_cam_world.to(gaussians.means)
     t = camera.t_cam_world.to(gaussians.means)
     # Written out, so that every backend that computes in float64 rounds a depth, and so breaks near-ties, in the same way.
     depth = _row_times(R[2].detach(), gaussians.means.detach()) + t[2].detach()
-    visible = (depth >= near).nonzero()[:, 0]
+    visible = (depth >= options.near).nonzero()[:, 0]
     visible = visible[torch.sort(depth[visible], stable=True).indices]
     means, quats, scales, opacities, looks = (field[visible] for field in gaussians)
 
@@ -139,7 +115,7 @@ def project(
     x, y, z, cov_xx, cov_xy, cov_yy, area, det, opacities, looks, means = (
         v[solid] for v in (x, y, z, cov_xx, cov_xy, cov_yy, area, det, opacities, looks, means)
     )
-    if antialiased:
+    if options.antialiased:
         opacities = opacities * area / det.sqrt()
     keep = opacities >= alpha_min
     x, y, z, cov_xx, cov_xy, cov_yy, det, opacities, looks, means = (

@@ -15,7 +15,6 @@ import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from avatar.data.recording import Recording
 from avatar.data.refinement import Refinement
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.files.names import shortened
+from avatar.files.atomic import check_target, whole_folder
 from avatar.files.opening import is_there
 from data_prep.formats import avatar_track
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
@@ -74,12 +73,6 @@ def _read_given(folder: Path, tracked: Mapping[int, Path], complain: Callable[[s
     return given
 
 
-def check_target(target: Path) -> None:
-    """Raise UserError where a refined folder may not be written: nothing is overwritten."""
-    if target.is_symlink() or (target.exists() and not target.is_dir()) or (target.is_dir() and any(target.iterdir())):
-        raise UserError(f"{target} exists already; choose another --out, or remove it")
-
-
 def write_folder(
     target: Path,
     subject: Subject,
@@ -93,12 +86,7 @@ def write_folder(
     Raises UserError when it exists already or the disk refuses.
     """
     check_target(target)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}-", dir=target.parent))
-    except OSError as error:
-        raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); choose another --out") from None
-    try:
+    with whole_folder(target) as building:
         _link_pictures(building, subject)
         head = _head_model(building, subject)
         given = (subject.given or subject.recording).tracks
@@ -110,14 +98,6 @@ def write_folder(
         (building / REFINEMENT_FILE).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         for name, data in extras.items():
             (building / name).write_bytes(data)
-        building.chmod(0o755)
-        if target.is_dir():
-            target.rmdir()  # it is empty
-        building.rename(target)
-    except OSError as error:
-        raise UserError(f"{target} cannot be written ({error.strerror or error}); nothing was left behind") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
 
 
 def frame_numbers(subject: Subject) -> list[int]:

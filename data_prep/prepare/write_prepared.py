@@ -13,6 +13,7 @@ from safetensors.numpy import save
 
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_manifest
 from avatar.errors import UserError
+from avatar.files.atomic import whole_folder
 from avatar.files.names import safe_name
 from data_prep.prepare.contents import find_damage, write_contents
 
@@ -48,25 +49,12 @@ def write_prepared(
 
     Raises UserError when the place cannot be written.
     """
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{safe_name(target.name)}-", dir=target.parent))
-    except OSError as error:
-        raise UserError(
-            f"nothing can be written in {target.parent} ({error.strerror}); name another folder with --out, "
-            "or another cache with AVATAR_CACHE"
-        ) from None
-    try:
+    advice = "name another folder with --out, or another cache with AVATAR_CACHE"
+    with whole_folder(target, lambda building, _: _replace(target, building, manifest.input_hash), advice) as building:
         (building / TRACKS_FILE).write_bytes(save(arrays))
         write_masks(building)
         (building / MANIFEST_FILE).write_text(manifest.to_json(), encoding="utf-8")
         write_contents(building)
-        building.chmod(0o755)
-        _replace(target, building, manifest.input_hash)
-    except OSError as error:
-        raise UserError(f"the prepared subject cannot be written to {target} ({error.strerror})") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
 
 
 def _replace(target: Path, building: Path, input_hash: str) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress
@@ -25,7 +24,6 @@ from data_prep.track.spill import despilled
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
 MAX_WITHOUT = 0.1  # of the frames may have a given matte that leaves out the face
-_AHEAD = 4  # frames that wait for a worker
 Made = TypeVar("Made")
 Read = Callable[[int], np.ndarray]  # the picture or the mask of the frame with this number
 
@@ -132,20 +130,8 @@ def ahead(
     numbers: Sequence[int], make: Callable[[int], Made], progress: Progress, title: str
 ) -> Iterator[tuple[int, Made]]:
     """Each frame number with what `make` gives for it, in order; made by some threads, a few frames ahead."""
-    with ThreadPoolExecutor(WORKERS) as pool:
-        pending: deque[tuple[int, Future[Made]]] = deque()
-        try:
-            for number in progress(numbers, len(numbers), title):
-                pending.append((number, pool.submit(make, number)))
-                if len(pending) > _AHEAD:
-                    first, future = pending.popleft()
-                    yield first, future.result()
-            while pending:
-                first, future = pending.popleft()
-                yield first, future.result()
-        finally:
-            for _, future in pending:
-                future.cancel()
+    made = in_order(make, numbers, WORKERS)
+    yield from zip(numbers, progress(made, len(numbers), title), strict=True)
 
 
 def write_image(path: Path, image: np.ndarray, options: list[int]) -> None:

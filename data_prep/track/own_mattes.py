@@ -1,7 +1,7 @@
 """The mattes that a person gives for a video: a folder or a video of all its pictures, checked before anything is made.
 
-Label images with one value besides 0 are understood, as in tracked folders (`mask_values`). What does not show the person
-is refused with the figure that says so.
+Folders of label images with one value besides 0 are understood, as in tracked folders (`mask_values`). What does not show
+the person is refused with the figure that says so.
 """
 
 from __future__ import annotations
@@ -32,32 +32,14 @@ _SAMPLES = 16  # pictures of a video of mattes
 class OwnMattes:
     footage: Footage
     notes: tuple[str, ...] = ()
-    label: int | None = None  # the value of a video of label images that stands for the person
 
     def turned(self, degrees: int) -> OwnMattes:
         return replace(self, footage=turned(self.footage, degrees))
 
     def read(self, view: View, span: Span) -> Iterator[TimedPicture]:
         """The mattes, uint8 [H, W], in the order of their times."""
-        # Labels are not numbers to take means of: they are read at their own size.
-        first = view if self.label is None else whole(self.footage.width, self.footage.height)
-        for time, image in self.footage.read(first, span, lambda _: None):
-            matte = self.values(image, time)
-            yield TimedPicture(time, matte if first is view else resampled(matte, view))
-
-    def values(self, image: UInt8[np.ndarray, "H W 3"], time: float) -> UInt8[np.ndarray, "H W"]:
-        """0 to 255, of a picture of the footage."""
-        grey = _grey(image)
-        if self.label is None:
-            return grey
-        is_person = grey == self.label
-        strange = grey[~is_person & (grey != 0)]
-        if len(strange):
-            raise UserError(
-                f"{self.footage.path} holds the value {strange[0]} beside 0 and {self.label}, at {time:.2f} s; make all "
-                "mattes alike"
-            )
-        return np.where(is_person, np.uint8(255), np.uint8(0))
+        for time, image in self.footage.read(view, span, lambda _: None):
+            yield TimedPicture(time, _grey(image))
 
 
 def open_mattes(path: Path, video: Footage) -> OwnMattes:
@@ -71,7 +53,7 @@ def open_mattes(path: Path, video: Footage) -> OwnMattes:
     found = [set(np.unique(each).tolist()) for each in _values_of_some(footage)]
     if not found:
         raise UserError(f"none of the pictures in {path} can be decoded; make the mattes again")
-    label = only_label(found)
+    label = only_label(found) if isinstance(footage, PictureFolder) else None  # a video's are not exact
     notes = [] if label is None else [f"the mattes in {path} are label images: {label} is read as 255"]
     if label is None:
         darkest, brightest = min(map(min, found)), max(map(max, found))
@@ -85,7 +67,7 @@ def open_mattes(path: Path, video: Footage) -> OwnMattes:
         rate = video.rate or DEFAULT_FPS
         as_masks = replace(footage, decode=_mask_reader(label), rate=rate, duration=len(footage.files) / rate)
         return OwnMattes(as_masks, tuple(notes))
-    return OwnMattes(footage, tuple(notes), label)
+    return OwnMattes(footage, tuple(notes))
 
 
 def refuse_mattes_of_others(mattes: OwnMattes, span: Span, faces: Sequence[Face | None]) -> None:
@@ -96,9 +78,9 @@ def refuse_mattes_of_others(mattes: OwnMattes, span: Span, faces: Sequence[Face 
     footage = mattes.footage
     size, small = whole(footage.width, footage.height), whole(footage.width, footage.height, LONGEST)
     shares = []
-    for face, (time, image) in zip(faces, sample_pictures(footage, span, size), strict=False):
+    for face, (_, image) in zip(faces, sample_pictures(footage, span, size), strict=False):
         if face is not None:
-            shares.append(share_on(face.points[:, :2], resampled(mattes.values(image, time), small)))
+            shares.append(share_on(face.points[:, :2], resampled(_grey(image), small)))
     if not shares:
         return
     on_face, beside = np.median(np.array(shares), axis=0)

@@ -3,9 +3,9 @@
     python scripts/paper/conditioning.py --out runs/paper
 
 One forward and one backward pass of all three heads of a head's Gaussians (the paper's: one head of three values), with
-the ways of `avatar.bench.hyper`, each compared with float64 before it is timed, and `model=covariance` beside them. Memory
-is Linux's high-water mark of a process of its own: parameters, gradients and all between them. What takes too much is
-measured on fewer Gaussians, and stated for all. A latent dimension that is measured is kept in --out/conditioning.
+the ways of `avatar.bench.hyper`, each compared with float64 before it is timed. Memory is Linux's high-water mark of a
+process of its own: parameters, gradients and all between them. What takes too much is measured on fewer Gaussians, and
+stated for all. A latent dimension that is measured is kept in --out/conditioning.
 Leaves conditioning.md, conditioning.csv and conditioning.png in --out.
 """
 
@@ -25,7 +25,6 @@ from pathlib import Path
 import torch
 from write_report import machine, run, table, write_report
 
-from avatar.baselines.covariance import conditional_mean
 from avatar.bench.hyper import (
     COVARIANCE_FLOATS,
     COVARIANCE_TOLERANCE,
@@ -42,11 +41,9 @@ from avatar.bench.hyper import (
 )
 from avatar.bench.results import new_figure
 from avatar.files.atomic import write_atomically
-from avatar.gaussians.hyper import HyperHeads
-from avatar.gaussians.hyper_cpu import HEADS
 from avatar.splat.scenes import HEAD_SPLATS
 
-TEXTBOOK, COLUMNS, TRICK, FUSED = "covariance, solver", "model=covariance", "trick, solver", "trick, compiled"
+TEXTBOOK, TRICK, FUSED = "covariance, solver", "trick, solver", "trick, compiled"
 PUBLISHED = {8: 2.5, 128: 151.0}  # naive / trick, RTX 2080 Ti, about 15,000 Gaussians, one head of three values
 PUBLISHED_MB = {8: (42, 22)}
 STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -63,28 +60,7 @@ class Point:
     bytes: float | None  # None: not Linux
 
 
-def by_columns(leaves: Leaves) -> torch.Tensor:
-    """As `model=covariance` does it: substitution by hand, a row of all Gaussians at a time."""
-    latents = leaves["latents"].T.contiguous()
-    parts = [conditional_mean(leaves[f"{head}.mean"], leaves[f"{head}.factor"], latents) for head in HEADS]
-    return torch.cat(parts).T
-
-
-def column_leaves(heads: HyperHeads) -> Leaves:
-    """`covariance_leaves` as `avatar.baselines.covariance` holds them: Gaussians last, triangles row by row."""
-    given = covariance_leaves(heads)
-    leaves = {"latents": given["latents"]}
-    for head, m in HEADS.items():
-        factor = given[f"{head}.factor"].detach().clone()
-        diagonal = torch.diagonal(factor, dim1=1, dim2=2)
-        diagonal.log_()
-        rows, columns = torch.tril_indices(m + heads.latent_size, m + heads.latent_size)
-        leaves[f"{head}.mean"] = given[f"{head}.mean"].detach().T.contiguous().requires_grad_()
-        leaves[f"{head}.factor"] = factor[:, rows, columns].T.contiguous().requires_grad_()
-    return leaves
-
-
-NAIVE = {TEXTBOOK: Way(by_covariance, covariance_leaves), COLUMNS: Way(by_columns, column_leaves)}
+NAIVE = {TEXTBOOK: Way(by_covariance, covariance_leaves)}
 TRICKS = {TRICK: WAYS["slope"], FUSED: WAYS["fused"]}
 
 

@@ -30,7 +30,6 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
     simd = {row["variant"]["simd"] for row in written["rows"] if row["variant"]["backend"] == "cpu"}
     assert simd == set(available_simd())
     assert [row["accuracy"] for row in written["rows"] if row["variant"]["backend"] == "reference"] == [None]
-    assert sum(row["variant"]["backend"] == "plain" for row in written["rows"]) == 2
     cutoffs = {(row["variant"]["alpha_min"], row["variant"]["t_min"]) for row in written["rows"]}
     assert cutoffs == {
         (1 / 255, 1e-4),
@@ -50,7 +49,7 @@ def test_quick_run_prints_a_table_and_writes_figures_and_plot(
             assert (row["accuracy"]["gradient"] <= 1e-4) == usual
     assert (tmp_path / "out" / "bench_splat.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out.splitlines()
-    lines = [line for line in printed if line.lstrip().startswith(("cpu", "plain", "reference"))]
+    lines = [line for line in printed if line.lstrip().startswith(("cpu", "reference"))]
     assert len(lines) == len(written["rows"])
 
 

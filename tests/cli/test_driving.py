@@ -103,7 +103,7 @@ def test_the_frame_rate_of_a_driver_is_that_of_its_video_and_its_drive_file(
         assert meta["fps"] == 60.0 and meta["duration"] == pytest.approx(8 / 60, abs=0.02)
         assert json.loads((tmp_path / "driver.choices.json").read_text())["driver"]["fps"] == 60.0
     assert main(["prepare", str(folder), *reading, "--out", str(tmp_path / "prepared")]) == 0
-    assert Subject.open(tmp_path / "prepared").fps == 60.0
+    assert Subject.open(tmp_path / "prepared").recording.fps == 60.0
 
 
 def test_eval_verifies_what_it_has_written(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

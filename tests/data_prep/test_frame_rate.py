@@ -27,14 +27,14 @@ def test_a_recorded_frame_rate_is_taken_and_can_be_overruled(format: str, tracke
     folder = WRITERS[format](tracked, tmp_path / "folder")
     record(folder, 29.97)
     subject, said = import_folder(folder, tracked, tmp_path / "out")
-    assert subject.fps == subject.manifest.fps == 29.97 and "29.97 a second, in" in said[-1]
+    assert subject.recording.fps == subject.manifest.fps == 29.97 and "29.97 a second, in" in said[-1]
     subject, said = import_folder(folder, tracked, tmp_path / "out", fps=50.0)
-    assert subject.fps == 50.0 and "50 a second, in" in said[-1]
+    assert subject.recording.fps == 50.0 and "50 a second, in" in said[-1]
 
 
 def test_an_unknown_frame_rate_is_assumed_and_said(tracked: Path, tmp_path: Path) -> None:
     subject, said = import_folder(tracked, tracked, tmp_path / "out")
-    assert subject.fps == 25.0 and "25 a second (assumed; --fps says otherwise), in" in said[-1]
+    assert subject.recording.fps == 25.0 and "25 a second (assumed; --fps says otherwise), in" in said[-1]
 
 
 @pytest.mark.parametrize("fps", ["fast", 0, -30, 1e9, None, [30, 30], True])
@@ -43,7 +43,7 @@ def test_a_record_that_is_no_frame_rate_is_said_and_not_used(fps: object, tracke
     record(folder, fps)
     subject, said = import_folder(folder, tracked, tmp_path / "out")
     sentence = f"fps in transforms_train.json is {fps}, which is no frame rate: it is not used; give --fps"
-    assert subject.fps == 25.0 and f"note: {sentence}" in said
+    assert subject.recording.fps == 25.0 and f"note: {sentence}" in said
 
 
 def test_check_tells_seconds_by_the_frame_rate(tracked: Path, capsys: pytest.CaptureFixture[str]) -> None:

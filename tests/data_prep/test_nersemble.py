@@ -135,7 +135,7 @@ def test_frames_are_positions_where_the_video_has_more(tmp_path: Path) -> None:
     assert_head_on_mattes(subject, folder)
     assert [frame.name for frame in subject.manifest.frames] == [f"{n:05d}" for n in positions]
     assert [frame.tracking for frame in subject.manifest.frames] == [0, 1, 2, 4, 5, 6]  # 7 is missing
-    assert subject.fps == RATE / 2
+    assert subject.recording.fps == RATE / 2
 
 
 @pytest.mark.parametrize("name", ["flame2023_tracking_v2.npz", "flame2023_tracking.npz"])

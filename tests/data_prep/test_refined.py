@@ -62,7 +62,7 @@ def written(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_is_read_back_with_both_trackings(written: Path, subject: Subject) -> None:
     again = opened(written)
     assert again.name == "someone" and again.manifest.format == "avatar-track"
-    assert again.recording.names == subject.recording.names and again.fps == subject.fps
+    assert again.recording.names == subject.recording.names and again.recording.fps == subject.recording.fps
     assert again.split == subject.split and again.manifest.refinement == history(subject)
     assert again.given is not None
     for name, value in better(subject).items():

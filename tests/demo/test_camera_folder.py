@@ -136,7 +136,7 @@ def test_every_folder_has_the_head_model(camera_folder: Path, assets: HeadAssets
         ("new.mp4 --cameras 2", "name a folder"),
         ("new.MOV --cameras 2", "name a folder"),
         ("new --cameras 2 --motion speech", "leave out --motion"),
-        ("used --cameras 2", "used is not empty"),
+        ("used --cameras 2", "used exists already and is not empty"),
     ],
 )
 def test_what_several_cameras_cannot_do_is_refused(
@@ -161,7 +161,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(vhap_folder, "write_image", full)
-    with pytest.raises(UserError, match="No space left on device; nothing was left"):
+    with pytest.raises(UserError, match=r"No space left on device\); nothing was left"):
         make_camera_folder(tmp_path / "out", 2, 2, SIZE, SEED)
     assert not list(tmp_path.iterdir())
 

@@ -246,7 +246,7 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     used = tmp_path / "used"
     used.mkdir()
     (used / "notes.txt").write_text("mine")
-    with pytest.raises(UserError, match="is not empty; choose another output folder"):
+    with pytest.raises(UserError, match="is not empty; choose another --out"):
         make_subject(used, frames=1, size=64)
     with pytest.raises(UserError, match="is not a folder"):
         make_subject(used / "notes.txt", frames=1, size=64)
@@ -264,6 +264,8 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(subject, "_write_frame", stop_at_the_third)
     expected = UserError if isinstance(error, OSError) else KeyboardInterrupt
-    with pytest.raises(expected, match="No space left on device; nothing was left" if expected is UserError else None):
+    with pytest.raises(
+        expected, match=r"No space left on device\); nothing was left" if expected is UserError else None
+    ):
         make_subject(tmp_path / "out", frames=4, size=64, seed=SEED_WITHOUT)
     assert not list(tmp_path.iterdir())

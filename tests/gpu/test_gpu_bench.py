@@ -46,7 +46,7 @@ def test_what_draws_here_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
             monkeypatch.setattr(splat_gpu, "find_spec", lambda _, has_gsplat=has_gsplat: has_gsplat or None)
             variants = all_variants((16,), (20,), count=20, size=16)
-            backends[has_gpu, has_gsplat] = {v.backend for v in variants} - {"cpu", "plain", "reference"}
+            backends[has_gpu, has_gsplat] = {v.backend for v in variants} - {"cpu", "reference"}
     assert backends == {
         (False, False): set(),
         (False, True): set(),

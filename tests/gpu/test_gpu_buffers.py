@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +14,7 @@ from splat.scenes import (
     SCENES,
     Scene,
     camera,
+    checked_options,
     gradients,
     inputs_of,
     random_gaussians,
@@ -23,7 +23,7 @@ from splat.scenes import (
 )
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from avatar.splat import CannotDraw, _checked_options, gpu_buffers, splat
+from avatar.splat import CannotDraw, gpu_buffers
 from avatar.splat.gpu_buffers import BYTES, HEADROOM, MAX_PAIRS, Kind, capacity_of, checked_drawings, most_pairs, roomy
 from avatar.types import Gaussians
 
@@ -35,10 +35,7 @@ def pairs_of(scene: Scene) -> int:
     from avatar.splat.gpu import pose_on, settings_of
     from avatar.splat.gpu_draw import draw
 
-    given = {**(inspect.unwrap(splat).__kwdefaults__ or {}), **scene.options, "backend": "gpu"}
-    settings = settings_of(
-        scene.camera, DEVICE, **_checked_options(scene.gaussians, scene.camera, scene.background, **given)
-    )
+    settings = settings_of(scene.camera, DEVICE, checked_options(scene, "gpu"))
     gaussians = Gaussians(*(t.detach().contiguous() for t in scene.gaussians))
     _, drawing = draw(gaussians, pose_on(scene.camera, DEVICE), scene.background, settings)
     return int(drawing.ends[-1])
@@ -98,17 +95,16 @@ def test_a_feature_that_is_not_finite_spoils_the_image_where_nobody_waits() -> N
 def test_so_does_one_of_a_pose_that_is_on_the_gpu(name: str, value: float) -> None:
     from avatar.splat.gpu import splat_gpu  # `splat` looks at a pose on the CPU, where Triton interprets
 
-    options: dict[str, Any] = {**(inspect.unwrap(splat).__kwdefaults__ or {}), "backend": "cpu"}
     pose = getattr(SCENE.camera, name).clone()
     pose.view(-1)[1] = value
     inputs = {name: tensor.to(DEVICE) for name, tensor in {**inputs_of(SCENE), name: pose}.items()}
     scene = with_inputs(SCENE, inputs)
-    checked = _checked_options(SCENE.gaussians, SCENE.camera, SCENE.background, **options)
+    checked = checked_options(SCENE, "cpu")
     with as_on_a_gpu(10_000):
-        found = splat_gpu(scene.gaussians, scene.camera, scene.background, **checked)
+        found = splat_gpu(scene.gaussians, scene.camera, scene.background, checked)
     assert found.image.isnan().all() and found.alpha.isnan().all()
     with checked_drawings(), pytest.raises(CannotDraw, match=f"{name} has 1 non-finite of"):
-        splat_gpu(scene.gaussians, scene.camera, scene.background, **checked)
+        splat_gpu(scene.gaussians, scene.camera, scene.background, checked)
 
 
 def test_a_value_that_is_not_finite_spoils_the_image_although_its_splat_is_hidden() -> None:

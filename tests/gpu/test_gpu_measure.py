@@ -8,6 +8,8 @@ from types import ModuleType
 
 import pytest
 
+from avatar.train import step_runner
+
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
@@ -24,11 +26,16 @@ def measure_gpu(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 SMALL = ["--size", "32", "--splats", "30", "--uv-size", "6", "--repeats", "1", "--quick"]
 
 
-def test_checks_times_and_tunings_are_written(measure_gpu: ModuleType, tmp_path: Path) -> None:
+def test_checks_times_and_tunings_are_written(
+    measure_gpu: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(measure_gpu, "STREAMED", 2)
+    for module in (measure_gpu, step_runner):
+        monkeypatch.setattr(module, "WARM", 1)
     assert measure_gpu.main([*SMALL, "--out", str(tmp_path)]) == 0
     text = (tmp_path / "gpu.md").read_text()
     assert "parity with the CPU: image off by " in text and "the same bits" in text and "FAILED" not in text
-    assert "replaying: 6 replayed training steps, the bits of launched ones" in text
+    assert "replaying: 2 replayed training steps, the bits of launched ones" in text
     for what in ("splatting, backward", "a rendered frame", "a training step with D-SSIM", "the same two, replayed"):
         assert f"| {what} | " in text
     assert "| 8 | 8 | 4 | 2 | 1 | " in text or "| 16 | 32 | 32 | 2 | 1 | " in text

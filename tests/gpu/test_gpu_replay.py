@@ -30,20 +30,20 @@ from avatar.train.step_runner import Kind, StepRunner
 from avatar.train.trainer import train
 from avatar.types import Gaussians
 
-# Degrees of the colours change at steps 7 and 14, the third term at step 10; checkpoints come in between.
+# Degrees of the colours change at steps 4 and 8, the third term at step 6; checkpoints come in between.
 TINY = (
     "model.uv_size=10",
     "model.latent_grid=4",
     "data.size=24",
     "trainer.perceptual=dssim",
-    "trainer.iterations=20",
-    "trainer.checkpoint_every=8",
+    "trainer.iterations=12",
+    "trainer.checkpoint_every=5",
     "trainer.prune_share=0",
 )
 
 
 def trained(
-    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int, degree_every: int = 7
+    folder: Path, run: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, warm: int, degree_every: int = 4
 ) -> tuple[Checkpoint, StepRunner, list[float]]:
     """The last checkpoint, what made the steps, and the loss of each."""
     config = small_config(*overrides)
@@ -89,8 +89,8 @@ def test_replayed_steps_have_the_bits_of_launched_ones(
     )
     found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, *overrides, warm=1)
     assert launching.replayed == 0
-    assert replaying.replayed == 20 - 4  # the first of each kind: degrees 0, 1, 1 with a third term, 2
-    assert same == losses and len(set(losses)) == 20
+    assert replaying.replayed == 12 - 4  # the first of each kind: degrees 0, 1, 1 with a third term, 2
+    assert same == losses and len(set(losses)) == 12
     assert expected.tensors["pose_corrections.moves"].any()
     assert_same(found, expected)
 
@@ -102,7 +102,7 @@ def test_steps_with_lpips_of_the_heads_box_are_replayed(
     lpips = Lpips("squeeze").on(DEVICE)
     monkeypatch.setattr(objective_module, "load_lpips", lambda *_, **__: lpips)
     monkeypatch.setattr(objective_module, "SPARSE_EVERY", 2)
-    tiny = ("data.size=40", "trainer.perceptual=lpips-squeeze", "trainer.iterations=12", "trainer.checkpoint_every=12")
+    tiny = ("data.size=40", "trainer.perceptual=lpips-squeeze", "trainer.checkpoint_every=12")
     expected, _, losses = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, *tiny, warm=99)
     found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, *tiny, warm=1)
     sizes = {kind.crop for kind in replaying._captured if kind.crop}
@@ -133,13 +133,14 @@ def test_the_kind_that_was_used_longest_ago_makes_room(monkeypatch: pytest.Monke
 def test_what_cannot_be_captured_is_launched_and_said(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, warm=99)
+    few = (*TINY, "trainer.iterations=4")
+    expected, _, _ = trained(tracked_folder, tmp_path / "launched", monkeypatch, *few, warm=99)
 
     def refuse(*_: object) -> None:
         raise RuntimeError("operation not permitted when stream is capturing")
 
     monkeypatch.setattr(step_runner_module, "Replay", refuse)
-    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *TINY, warm=1)
+    found, steps, _ = trained(tracked_folder, tmp_path / "run", monkeypatch, *few, warm=1)
     said = capsys.readouterr().err
     assert said.count("because they cannot be replayed: operation not permitted") == 1
     assert steps.replayed == 0

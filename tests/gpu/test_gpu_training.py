@@ -16,6 +16,7 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
+from avatar.train import objective as objective_module
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import choose_perceptual
@@ -58,16 +59,19 @@ def trained(
     return avatar, losses
 
 
-def test_thirty_steps_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path: Path) -> None:
+def test_steps_have_the_losses_of_the_cpu(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Across the steps where a spherical-harmonics degree, the perceptual term and a checkpoint come in."""
-    steps = ("trainer.iterations=30",)
+    monkeypatch.setattr(objective_module, "SH_INTERVAL", 4)
+    steps = ("trainer.iterations=12", "trainer.checkpoint_every=5")
     _, expected = trained(tracked_folder, tmp_path / "cpu", *steps, on_cpu=True)
     avatar, found = trained(tracked_folder, tmp_path / "gpu", *steps)
-    assert len(found) == len(expected) == 30
+    assert len(found) == len(expected) == 12
     assert found == pytest.approx(expected, rel=1e-4)
     assert avatar.device.type == DEVICE.type
     saved = newest_checkpoint(tmp_path / "gpu")
-    assert saved.step == 30 and saved.meta["device"] == DEVICE.type
+    assert saved.step == 12 and saved.meta["device"] == DEVICE.type
     assert all(tensor.is_cpu for tensor in saved.tensors.values())
 
 

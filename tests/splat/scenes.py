@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -13,7 +14,8 @@ import torch
 from torch import Tensor
 
 from avatar.compute.device import interpreted
-from avatar.splat import splat
+from avatar.splat import check_options, splat
+from avatar.splat.options import Options, check_region
 from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Camera, Gaussians, Rendering
 
@@ -135,6 +137,14 @@ SCENES: dict[str, Scene] = {
         for used in range(stored + 1)
     },
 }
+
+
+def checked_options(scene: Scene, backend: str) -> Options:
+    """As `splat` gives them to a backend."""
+    given = {**(inspect.unwrap(splat).__kwdefaults__ or {}), **scene.options}
+    del given["backend"]
+    given["region"] = check_region(given["region"], scene.camera.width, scene.camera.height)
+    return check_options(scene.gaussians, scene.camera, scene.background, backend, Options(**given))
 
 
 def render(scene: Scene, backend: Any = "cpu") -> Rendering:

@@ -25,7 +25,7 @@ from splat.scenes import (
     single_splat,
     use_simd,
 )
-from splat.test_splat_reference import OPTIONS
+from splat.test_splat_reference import options_of
 from torch import Tensor
 
 from avatar.splat import checked_drawings
@@ -132,12 +132,12 @@ def test_gradcheck_of_the_reference(antialiased: bool) -> None:
     g.means[4, 2] -= 2.0  # behind the camera
     scene = Scene(g, camera(4, 3, centre=(0.3, 0.8)))
     inputs = {name: tensor.double() for name, tensor in with_features(scene, 4).items()}
-    options = {**OPTIONS, "antialiased": antialiased, "sh_degree": None}
+    options = options_of(scene, antialiased=antialiased, sh_degree=None)
 
     def drawing(*values: Tensor) -> tuple[Tensor, ...]:
         named = dict(zip(inputs, values, strict=True))
         view = replace(scene.camera, **{name: named[name] for name in POSE})
-        return tuple(splat_reference(FeatureGaussians(*values[:5]), view, named["background"], **options))
+        return tuple(splat_reference(FeatureGaussians(*values[:5]), view, named["background"], options))
 
     leaves = [tensor.requires_grad_() for tensor in inputs.values()]
     assert torch.autograd.gradcheck(drawing, leaves, eps=1e-6, atol=1e-6, rtol=1e-5)

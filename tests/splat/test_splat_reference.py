@@ -8,6 +8,7 @@ import pytest
 import torch
 from splat.scenes import Scene, camera, in_float64, inputs_of, random_gaussians, render, with_inputs
 
+from avatar.splat.options import Options, check_region
 from avatar.splat.reference import splat_reference
 
 OPTIONS: dict[str, Any] = {
@@ -20,13 +21,20 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-def check_gradients(scene: Scene, **options: Any) -> None:
+def options_of(scene: Scene, **options: Any) -> Options:
+    whole = check_region(None, scene.camera.width, scene.camera.height)
+    return Options(**{**OPTIONS, "region": whole, **options})
+
+
+def check_gradients(scene: Scene, block: int = 16, **options: Any) -> None:
     """In all that a drawing has a gradient in, against finite differences."""
     inputs = inputs_of(in_float64(scene))
 
     def draw(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         moved = with_inputs(scene, dict(zip(inputs, values, strict=True)))
-        return tuple(splat_reference(moved.gaussians, moved.camera, moved.background, **{**OPTIONS, **options}))
+        return tuple(
+            splat_reference(moved.gaussians, moved.camera, moved.background, options_of(scene, **options), block)
+        )
 
     leaves = [tensor.clone().requires_grad_() for tensor in inputs.values()]
     assert torch.autograd.gradcheck(draw, leaves, eps=1e-6, atol=1e-6, rtol=1e-5)
@@ -53,8 +61,8 @@ def test_result_does_not_depend_on_the_block(block: int) -> None:
     scene = in_float64(Scene(random_gaussians(200), camera(50, 41)))
     expected = render(scene, "reference")
     cut_offs = torch.tensor([1 / 255, 0.999, 1e-4], dtype=torch.float32).tolist()
-    options = {**OPTIONS, **dict(zip(("alpha_min", "alpha_max", "t_min"), cut_offs, strict=True))}
-    found = splat_reference(scene.gaussians, scene.camera, scene.background, sh_degree=3, block=block, **options)
+    options = options_of(scene, sh_degree=3, **dict(zip(("alpha_min", "alpha_max", "t_min"), cut_offs, strict=True)))
+    found = splat_reference(scene.gaussians, scene.camera, scene.background, options, block)
     assert (found.image - expected.image).abs().max() < 1e-13
     assert (found.alpha - expected.alpha).abs().max() < 1e-13
 

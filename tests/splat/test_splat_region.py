@@ -23,7 +23,7 @@ from splat.scenes import (
 from splat.test_splat_reference import check_gradients
 
 from avatar.splat import splat
-from avatar.splat.region import Region
+from avatar.splat.options import Region
 
 WIDTH, HEIGHT = 75, 70  # a tile's side divides neither
 SCENE = Scene(random_gaussians(150, seed=21), camera(WIDTH, HEIGHT))
@@ -124,9 +124,8 @@ def test_splats_beside_the_region_are_not_projected_into_it() -> None:
 
 def test_gradcheck_of_the_reference() -> None:
     scene = Scene(random_gaussians(4, sh_degree=1, spread=0.1, size=0.1), camera(5, 4))
-    region = {"region": Region(1, 2, 4, 3), "block": 2}
     assert render(scene.with_options(region=(slice(2, 3), slice(1, 4)))).alpha.max() > 0.1
-    check_gradients(scene, sh_degree=1, **region)
+    check_gradients(scene, block=2, sh_degree=1, region=Region(1, 2, 4, 3))
 
 
 @pytest.mark.parametrize("name", ["head", "wide field of view", "needles", "1x1"])

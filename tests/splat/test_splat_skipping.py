@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
-from typing import Any
-
 import pytest
 import torch
-from splat.scenes import SCENES, SIMD, Scene, camera, gradients, random_gaussians, render, use_simd
+from splat.scenes import SCENES, SIMD, Scene, camera, checked_options, gradients, random_gaussians, render, use_simd
 
-import avatar.splat
 from avatar.splat import cpu
 from avatar.types import Gaussians
 
@@ -20,14 +16,8 @@ from avatar.types import Gaussians
 def test_skipping_does_not_change_a_bit(name: str, simd: str, monkeypatch: pytest.MonkeyPatch) -> None:
     use_simd(monkeypatch, simd)
     scene, drawn = SCENES[name], render(SCENES[name])
-    options: dict[str, Any] = {
-        **(inspect.unwrap(avatar.splat.splat).__kwdefaults__ or {}),
-        **scene.options,
-        "backend": "cpu",
-    }
-    checked = avatar.splat._checked_options(scene.gaussians, scene.camera, scene.background, **options)
     gaussians, size = Gaussians(*(t.contiguous() for t in scene.gaussians)), (scene.camera.height, scene.camera.width)
-    settings = {**cpu._settings(scene.camera, **checked), "everywhere": True}
+    settings = {**cpu._settings(scene.camera, checked_options(scene, "cpu")), "everywhere": True}
     image, alpha, _ = cpu._draw(gaussians, scene.background, size, settings)
     assert torch.equal(image, drawn.image) and torch.equal(alpha, drawn.alpha)
 

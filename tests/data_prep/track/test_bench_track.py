@@ -99,7 +99,7 @@ def test_the_report_has_every_figure() -> None:
 def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "track", "--quick", "--out", str(tmp_path)]) == 0
     (subject,) = json.loads((tmp_path / "bench_track.json").read_text())["subjects"]
-    assert (subject["name"], subject["frames"], subject["size"]) == ("demo-1", 20, [192, 192])
+    assert (subject["name"], subject["frames"], subject["size"]) == ("demo-1", 14, [192, 192])
     assert 0.0 < subject["vertices"]["moving"] < subject["vertices"]["all"] < 4.0
     assert 0.0 < subject["first_vertices"]["moving"] != subject["vertices"]["moving"]
     assert subject["head"] > 0.95
@@ -116,11 +116,11 @@ def test_a_tiny_run(tracking_models: None, tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.slow
 def test_a_tiny_run_of_a_folder(tracking_models: None, tmp_path: Path) -> None:
-    folder = make_subject(tmp_path / "someone", 20, 192, seed=2)
+    folder = make_subject(tmp_path / "someone", 14, 192, seed=2)
     out = tmp_path / "out"
     assert main(["bench", "track", str(folder), "--quick", "--out", str(out)]) == 0
     (subject,) = json.loads((out / "bench_track_someone.json").read_text())["subjects"]
-    assert (subject["name"], subject["frames"]) == ("someone", 20)
+    assert (subject["name"], subject["frames"]) == ("someone", 14)
     assert 0.0 < subject["vertices"]["all"] < 4.0 and subject["head"] > 0.95
 
 

@@ -12,7 +12,7 @@ from avatar.commands import demo
 from avatar.runs.run import read_run_info
 from data_prep.formats.avatar_track import read_info
 
-FRAMES = 30
+FRAMES = 16
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The part of the image that a drawing is limited to."""
+"""The options of a drawing, and the part of the image that it is limited to."""
 
 from __future__ import annotations
 
@@ -13,6 +13,19 @@ class Region(NamedTuple):
     top: int
     right: int
     bottom: int
+
+
+class Options(NamedTuple):
+    """Those of `avatar.splat.splat`, which says what each means."""
+
+    sh_degree: int | None  # once checked, None for features alone
+    alpha_min: float
+    alpha_max: float
+    t_min: float
+    blur: float
+    near: float
+    antialiased: bool
+    region: Region
 
 
 def check_region(region: Any, width: int, height: int) -> Region:
