@@ -13,7 +13,7 @@ from small_runs import small_config, train_small
 
 from avatar.data.rig import RigCamera
 from avatar.errors import UserError
-from avatar.model import Avatar
+from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.motion import HeadPose, moved_pose
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.train.objective import Objective, choose_perceptual
