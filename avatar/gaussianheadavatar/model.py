@@ -6,7 +6,7 @@
 Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
 
 Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. docs/bench/cameras.md lists
-what differs from them: there is no first stage, so `start_from` takes geometry from mesh and masks, and first colours
+what differs from them: there is no first stage, so `initialize_from` takes geometry from mesh and masks, and first colours
 from frames.
 """
 
@@ -28,8 +28,8 @@ from avatar.compute.device import to_device
 from avatar.compute.memory import Need
 from avatar.config import ModelConfig, TrainerConfig
 from avatar.gaussianheadavatar.hyper_sets import Attributes, HyperSets
+from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
 from avatar.gaussianheadavatar.networks import ATTRIBUTES, Blended, Networks, Outputs, encode, nearness
-from avatar.gaussianheadavatar.start import starting_points
 from avatar.gaussianheadavatar.start_points import landmarks
 from avatar.gaussianheadavatar.upsampler import Upsampler
 from avatar.gaussians.apply_offsets import quaternion_product
@@ -58,7 +58,7 @@ class GaussianHeadAvatar(Avatar):
     is_replayable = False  # each path of the networks runs on the points that it counts for
     has_colours = False
     unknown_to_browsers = "its upsampling network"
-    start_frames = 48
+    initial_frames = 48
     hyper_class: ClassVar[type[nn.Module] | None] = None  # made of the numbers of Gaussians, channels and latent values
     centre: Tensor  # of the head at rest, metres
     joint: Tensor  # of its neck, metres
@@ -98,20 +98,20 @@ class GaussianHeadAvatar(Avatar):
         return Outputs(3, channels_of(config), ATTRIBUTES)
 
     @torch.no_grad()
-    def start_from(self, frames: Iterable[Frame], colours: bool) -> None:
+    def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
         """Put the Gaussians on the mesh, the masks' visual hull and into the mouth. Raises UserError for masks that have
         nothing in common."""
         config, shown = self.config, list(frames)
         texels = bound_texels(self.head.assets, self.head.assets, config.uv_size, config.uv_detail)
-        start = starting_points(self.head, texels, shown, len(self), self.centre, self.unit)
+        start = initial_gaussians(self.head, texels, shown, len(self), self.centre, self.unit)
         self.positions.copy_(start.positions)
         self.log_scales.copy_(start.log_scales)
         self.features.copy_(first_features((start.positions - self.centre) / self.unit))
         first = self.features.new_zeros(len(self), channels_of(config))
         first[:, :3] = start.colours if colours else 0.5
-        self.start_colours(first, shown)
+        self.initialize_colours(first, shown)
 
-    def start_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
+    def initialize_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
         """Fit the colour networks to these, whatever the frame's parameters."""
         branches = self.networks.expression, self.networks.pose
         optimizer = torch.optim.Adam([p for b in branches for p in b.colour.parameters()], FIT_RATE)
@@ -241,7 +241,7 @@ class HyperGaussianHeadAvatar(GaussianHeadAvatar):
         assert isinstance(self.hyper, HyperSets)
         return self.hyper(*blended)
 
-    def start_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
+    def initialize_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
         assert isinstance(self.hyper, HyperSets)
         self.hyper.start_colour(colours)
 

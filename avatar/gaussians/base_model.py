@@ -29,8 +29,8 @@ Groups = dict[str, tuple[Sequence[Tensor], float]]  # parameters and their learn
 class Avatar(nn.Module):
     """One person's avatar.
 
-    A model is a subclass. It makes its parameters in `make_parameters`, gives `forward`, `count_gaussians`, `start_from`
-    and `parameter_groups`, and of the other methods those in which it differs. `avatar.runs.model_registry` lists the
+    A model is a subclass. It makes its parameters in `make_parameters`, gives `forward`, `count_gaussians`,
+    `initialize_from` and `parameter_groups`, and of the other methods those in which it differs. `avatar.runs.model_registry` lists the
     models by name; most are an `avatar.gaussians.uv_avatar.UVAvatar`.
 
     `mesh` is `head`, or goes on after its vertices and triangles. `to(device)` moves all that drawing needs. `head` and
@@ -41,7 +41,7 @@ class Avatar(nn.Module):
     is_replayable = True  # whether steps, and frames, do the same operations each time
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     has_colours = True  # whether each Gaussian has a colour; else `draw` makes colours of features
-    start_frames = 16  # that `start_from` gets, evenly spread over the training frames
+    initial_frames = 16  # that `initialize_from` gets, evenly spread over the training frames
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
@@ -80,7 +80,7 @@ class Avatar(nn.Module):
         self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(N, 1))
         self.opacity_logits = nn.Parameter(torch.logit(torch.tensor(config.initial_opacity)).repeat(N))
 
-    def start_from(self, frames: Iterable[Frame], colours: bool) -> None:
+    def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
         """Before training: set from training frames what their pictures say; `colours`: colours too."""
         raise NotImplementedError
 

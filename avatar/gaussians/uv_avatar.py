@@ -51,7 +51,7 @@ class UVAvatar(Avatar):
         return texels
 
     @torch.no_grad()
-    def start_from(self, frames: Iterable[Frame], colours: bool) -> None:
+    def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
         """Set the base colour of each Gaussian to the mean that the frames show at its place; those that no frame shows
         keep theirs."""
         if not colours:

@@ -56,7 +56,7 @@ def train(
         load_module(avatar, resume.tensors, run)
         start = resume.step
     else:
-        start_from_frames(avatar, subject, config)
+        initialize_from_frames(avatar, subject, config)
     recording = subject.recording
     if resume is None:
         avatar.learn_head_rotation(recording.tracks["R"][recording.times(recording.split.train)])
@@ -126,11 +126,11 @@ def train(
     return step
 
 
-def start_from_frames(avatar: Avatar, subject: Subject, config: Config) -> None:
-    """Set what the avatar takes from training frames before its first step: `Avatar.start_from`."""
-    chosen = evenly_spread(subject.split.train, avatar.start_frames)
+def initialize_from_frames(avatar: Avatar, subject: Subject, config: Config) -> None:
+    """Set what the avatar takes from training frames before its first step: `Avatar.initialize_from`."""
+    chosen = evenly_spread(subject.split.train, avatar.initial_frames)
     frames = (subject.frame(index, config.data.size) for index in chosen)
-    avatar.start_from(frames, colours=config.trainer.initial_colours == "frames")
+    avatar.initialize_from(frames, colours=config.trainer.initial_colours == "frames")
 
 
 def save_avatar(

@@ -12,12 +12,12 @@ from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
 from avatar.errors import UserError
+from avatar.gaussianheadavatar.initial_gaussians import at_rest
 from avatar.gaussianheadavatar.model import GaussianHeadAvatar, small_camera
-from avatar.gaussianheadavatar.start import at_rest
 from avatar.head.model import matrix_from_6d
 from avatar.runs.model_registry import make_avatar
 from avatar.splat import splat_features
-from avatar.train.trainer import start_from_frames
+from avatar.train.trainer import initialize_from_frames
 from avatar.types import Camera
 
 NAMES = ["gaussianheadavatar", "gaussianheadavatar_hyper", "gaussianheadavatar_ndgs"]
@@ -139,7 +139,7 @@ def test_it_starts_on_the_mesh_and_on_the_hull_in_the_colours_of_training_frames
     for one in (subject, poisoned(subject)):
         avatar = new_avatar(assets, subject, config)
         assert isinstance(avatar, GaussianHeadAvatar)
-        start_from_frames(avatar, one, config)
+        initialize_from_frames(avatar, one, config)
         found.append(avatar)
     first, second = found
     for key, value in first.state_dict().items():
@@ -157,7 +157,7 @@ def test_a_head_of_one_colour_starts_in_that_colour(name: str, tracked_folder: P
     _, subject, assets = open_small(tracked_folder, config)
     avatar, colour = new_avatar(assets, subject, config), torch.tensor([0.8, 0.1, 0.3])
     frames = [subject.frame(i) for i in subject.split.train[::4]]
-    avatar.start_from([replace(f, image=colour.expand_as(f.image)) for f in frames], True)
+    avatar.initialize_from([replace(f, image=colour.expand_as(f.image)) for f in frames], True)
     gaussians = avatar(frames[0].params)
     screen = frames[0].camera.project(gaussians.means.detach())
     nearest = screen[:, 2] < screen[:, 2].median()  # the side that faces the camera
@@ -171,7 +171,7 @@ def test_masks_that_have_nothing_in_common_get_a_sentence(tracked_folder: Path) 
     avatar = new_avatar(assets, subject, config)
     frames = [subject.frame(i) for i in subject.split.train[:4]]
     with pytest.raises(UserError, match="nowhere to start.*avatar check"):
-        avatar.start_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], True)
+        avatar.initialize_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], True)
 
 
 def test_fewer_steps_have_higher_rates() -> None:

@@ -15,7 +15,7 @@ from avatar.gaussians import seen_colours as colours_module
 from avatar.gaussians.uv_avatar import UVAvatar
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
-from avatar.train.trainer import start_from_frames
+from avatar.train.trainer import initialize_from_frames
 from avatar.types import Camera, Frame
 
 
@@ -25,7 +25,7 @@ def seen_colours(avatar: UVAvatar, frame: Frame) -> tuple[torch.Tensor, torch.Te
 
 def colour_from_frames(avatar: UVAvatar, subject: Subject) -> int:
     """How many Gaussians got another colour than grey."""
-    start_from_frames(avatar, subject, small_config("trainer.initial_colours=frames"))
+    initialize_from_frames(avatar, subject, small_config("trainer.initial_colours=frames"))
     return int((avatar.sh_dc[:, 0] != 0).any(dim=-1).sum())
 
 

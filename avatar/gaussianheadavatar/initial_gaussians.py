@@ -1,4 +1,4 @@
-"""Where the Gaussians begin: on the mesh, on the visual hull of the training masks beyond it, and in the mouth."""
+"""Where the Gaussians start: on the mesh, on the visual hull of the training masks beyond it, and in the mouth."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ MOUTH_COLOUR = 0.3  # dark: a mouth's inside
 UNSEEN = 0.5  # grey
 
 
-class Start(NamedTuple):
+class InitialGaussians(NamedTuple):
     positions: Float[Tensor, "N 3"]  # metres, head at rest
     log_scales: Float[Tensor, "N 3"]
     colours: Float[Tensor, "N 3"]  # in [0, 1]
 
 
-def starting_points(
+def initial_gaussians(
     head: HeadModel, texels: UVTexels, frames: Sequence[Frame], count: int, centre: Float[Tensor, 3], half: float
-) -> Start:
+) -> InitialGaussians:
     """`count` points, those of `texels` first; `centre` and `half` say where the head is and half its length, metres.
 
     Raises UserError for masks that leave no common hull.
@@ -51,7 +51,7 @@ def starting_points(
     mouth = mouth_box(lips, in_mouth, torch.Generator().manual_seed(0))
     positions = torch.cat((on_mesh, outside, mouth))
     shown = (colours, hull_colours(head, outside, frames, centre), torch.full_like(mouth, MOUTH_COLOUR))
-    return Start(positions, knn_log_scales(positions), torch.cat(shown))
+    return InitialGaussians(positions, knn_log_scales(positions), torch.cat(shown))
 
 
 def beyond_mesh(
