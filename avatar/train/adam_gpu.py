@@ -54,7 +54,7 @@ class GpuAdam(torch.optim.Adam):
                     adam,
                     -(-parameter.numel() // LANES),
                     parameter,
-                    parameter.grad.contiguous(),
+                    in_order_of(parameter, parameter.grad),
                     state["exp_avg"],
                     state["exp_avg_sq"],
                     group["full_lr"],
@@ -70,3 +70,10 @@ class GpuAdam(torch.optim.Adam):
                     LOG2_BETA2=math.log2(beta2),
                     BLOCK=LANES,
                 )
+
+
+def in_order_of(parameter: Tensor, gradient: Tensor) -> Tensor:
+    """The gradient in the parameter's order in memory, by which the kernel pairs their values."""
+    if gradient.stride() == parameter.stride():
+        return gradient
+    return torch.empty_like(parameter).copy_(gradient)

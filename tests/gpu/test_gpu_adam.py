@@ -14,13 +14,14 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from avatar.train.adam_gpu import GpuAdam
 from avatar.train.optimizer import EPSILON, load_optimizer, optimizer_tensors, set_rates
 
-SHAPES = ((3,), (70, 5), (), (1500,))
+SHAPES = ((3,), (70, 5), (), (4, 3, 2, 5), (1500,))  # that of four dimensions has its channels last in memory
 RATES = (1e-2, 2e-4)
 
 
 def parameters() -> list[nn.Parameter]:
     generator = torch.Generator().manual_seed(0)
-    return [nn.Parameter(torch.randn(shape, generator=generator).to(DEVICE)) for shape in SHAPES]
+    values = [torch.randn(shape, generator=generator).to(DEVICE) for shape in SHAPES]
+    return [nn.Parameter(v.to(memory_format=torch.channels_last) if v.ndim == 4 else v) for v in values]
 
 
 def groups_of(own: list[nn.Parameter]) -> list[dict[str, object]]:
