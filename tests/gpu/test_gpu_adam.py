@@ -72,7 +72,7 @@ def test_the_first_step_is_the_rate_times_the_gradients_sign() -> None:
     adam = GpuAdam(groups_of(own), eps=EPSILON, device=DEVICE)
     give(own, 3)
     adam.step()
-    for parameter, old, rate in zip(own, before, (RATES[0], RATES[0], RATES[1], RATES[1]), strict=True):
+    for parameter, old, rate in zip(own, before, (RATES[0], RATES[0], RATES[1], RATES[1], RATES[1]), strict=True):
         moved = old - parameter.detach()
         torch.testing.assert_close(moved, rate * parameter.grad.sign(), rtol=1e-3, atol=3e-7)
 
