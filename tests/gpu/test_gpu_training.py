@@ -75,6 +75,13 @@ def test_steps_have_the_losses_of_the_cpu(
     assert all(tensor.is_cpu for tensor in saved.tensors.values())
 
 
+def test_steps_of_gaussian_head_avatar_have_the_losses_of_the_cpu(tracked_folder: Path, tmp_path: Path) -> None:
+    steps = ("model=gaussianheadavatar_hyper", "trainer.iterations=4")
+    _, expected = trained(tracked_folder, tmp_path / "cpu", *steps, on_cpu=True)
+    _, found = trained(tracked_folder, tmp_path / "gpu", *steps)
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
 @pytest.fixture
 def launched(monkeypatch: pytest.MonkeyPatch) -> None:
     """No step is replayed, so that Python sees what each does."""
