@@ -168,7 +168,9 @@ def judge_tracking(info: TrackingInfo, subject: Path, anyway: bool) -> None:
     """Say how many figures are good. Raises UserError, with advice, where one is poor and not to be let pass."""
     judged = [figure for figure in info.quality.get("figures", ()) if "grade" in figure]
     counts = [f"{sum(f['grade'] == grade for f in judged)} {grade}" for grade in ("good", "fair", "poor")]
-    print(f"{', '.join(counts)} of {len(judged)} figures; look at {subject / 'overlay'}: does the mesh lie on the face?")
+    print(
+        f"{', '.join(counts)} of {len(judged)} figures; look at {subject / 'overlay'}: does the mesh lie on the face?"
+    )
     told = [
         f"{figure['name'].replace('  of', 'landmark error of')}: {figure['value']:.4g} {figure['unit']}".rstrip()
         + (f" -> {figure['advice']}" if figure["advice"] else "")

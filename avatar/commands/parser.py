@@ -36,7 +36,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     parser = argparse.ArgumentParser(
         prog="avatar",
         description="Animatable 3D Gaussian head avatars from a video of one person, on a CPU or a GPU.",
-        epilog="To begin: avatar demo OUT. avatar COMMAND --help lists a command's options.",
+        epilog="To begin: avatar demo OUT, or avatar create VIDEO. avatar COMMAND --help lists a command's options.",
     )
     parser.add_argument("--version", action="version", version=f"avatar {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
