@@ -130,8 +130,8 @@ def training_arguments(arguments: Namespace, place: Place) -> Namespace:
 
 
 def say_plan(footage: Footage, assets: HeadAssets, training: Namespace) -> None:
-    """Frames, minutes and memory. The minutes are those of the documentation's machine, of two cores of 2023: a slower one
-    takes longer, one thread about twice as long. Raises UserError where memory or the device are missing."""
+    """Print frames, minutes and memory. The minutes are the documentation's, of two free cores and without LPIPS; with one
+    thread twice those. Raises UserError where the memory does not suffice or the device is not there."""
     config = load_config(config_overrides(training))
     device = choose_device(training.device or config.device, print)
     frames = count_frames(footage)
@@ -143,8 +143,9 @@ def say_plan(footage: Footage, assets: HeadAssets, training: Namespace) -> None:
     tracking, rest = frames * TRACKING_FRAME, training_seconds(config, training.refine or 0, frames, train, device.type)
     slower = 2 / min(2, thread_count())
     minutes = [f"{seconds * slower / 60:.1f}" for seconds in (tracking + rest, tracking, rest)]
+    counted = "about" if footage.duration and footage.rate else "at most"
     print(
-        f"Plan         about {frames:,} frames; about {minutes[0]} minutes on this machine, tracking {minutes[1]} and "
+        f"Plan         {counted} {frames:,} frames; about {minutes[0]} minutes on this machine, tracking {minutes[1]} and "
         f"training {minutes[2]}; what is done already takes none"
     )
     memory = max(TRACKING_BYTES, sum(need.size for need in needs))

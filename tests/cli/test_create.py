@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from avatar.files.third_party import FOLDER_VARIABLE
 from avatar.files.video import video_writer
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.prepare.open import HEAD_VARIABLE
+from data_prep.track.footage.pictures import open_footage
 from data_prep.track.quality import Figure
 
 FRAMES = 30
@@ -141,6 +143,21 @@ def test_a_folder_of_another_video_is_refused(
     shutil.copytree(tracked_folder, subject := video.parent / "me" / "subject")
     words = ("create", video, "--head", tracked_folder / "head_model", "--out", subject.parent)
     assert f"{subject} exists and is not this tracking" in avatar(*words, status=1)
+
+
+def test_the_page_is_shown_where_there_is_a_desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("webbrowser.open", shown.append)
+    create.show(tmp_path / "avatar.html")
+    assert shown == [(tmp_path / "avatar.html").as_uri()]
+
+
+def test_frames_are_counted_as_they_are_tracked(video: Path) -> None:
+    footage = open_footage(video)
+    assert create.count_frames(footage) == FRAMES
+    assert create.count_frames(replace(footage, rate=60.0, duration=10.0)) == 300, "every second one"
+    assert create.count_frames(replace(footage, duration=None)) == create.count_frames(replace(footage, duration=1e4))
 
 
 def test_the_minutes_count_every_part() -> None:
