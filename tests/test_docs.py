@@ -13,6 +13,7 @@ from avatar.commands.arguments import parse
 from avatar.config import load_config
 
 COMMANDS = (
+    "create",
     "train",
     "eval",
     "refine",

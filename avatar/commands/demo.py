@@ -6,22 +6,19 @@ from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
 
-from avatar.commands.eval import writing_figures
+from avatar.commands.finish import figures, measured
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
-from avatar.evaluation.evaluate import evaluate
 from avatar.export.web_page import write_page
-from avatar.files.opening import read_json
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
-from avatar.pipeline.open import open_driver, open_run
+from avatar.pipeline.open import open_driver
 from avatar.pipeline.reenact import reenact
 from avatar.pipeline.track import bar, can_track
-from avatar.pipeline.train import resume_run, train_new
-from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.run import RUN_FILE, open_trained, read_run_info
+from avatar.pipeline.train_refined import go_on_or_begin, is_begun
+from avatar.runs.run import open_trained, read_run_info
 from data_prep.track.track import track
 
 RECIPE = ["experiment=demo"]
@@ -43,20 +40,18 @@ def run_demo(arguments: Namespace) -> int:
     actor, driver, run = out / ACTOR.name, out / DRIVER.name, out / "run"
     check_folder_output(out)
     check_outputs([out, run], [])
-    begun = (run / RUN_FILE).is_file() and list_checkpoints(run / "checkpoints")
-    if begun and read_run_info(run).source.folder.resolve() != actor.resolve():
+    if is_begun(run) and read_run_info(run).source.folder.resolve() != actor.resolve():
         raise UserError(f"{run} is a run of another video; choose another folder for the demo")
     missing = [person for person in (ACTOR, DRIVER) if not (out / person.name).is_dir()]
     make = film_and_track if missing and can_track(say_why_not) else make_tracked
     for person in missing:
         make(person, out)
-    status = resume_run(run) if begun else train_new(Source(actor, head_beside(actor)), RECIPE, run)
+    status = go_on_or_begin(Source(actor, head_beside(actor)), RECIPE, run)
     if status != OK:
         return status
     trained = open_trained(run)
     video = reenact(trained, open_driver(driver, trained), run / "reenact" / "driver-relative.mp4")
-    with writing_figures(run):
-        results = evaluate(open_run(run, say=discard), None, write_frames=False, say=discard)
+    results = measured(run)
     page = write_page(trained, out / "avatar.html")
     print("\nThe demo is done.")
     if (film := out / f"{ACTOR.name}.mp4").is_file():
@@ -67,17 +62,6 @@ def run_demo(arguments: Namespace) -> int:
     print(f"  avatar eval {run}   prints all its figures, avatar view {run} moves it by hand")
     print(f"\nOpen this first: {page.path}, the avatar in a browser")
     return OK
-
-
-def discard(_: str) -> None:
-    """What `avatar eval` prints is a screen of its own."""
-
-
-def figures(results: Path) -> str:
-    """Of the protocol that masks nothing away."""
-    strict = read_json(results)["protocols"]["strict"]
-    means = strict["means"]
-    return f"PSNR {means['psnr']:.2f}, SSIM {means['ssim']:.4f} over {len(strict['frames'])} of them"
 
 
 def film_and_track(person: Person, out: Path) -> None:

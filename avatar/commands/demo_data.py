@@ -32,7 +32,7 @@ def run_demo_data(arguments: Namespace) -> int:
         if not (head := head_beside(arguments.out)).exists():
             make_head_model(head)
             print(f"Head   {head}")
-        print(f"Next   avatar train {arguments.out} --head {head}")
+        print(f"Next   avatar create {arguments.out} --head {head}")
         return OK
     make_subject(arguments.out, frames, _or(arguments.size, 256), arguments.seed, motion)
     print(f"Next   avatar train {arguments.out}")

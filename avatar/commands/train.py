@@ -13,6 +13,7 @@ from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.files.names import safe_name
+from avatar.pipeline import OK
 from avatar.pipeline.open import at_new_place, source_of
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, plan_file
 from avatar.pipeline.track import head_for_video, is_video, tracked_once
@@ -27,6 +28,13 @@ MAX_ROUNDS = 10
 def run_train(arguments: Namespace) -> int:
     settle_paths(arguments)
     run = arguments.out or default_run(arguments.folder)
+    status = train_as_asked(run, arguments)
+    print(f"Next         avatar eval {run}" if status == OK else "Add --resume to the same command to go on.")
+    return status
+
+
+def train_as_asked(run: Path, arguments: Namespace) -> int:
+    """Train into `run`, or go on with it; the exit status."""
     overrides = config_overrides(arguments)
     has_plan = plan_file(run).exists()
     if arguments.device is not None and (arguments.refine is not None or has_plan):

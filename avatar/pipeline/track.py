@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -30,8 +31,9 @@ def head_for_video(video: Path, given: Path | None) -> Path:
     if named := named_path(HEAD_VARIABLE):
         return named
     raise UserError(
-        f"no head model to track {video} with: give --head PATH, or set {HEAD_VARIABLE}. FLAME 2023 Open (CC-BY-4.0) can "
-        "be had from https://flame.is.tue.mpg.de; docs/data.md says which files belong into its folder"
+        f"no head model to track {video} with: give --head PATH, or set {HEAD_VARIABLE}. Register at "
+        "https://flame.is.tue.mpg.de, download FLAME 2023 Open (CC-BY-4.0) and unpack it into a folder; docs/data.md says "
+        "which files belong there"
     )
 
 
@@ -56,17 +58,25 @@ def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> P
     return folder
 
 
+def tracking_lacks(*others: Callable[[], object]) -> list[str]:
+    """All that tracking a video needs and this machine has not, each with what to do; `others` are checked first, and raise
+    UserError for what is missing."""
+    needed = [partial(require, file) for file in TRACKING_FILES if not file.is_optional]
+    missing = []
+    for check in (*others, load_mediapipe, *needed):
+        try:
+            check()
+        except UserError as error:
+            missing.append(str(error))
+    return missing
+
+
 def can_track(say: Callable[[str], object]) -> bool:
     """Whether this machine has what tracking a video needs; says what is missing where it has not."""
-    try:
-        load_mediapipe()
-        for file in TRACKING_FILES:
-            if not file.is_optional:
-                require(file)
-    except UserError as error:
-        say(str(error))
-        return False
-    return True
+    missing = tracking_lacks()
+    if missing:
+        say("; ".join(missing))
+    return not missing
 
 
 def bar(items: Iterable[Item], total: int | None, title: str, unit: str = "frames") -> Iterable[Item]:

@@ -86,7 +86,7 @@ def go_on(
     avatar = new_avatar(assets, subject, config, info.perceptual, chosen)
     if is_complete:
         save_avatar(run, avatar, checkpoint, subject, config, info.perceptual)
-        print(f"{run} is complete ({checkpoint.step} steps). Next: avatar eval {run}")
+        print(f"{run} is complete ({checkpoint.step} steps).")
         return OK
     if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
         print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; {OTHER_ROUNDING}")
@@ -137,12 +137,10 @@ def finish_training(
     rate = f"{seconds / max(done - first, 1):.3f} s per step"
     if done < config.trainer.iterations:
         print(f"\nInterrupted at step {done} ({rate}); everything up to there is saved in {run}.")
-        print("Add --resume to the same command to go on.")
         return INTERRUPTED
     print(f"Trained in {seconds:.0f} s ({rate}).")
     print(f"Avatar       {run / 'avatar.safetensors'}")
     print(f"Previews     {run / 'previews'}")
     if next((curves := run / "tensorboard").glob("events*"), None) is not None:
         print(f"Curves       tensorboard --logdir {curves}")
-    print(f"Next         avatar eval {run}")
     return OK

@@ -55,7 +55,7 @@ def test_the_command_writes_a_video_and_a_head_model(tmp_path: Path, capsys: pyt
     out, head = tmp_path / "me.mp4", tmp_path / "head_model"
     options = ["--video", "--frames", "3", "--size", "96"]
     assert main(["demo-data", str(out), *options, "--seed", "1"]) == 0
-    assert f"avatar train {out} --head {head}" in capsys.readouterr().out
+    assert f"avatar create {out} --head {head}" in capsys.readouterr().out
     video = open_video(out)
     assert (video.width, video.height, video.rate) == (96, 96, 25.0)
     assert len(list(video.read(whole(96, 96), Span(), lambda said: None))) == 3

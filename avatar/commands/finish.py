@@ -1,0 +1,34 @@
+"""What follows a training where one command does everything: the figures, and their line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from avatar.commands.eval import writing_figures
+from avatar.evaluation.evaluate import evaluate, facts_of
+from avatar.evaluation.previous_results import read_earlier
+from avatar.files.opening import read_json
+from avatar.pipeline.open import open_run
+
+
+def measured(path: Path) -> Path:
+    """RUN/eval/results.json of a run, by all protocols; what was measured already is not measured again.
+
+    Raises UserError as `evaluate` does.
+    """
+    run, folder = open_run(path, say=discard), path / "eval"
+    if read_earlier(folder, facts_of(run), ()).entries:
+        return folder / "results.json"
+    with writing_figures(path):
+        return evaluate(run, None, write_frames=False, say=discard)
+
+
+def discard(_: str) -> None:
+    """What `avatar eval` prints is a screen of its own."""
+
+
+def figures(results: Path) -> str:
+    """Of the protocol that masks nothing away."""
+    strict = read_json(results)["protocols"]["strict"]
+    means = strict["means"]
+    return f"PSNR {means['psnr']:.2f}, SSIM {means['ssim']:.4f} over {len(strict['frames'])} of them"
