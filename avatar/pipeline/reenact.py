@@ -27,9 +27,9 @@ from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
 from avatar.files.video import side_by_side, write_video
 from avatar.head.model import HeadModel
-from avatar.motion.distance_strip import DistanceStrip, distances_csv
 from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
 from avatar.motion.rest import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
+from avatar.motion.training_distance import DistanceStrip, distances_csv
 from avatar.motion.transfer import NEUTRAL_MODES, Transfer, transfer_motion
 from avatar.runs.run import versions
 from avatar.runs.trained import TrainedAvatar

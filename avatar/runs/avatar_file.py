@@ -32,7 +32,7 @@ from avatar.files.opening import MissingFile, open_file
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames, parse_expression_names
-from avatar.head.packed import head_from_tensors, head_tensors
+from avatar.head.head_tensors import head_from_tensors, head_tensors
 from avatar.motion.rest import RestPose
 from avatar.runs.checkpoint import check_fit, load_module, module_tensors
 from avatar.runs.memory_estimate import count_gaussians, drawing_needs

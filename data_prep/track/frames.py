@@ -14,11 +14,11 @@ from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress
+from data_prep.track.despill import despilled
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.first_pass import Look
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
-from data_prep.track.own_mattes import OPAQUE, OwnMattes, share_on
-from data_prep.track.spill import despilled
+from data_prep.track.user_mattes import OPAQUE, OwnMattes, share_on
 
 # JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -116,7 +116,7 @@ def write_masks(
 def write_despilled(
     folder: Path, numbers: Sequence[int], images: Read, mattes: Read, width: int, progress: Progress
 ) -> None:
-    """The frames as `spill.despilled` makes them, as JPEG; by some threads."""
+    """The frames as `despill.despilled` makes them, as JPEG; by some threads."""
 
     def one(number: int) -> None:
         made = despilled(images(number), mattes(number), width)

@@ -35,15 +35,15 @@ from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.first_pass import Look, from_json, look_at, to_json
 from data_prep.track.fit.focal import Focal
 from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, View, check_span
-from data_prep.track.footage.turned import turned
 from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, matte_network, tracking_key
-from data_prep.track.own_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 from data_prep.track.quality import judge
 from data_prep.track.stage_folder import StageFolder, growing
 from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
 from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
+from data_prep.track.user_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"

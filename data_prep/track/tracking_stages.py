@@ -13,7 +13,7 @@ from avatar.data.images import read_image, read_mask
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.progress import Progress
-from data_prep.track import background_plate, spill
+from data_prep.track import background_plate, despill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
@@ -39,8 +39,8 @@ from data_prep.track.matting import open_matter, sharpened
 from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.outline import Outline, measure_outline
 from data_prep.track.overlay import FrameParts, write_overlay
-from data_prep.track.own_mattes import OwnMattes
 from data_prep.track.stage_folder import StageFolder
+from data_prep.track.user_mattes import OwnMattes
 
 DESPILLED = "despilled"  # the stage that stands in for the frames
 
@@ -134,8 +134,8 @@ class TrackingStages:
         numbers = _numbers(landmarks)
 
         def make(folder: Path) -> dict[str, Any]:
-            some = numbers[:: -(-len(numbers) // spill.CLIP_FRAMES)]
-            width = spill.spill_width((self._image(number), self._mask(number)) for number in some)
+            some = numbers[:: -(-len(numbers) // despill.CLIP_FRAMES)]
+            width = despill.spill_width((self._image(number), self._mask(number)) for number in some)
             if width:
                 write_despilled(folder, numbers, self._image, self._mask, width, self._progress)
             return {"width": width}

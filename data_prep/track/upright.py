@@ -16,8 +16,8 @@ from jaxtyping import UInt8
 
 from avatar.errors import UserError
 from data_prep.track.faces.detect import Face, FaceDetector
+from data_prep.track.footage.rotated import TURNS, turn_image
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
-from data_prep.track.footage.turned import TURNS, turn_image
 
 SAMPLES = 8  # pictures
 LONGEST = 1280  # pixels of their longer side

@@ -8,8 +8,8 @@ import torch
 from heads import random_params, rest_params
 
 from avatar.head.model import matrix_from_6d
-from avatar.motion.distance_strip import FAR, DistanceStrip, distances_csv
 from avatar.motion.drive import Drive, choose_cameras, smoothed
+from avatar.motion.training_distance import FAR, DistanceStrip, distances_csv
 from avatar.types import Camera
 
 

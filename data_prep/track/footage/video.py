@@ -23,7 +23,7 @@ from data_prep.track.footage.source import (
     opaque,
     stride,
 )
-from data_prep.track.footage.tone import HDR_TRANSFERS, tone_filters
+from data_prep.track.footage.tone_mapping import HDR_TRANSFERS, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
 _STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\(\w+\))?: (\w+): (.*)")

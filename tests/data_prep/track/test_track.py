@@ -161,7 +161,7 @@ def test_what_is_to_be_tracked(tracked: Path, video: Path, tmp_path: Path) -> No
         find_head(video)
 
 
-def test_own_mattes_win(video: Path, demo_head_model: Path, tmp_path: Path) -> None:
+def test_user_mattes_win(video: Path, demo_head_model: Path, tmp_path: Path) -> None:
     performance = perform(SEED, FRAMES, "speech")
     folder = tmp_path / "mattes"
     folder.mkdir()

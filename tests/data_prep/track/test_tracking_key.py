@@ -143,7 +143,7 @@ def test_another_file_of_the_head_model_makes_another(name: str, head: Path) -> 
     assert key(head) != before
 
 
-def test_own_mattes_make_another(head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_user_mattes_make_another(head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("data_prep.track.tracking_stages.open_footage", lambda path: footage(path.name))
     keys = {key(head), key(head, Choices(matte=Path("a"))), key(head, Choices(matte=Path("b")))}
     assert len(keys) == 3

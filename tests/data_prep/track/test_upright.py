@@ -20,8 +20,8 @@ from data_prep.track import track as tracking
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.rotated import TURNS, turn_image, turned
 from data_prep.track.footage.source import Box, Span, View, whole
-from data_prep.track.footage.turned import TURNS, turn_image, turned
 from data_prep.track.track import Choices, track
 from data_prep.track.upright import find_upright, find_upright_by_landmarks, roll_of, sample_pictures
 

@@ -19,9 +19,9 @@ from avatar.errors import UserError
 from data_prep.prepare.mask_values import coloured_sentence, is_coloured, judge_range, only_label, sampled
 from data_prep.track.faces.detect import Face
 from data_prep.track.footage.pictures import PictureFolder, open_footage, resampled
+from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
 from data_prep.track.footage.timing import DEFAULT_FPS
-from data_prep.track.footage.turned import turned
 from data_prep.track.upright import LONGEST, sample_pictures
 
 OPAQUE = 0.5  # of the face: less is not the person's matte
