@@ -49,7 +49,7 @@ def test_the_same_subject(original: Path, folder: Path, tmp_path: Path) -> None:
     assert said[0] == "format: avatar-track" and mine.manifest.frame_offset == 0
     assert said[1].startswith("images and tracking are paired by tracking.json: head overlap")
     assert any("the focal length is assumed: a lens of 28 mm equivalent: give --focal" in line for line in said)
-    assert len(mine) == FRAMES - 2 and mine.fps == 29.97
+    assert len(mine) == FRAMES - 2 and mine.recording.fps == 29.97
     at = [n for n in range(FRAMES) if n not in (5, 6)]
     for name in ("expression", "jaw", "eyes", "eyelids", "neck", "R", "t"):
         torch.testing.assert_close(mine.recording.tracks[name], theirs.recording.tracks[name][at], atol=1e-6, rtol=0)
