@@ -107,7 +107,8 @@ class CovarianceAvatar(FlashAvatar):
 
     @classmethod
     def step_needs(cls, config: ModelConfig, gaussians: int, size: tuple[int, int]) -> list[Need]:
-        """Of each head: the factor as a square, the latent's columns of the covariance, and the factors of its block."""
+        """Of each head: the factor as a square, its diagonal and both gradients; the latent's columns of the covariance and
+        its block's factors, with theirs."""
         n = config.latent_dim
-        squares = sum((m + n) ** 2 + (m + n) * n + n**2 for m in HEADS.values())
+        squares = sum(4 * (m + n) ** 2 + 2 * (m + n) * n + 2 * n**2 for m in HEADS.values())
         return [Need("the covariances", 4 * gaussians * squares, "model.uv_size or model.latent_dim")]

@@ -95,6 +95,13 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("{run}/eval", OF_RUN),
         ("{motion}", IS_FILE),
     ],
+    "create {clip} --head {head}": [
+        ("{clip}", IS_INPUT),
+        ("{clip}/me", IN_INPUT),
+        ("{head}/me", IN_INPUT),
+        ("{run}/eval", OF_RUN),
+        ("{motion}", IS_FILE),
+    ],
     "track {clip} --head {head} --matte {data}": [("{data}/tracked", IN_INPUT)],
     "compare {run} {run}": [("{run}/eval", OF_RUN), ("{run}/run.json", IS_FILE), ("{motion}", IS_FILE)],
     "bench splat --quick": [("{run}/checkpoints", OF_RUN), ("{motion}", IS_FILE)],
