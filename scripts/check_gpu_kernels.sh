@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Verify the GPU's kernels where there is no GPU: Triton's interpreter against the compiled core and the float64 reference,
 # deliberate mistakes that the tests have to catch, launches counted on torch's meta device, and every kernel compiled for
-# three GPUs (all six: compile_kernels.py --all). Installs Triton into .venv; where that cannot be had, says so and is done.
+# six GPUs. Installs Triton into .venv; where that cannot be had, says so and is done.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=.venv/bin/python

@@ -1,10 +1,6 @@
 """Compile every GPU kernel ahead of time, for targets that this machine need not have, and say what each one takes.
 
-    python scripts/compile_kernels.py [--out docs/bench/gpu_kernels.md] [--all | --targets sm_90 gfx942 ...] [--jobs 2]
-
-Without --all, for three GPUs: sm_90; gfx1100, whose 256 registers are the fewest of AMD's; gfx942, whose programs have 64
-lanes a warp and multiply matrices with instructions of their own. Left out are sm_80, sm_100 and sm_120, which have sm_90's
-limit of 255 registers a thread and compilers that differ little. --all is for the table.
+    python scripts/compile_kernels.py [--out docs/bench/gpu_kernels.md] [--targets sm_90 gfx942 ...] [--jobs 2]
 
 What is compiled is what the program starts: drawings, training steps and frames are rehearsed on torch's meta device,
 where a start is noted and nothing computed. Ends with status 1 when a kernel does not compile, or keeps values in memory
@@ -52,7 +48,6 @@ TARGETS = {
     "gfx942": GPUTarget("hip", "gfx942", 64),
     "gfx1100": GPUTarget("hip", "gfx1100", 32),
 }
-USUAL = ("sm_90", "gfx942", "gfx1100")
 TYPES = {
     torch.float32: "*fp32",
     torch.float64: "*fp64",
@@ -189,8 +184,8 @@ def table(variants: Sequence[Variant], targets: Sequence[str], uses: dict[tuple[
     lines = [
         "# What the GPU's kernels take",
         "",
-        f"Registers a thread, by Triton {triton.__version__}'s compilers; `python scripts/compile_kernels.py --all` writes "
-        "this. No kernel spills one.",
+        f"Registers a thread, by Triton {triton.__version__}'s compilers; `python scripts/compile_kernels.py` writes this. "
+        "No kernel spills one.",
         "",
         "| kernel | warps | shared bytes | " + " | ".join(targets) + " |",
         "|---|---|---|" + "---|" * len(targets),
@@ -205,17 +200,7 @@ def table(variants: Sequence[Variant], targets: Sequence[str], uses: dict[tuple[
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="write the table there")
-    parser.set_defaults(targets=list(USUAL))
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--all",
-        action="store_const",
-        dest="targets",
-        const=list(TARGETS),
-        default=argparse.SUPPRESS,
-        help="for all six GPUs",
-    )
-    chosen.add_argument("--targets", nargs="+", choices=tuple(TARGETS), default=argparse.SUPPRESS)
+    parser.add_argument("--targets", nargs="+", choices=tuple(TARGETS), default=list(TARGETS))
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     variants = rehearse(head_assets(demo_head()))
