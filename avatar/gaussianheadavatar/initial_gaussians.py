@@ -14,7 +14,7 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.gaussianheadavatar.start_points import knn_log_scales, mouth_box, spread_points, visual_hull
 from avatar.gaussians.mesh_embedding import Embedding
-from avatar.gaussians.seen_colours import mean_colours, seen_at
+from avatar.gaussians.seen_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.uv import UVTexels
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.types import Camera, Frame
@@ -84,10 +84,8 @@ def hull_colours(
     head: HeadModel, points: Float[Tensor, "H 3"], frames: Sequence[Frame], centre: Float[Tensor, 3]
 ) -> Float[Tensor, "H 3"]:
     """The mean colour that the frames show at points beyond the mesh; outwards is away from the head's centre."""
-    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
-    for frame in frames:
-        still = replace(frame, camera=at_rest(head, frame))
-        pixels, shown = seen_at(points, points - centre, head.neutral_vertices(), head.faces, still)
-        total += pixels * shown[:, None]
-        weight += shown
-    return torch.where(weight[:, None] > 1e-3, total / weight.clamp(min=1e-3)[:, None], torch.tensor(UNSEEN))
+    surface = head.neutral_vertices(), head.faces
+    still = (replace(frame, camera=at_rest(head, frame)) for frame in frames)
+    colours, seen = mean_of(len(points), (seen_at(points, points - centre, *surface, frame) for frame in still))
+    colours[~seen] = UNSEEN
+    return colours

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -59,7 +59,6 @@ class GaussianHeadAvatar(Avatar):
     has_colours = False
     unknown_to_browsers = "its upsampling network"
     initial_frames = 48
-    hyper_class: ClassVar[type[nn.Module] | None] = None  # made of the numbers of Gaussians, channels and latent values
     centre: Tensor  # of the head at rest, metres
     joint: Tensor  # of its neck, metres
     places: Tensor  # landmarks, half head lengths from the centre
@@ -87,10 +86,15 @@ class GaussianHeadAvatar(Avatar):
         self.positions = nn.Parameter(torch.zeros(N, 3))  # metres, head at rest
         self.features = nn.Parameter(torch.zeros(N, FEATURES))
         theta = num_expressions + CONDITION_EXTRAS
-        self.networks = Networks(theta, 6, config.mlp_width, FEATURES, outputs, bounded=self.hyper_class is None)
-        self.hyper = None if self.hyper_class is None else self.hyper_class(N, channels, config.latent_dim)
+        self.hyper = self.make_hyper(config, N)
+        self.networks = Networks(theta, 6, config.mlp_width, FEATURES, outputs, bounded=self.hyper is None)
         self.upsampler = Upsampler(channels, config.upsampling)
         self.register_buffer("mean_rotation", torch.eye(3))
+
+    @staticmethod
+    def make_hyper(config: ModelConfig, N: int) -> nn.Module | None:
+        """The distributions that the networks' latents condition; None: there are no latents."""
+        return None
 
     @staticmethod
     def outputs(config: ModelConfig) -> Outputs:
@@ -230,7 +234,9 @@ class GaussianHeadAvatar(Avatar):
 class HyperGaussianHeadAvatar(GaussianHeadAvatar):
     """With HyperGaussians: the networks give five latents, which condition what the networks gave before."""
 
-    hyper_class = HyperSets
+    @staticmethod
+    def make_hyper(config: ModelConfig, N: int) -> nn.Module:
+        return HyperSets(N, channels_of(config), config.latent_dim)
 
     @staticmethod
     def outputs(config: ModelConfig) -> Outputs:
@@ -246,17 +252,12 @@ class HyperGaussianHeadAvatar(GaussianHeadAvatar):
         self.hyper.start_colour(colours)
 
 
-class MovedAndFaded(NdGaussians):
-    """`NdGaussians` for any number of feature channels, which they do not touch."""
-
-    def __init__(self, num_gaussians: int, _: int, latents: int) -> None:
-        super().__init__(num_gaussians, latents)
-
-
 class NdgsHeadAvatar(GaussianHeadAvatar):
     """With N-dimensional Gaussians, which the latent moves and fades; colours and shapes are the networks' own."""
 
-    hyper_class = MovedAndFaded
+    @staticmethod
+    def make_hyper(config: ModelConfig, N: int) -> nn.Module:
+        return NdGaussians(N, config.latent_dim)
 
     @staticmethod
     def outputs(config: ModelConfig) -> Outputs:

@@ -26,9 +26,15 @@ def mean_colours(
     A frame counts by the cosine between the surface's normal and the line of sight, squared, times the matte, and not at
     all where the mesh hides the place.
     """
-    total, weight = torch.zeros(len(embedding), 3), torch.zeros(len(embedding))
-    for frame in frames:
-        colours, shown = seen_colours(mesh, embedding, frame)
+    return mean_of(len(embedding), (seen_colours(mesh, embedding, frame) for frame in frames))
+
+
+def mean_of(
+    N: int, looks: Iterable[tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]]
+) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
+    """The mean of what `seen_at` gave for N points in some frames, and which points they show."""
+    total, weight = torch.zeros(N, 3), torch.zeros(N)
+    for colours, shown in looks:
         total += colours * shown[:, None]
         weight += shown
     seen = weight > LEAST_WEIGHT

@@ -20,7 +20,7 @@ def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(objective, "load_lpips", missing)
 
 
-@pytest.mark.parametrize("name", ["paper", "mlp_256x40", "mlp_512x11"])
+@pytest.mark.parametrize("name", ["paper", "mlp_256x40", "mlp_512x11", "gha_paper"])
 def test_the_papers_experiments_never_train_without_lpips(name: str) -> None:
     said: list[str] = []
     config = load_config([f"experiment={name}"]).trainer
