@@ -5,8 +5,8 @@ Conventions
 Camera      OpenCV: x right, y down, z forward; the centre of pixel (column i, row j) is at (i + 0.5, j + 0.5).
             `T_cam_world` style names say from-to: `p_cam = R_cam_world @ p_world + t_cam_world`. Lengths in metres,
             focal lengths and principal point in pixels of this camera's own width and height.
-World       The posed head's own space: identity global rotation, head pose is in the camera. Where several cameras
-            film one head, each camera's pose holds the head's.
+World       The posed head's own space: the head's pose, its neck's turn included, is in the camera, and the torso
+            turns beneath it. Where several cameras film one head, each camera's pose holds the head's.
 Rotations   Quaternions are (w, x, y, z) and are normalised where they are used. "6D" rotations are the first two rows
             of the matrix, flattened; the third row is their cross product (metrical-tracker's files).
 Images      float32 [H, W, 3] (masks [H, W]) in [0, 1], the values of the 8-bit file / 255, unclamped until written.
@@ -71,7 +71,7 @@ class HeadParams:
     jaw: Float[Tensor, 6]  # 6D rotation
     eyes: Float[Tensor, 12]  # two 6D rotations, left then right
     eyelids: Float[Tensor, 2]  # blendshape weights, left then right
-    neck: Float[Tensor, 6]  # 6D rotation; identity in metrical-tracker's data, and not a condition of the MLP
+    neck: Float[Tensor, 6]  # 6D rotation of the head against the torso: it moves the torso; not a condition of the MLP
 
     def condition(self) -> Float[Tensor, " C"]:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""

@@ -20,7 +20,7 @@ from avatar.types import IDENTITY_6D, HeadParams
 class Conditions(NamedTuple):
     """Field names are columns of frames.csv."""
 
-    yaw: float  # degrees, from the front 0, positive from the head's own left; the neck's rotation counts as the head's
+    yaw: float  # degrees, from the front 0, positive from the head's own left
     expression_distance: float  # mm
 
 
@@ -30,7 +30,7 @@ def conditions(head: HeadModel, recording: Recording, indices: Sequence[int]) ->
         head, [recording.params(i) for i in indices], recording.motion(recording.split.train)
     )
     return {
-        index: Conditions(seen_from(recording.camera(index), recording.params(index)).yaw, distance)
+        index: Conditions(seen_from(recording.camera(index)).yaw, distance)
         for index, distance in zip(indices, distances, strict=True)
     }
 
@@ -38,7 +38,7 @@ def conditions(head: HeadModel, recording: Recording, indices: Sequence[int]) ->
 def expression_distances(head: HeadModel, frames: Sequence[HeadParams], training: Sequence[HeadParams]) -> list[float]:
     """For each frame the root mean square distance of its vertices, in mm, from the nearest training frame's.
 
-    Vertices in the head's own space, the neck at rest: expression, jaw, eyes and lids count, the head's pose does not.
+    Vertices in the head's own space, the torso at rest: expression, jaw, eyes and lids count, poses do not.
     """
     shapes = torch.stack([_shape(head, params) for params in (*training, *frames)])
     shapes = (shapes - shapes[0]).flatten(1)  # small numbers, because cdist takes differences of squares

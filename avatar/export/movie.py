@@ -23,8 +23,7 @@ PERIOD = 6.0  # seconds of one round
 def limits_of(trained: TrainedAvatar) -> OrbitLimits:
     """How far the camera may turn from its place at rest."""
     recording = trained.recording
-    frames = [(recording.camera(i), recording.params(i)) for i in recording.split.train]
-    return orbit_limits((trained.rest_camera(), trained.rest_params()), frames)
+    return orbit_limits(trained.rest_camera(), [recording.camera(i) for i in recording.split.train])
 
 
 def path_camera(rest: Camera, limits: OrbitLimits, path: CameraPath, seconds: float, period: float = PERIOD) -> Camera:

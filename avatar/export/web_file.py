@@ -126,7 +126,6 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
     """What the page says, and how far things can be moved there."""
     recording, kept = trained.recording, list(drawing.kept)
     train = list(recording.split.train)
-    frames = [(recording.camera(i), recording.params(i)) for i in train]
     expressions = recording.tracks["expression"][recording.times(train)]
     rest, camera = trained.rest_params(), trained.rest_camera()
     names, turning = trained.assets.names.names, trained.avatar.turning
@@ -151,8 +150,8 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
             for control in controls
         ],
         "drive": face_map(trained, kept),
-        "joints": joint_ranges([params for _, params in frames]),
-        "orbit": orbit_limits((camera, rest), frames)._asdict(),
+        "joints": joint_ranges(recording.motion(train)),
+        "orbit": orbit_limits(camera, [recording.camera(i) for i in train])._asdict(),
         "rest": torch.cat((rest.expression[kept], rest.jaw, rest.eyes, rest.eyelids, rest.neck)).tolist(),
         "camera": {
             "rotation": camera.R_cam_world.flatten().tolist(),

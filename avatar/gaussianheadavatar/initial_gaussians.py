@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -16,8 +15,8 @@ from avatar.gaussianheadavatar.start_points import knn_log_scales, mouth_box, sp
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.seen_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.uv import UVTexels
-from avatar.head.model import HeadModel, matrix_from_6d
-from avatar.types import Camera, Frame
+from avatar.head.model import HeadModel
+from avatar.types import Frame
 
 REACH = 1.8  # of the hull's box from the head's centre, half head lengths
 APART = 0.004  # metres from the mesh from which the hull counts as beyond it
@@ -58,7 +57,7 @@ def beyond_mesh(
     head: HeadModel, on_mesh: Float[Tensor, "M 3"], frames: Sequence[Frame], centre: Float[Tensor, 3], half: float
 ) -> Float[Tensor, "H 3"]:
     """Points of the hull that are not on the mesh; all of its points where it is nowhere beyond it."""
-    views = [(at_rest(head, frame), frame.alpha * frame.head_mask) for frame in frames]
+    views = [(frame.camera, frame.alpha * frame.head_mask) for frame in frames]
     reach = torch.full((3,), REACH * half)
     try:
         hull = visual_hull(views, centre - reach, centre + reach)
@@ -72,20 +71,11 @@ def beyond_mesh(
     return beyond if len(beyond) else hull
 
 
-def at_rest(head: HeadModel, frame: Frame) -> Camera:
-    """The camera before which the head at rest stands as the frame's head does, its neck's turn included."""
-    joint, _ = head.neck()
-    turn = matrix_from_6d(frame.params.neck)
-    R, t = frame.camera.R_cam_world, frame.camera.t_cam_world
-    return replace(frame.camera, R_cam_world=R @ turn, t_cam_world=t + R @ (joint - turn @ joint))
-
-
 def hull_colours(
     head: HeadModel, points: Float[Tensor, "H 3"], frames: Sequence[Frame], centre: Float[Tensor, 3]
 ) -> Float[Tensor, "H 3"]:
     """The mean colour that the frames show at points beyond the mesh; outwards is away from the head's centre."""
     surface = head.neutral_vertices(), head.faces
-    still = (replace(frame, camera=at_rest(head, frame)) for frame in frames)
-    colours, seen = mean_of(len(points), (seen_at(points, points - centre, *surface, frame) for frame in still))
+    colours, seen = mean_of(len(points), (seen_at(points, points - centre, *surface, frame) for frame in frames))
     colours[~seen] = UNSEEN
     return colours

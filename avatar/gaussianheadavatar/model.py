@@ -1,7 +1,7 @@
 """Gaussian Head Avatar: free Gaussians with features, moved and coloured by networks, drawn small and enlarged.
 
     head parameters -> networks, blended by the distance to the face -> [HyperGaussians] -> Gaussians at rest
-                    -> turned with the neck -> splatted features -> upsampler -> picture
+                    -> splatted features -> upsampler -> picture
 
 Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
 
@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from kornia.geometry.conversions import rotation_matrix_to_axis_angle, rotation_matrix_to_quaternion
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, normalize
 
@@ -32,13 +32,12 @@ from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
 from avatar.gaussianheadavatar.networks import ATTRIBUTES, Blended, Networks, Outputs, encode, nearness
 from avatar.gaussianheadavatar.start_points import landmarks
 from avatar.gaussianheadavatar.upsampler import Upsampler
-from avatar.gaussians.apply_offsets import quaternion_product
 from avatar.gaussians.base_model import CONDITION_EXTRAS, Avatar, Groups
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import matrix_from_6d, nearest_rotation
 from avatar.splat import splat_features
-from avatar.types import IDENTITY_6D, Camera, FeatureGaussians, Frame, HeadParams, Rendering
+from avatar.types import Camera, FeatureGaussians, Frame, HeadParams, Rendering
 
 FEATURES = 128  # of a point, which networks for colour and shape take
 NEAR, FAR = math.sqrt(0.1), math.sqrt(0.25)  # to the nearest landmark, half head lengths: what follows the expression
@@ -60,19 +59,17 @@ class GaussianHeadAvatar(Avatar):
     unknown_to_browsers = "its upsampling network"
     initial_frames = 48
     centre: Tensor  # of the head at rest, metres
-    joint: Tensor  # of its neck, metres
     places: Tensor  # landmarks, half head lengths from the centre
     mean_rotation: Tensor  # of the head before the reference camera in training
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__(assets, identity, config)
-        vertices, (joint, turned) = self.head.neutral_vertices(), self.head.neck()
-        skull = vertices[turned > 0.5]
+        vertices = self.head.neutral_vertices()
+        skull = vertices[self.head.neck()[1] > 0.5]
         low, high = skull.amin(dim=0), skull.amax(dim=0)
         self.unit = 0.5 * float((high - low)[1])
         face = assets.regions.get("face", torch.arange(len(vertices)))
         self.register_buffer("centre", 0.5 * (low + high), persistent=False)
-        self.register_buffer("joint", joint, persistent=False)
         self.register_buffer("places", (landmarks(vertices, face) - self.centre) / self.unit, persistent=False)
 
     @classmethod
@@ -142,7 +139,7 @@ class GaussianHeadAvatar(Avatar):
         scales = torch.exp(self.log_scales + CHANGE * changes.scale)
         opacities = torch.sigmoid(self.opacity_logits + CHANGE * changes.opacity[:, 0])
         opacities = opacities if changes.density is None else opacities * changes.density
-        return FeatureGaussians(*self.turned(means, quats, params.neck), scales, opacities, changes.colour)
+        return FeatureGaussians(means, quats, scales, opacities, changes.colour)
 
     def attributes(self, blended: Blended) -> Attributes:
         """What the networks change."""
@@ -161,16 +158,6 @@ class GaussianHeadAvatar(Avatar):
             torch.eye(3, device=self.device) if rotation is None else mean.T @ to_device(rotation.float(), self.device)
         )
         return rotation_matrix_to_axis_angle(torch.stack((turn, neck))).flatten()
-
-    def turned(
-        self, means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"], neck: Float[Tensor, 6]
-    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
-        """All points turned rigidly about the neck's joint."""
-        if neck.is_cpu and tuple(neck.tolist()) == IDENTITY_6D:
-            return means, quats
-        turn = to_device(matrix_from_6d(neck), self.device)
-        turned = quaternion_product(rotation_matrix_to_quaternion(turn).expand_as(quats), quats)
-        return (means - self.joint) @ turn.T + self.joint, turned
 
     def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
         return self.enlarged(self.splatted(gaussians, camera, **options), camera, background)

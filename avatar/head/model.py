@@ -108,7 +108,7 @@ class HeadModel:
         return self._identity_shape.clone()
 
     def neck(self) -> tuple[Float[Tensor, 3], Float[Tensor, " V"]]:
-        """The joint of the identity's neck, metres, and which share of its turns each vertex takes."""
+        """The joint of the identity's neck, metres, and which share of the head each vertex is; the rest is torso."""
         return self._identity_joints[NECK].clone(), self._carried(self._weights, NECK)
 
     def _carried(self, weights: Float[Tensor, "R J"], joint: int) -> Float[Tensor, " R"]:
@@ -116,7 +116,7 @@ class HeadModel:
         return weights[:, [_follows(self._parents, j, joint) for j in range(len(self._parents))]].sum(dim=1)
 
     def vertices(self, params: HeadParams) -> Float[Tensor, "V 3"]:
-        """The posed head in metres, world space (the root at identity; the head's pose is in the camera).
+        """The posed head in metres, world space: the head's pose is in the camera, so `neck` turns the torso beneath it.
 
         Raises ValueError when the parameters' shapes are wrong; fewer expression coefficients than the basis has stand
         for zeros in the rest.
@@ -189,8 +189,13 @@ class HeadModel:
     def _joint_transforms(
         self, rotations: Float[Tensor, "J 3 3"], joints: Float[Tensor, "J 3"]
     ) -> tuple[Float[Tensor, "J 3 3"], Float[Tensor, "J 3"]]:
-        """Rest space -> posed space for every joint, along the kinematic tree: p -> R p + t."""
-        R, t = [rotations[ROOT]], [joints[ROOT] - rotations[ROOT] @ joints[ROOT]]
+        """Rest space -> posed space for every joint, along the kinematic tree: p -> R p + t.
+
+        The root turns backwards about the identity's neck joint, so that the head stays where the camera expects it.
+        """
+        pivot = self._identity_joints[NECK]
+        R = [rotations[ROOT] @ rotations[NECK].mT]
+        t = [pivot - R[ROOT] @ pivot]
         for joint in range(1, len(self._parents)):
             parent = self._parents[joint]
             R.append(R[parent] @ rotations[joint])

@@ -72,32 +72,31 @@ def pose(
 
     expression [given]: as many of the `stride` coefficients as there are; identity_joints [5, 3] at rest, without
     expression; joint_directions [5, 3, stride];  coefficients [stride + 36]: of the expression, then of the correctives
-    transforms [5, 12]: of root (the identity), neck, jaw, left and right eye; all but the neck hang on the neck.
+    transforms [5, 12]: of root, neck, jaw, left and right eye; all but the root hang on the neck, which stays where it is
+    on the identity: the root turns backwards about it.
     """
     e = tl.arange(0, EXPRESSIONS)
     weights = tl.load(expression + e, mask=e < given, other=0.0)
     tl.store(coefficients + e, weights, mask=e < stride)
     one, zero = tl.sum(tl.where(e == 0, 1.0, 0.0), 0), tl.sum(tl.where(e == 0, 0.0, 0.0), 0)
-    _put_transform(transforms, one, zero, zero, zero, one, zero, zero, zero, one, zero, zero, zero)
 
     n0, n1, n2, n3, n4, n5, n6, n7, n8 = matrix_of_6d(neck)
     _put_feature(coefficients + stride, n0, n1, n2, n3, n4, n5, n6, n7, n8)
+    px, py, pz = tl.load(identity_joints + 3), tl.load(identity_joints + 4), tl.load(identity_joints + 5)
+    a, b, c = rotated(n0, n3, n6, n1, n4, n7, n2, n5, n8, px, py, pz)
+    _put_transform(transforms, n0, n3, n6, n1, n4, n7, n2, n5, n8, px - a, py - b, pz - c)
     x, y, z = _joint(identity_joints, joint_directions, weights, 1, stride, e, e < stride)
-    a, b, c = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, x, y, z)
-    t0, t1, t2 = x - a, y - b, z - c
-    _put_transform(transforms + TRANSFORM, n0, n1, n2, n3, n4, n5, n6, n7, n8, t0, t1, t2)
+    a, b, c = rotated(n0, n3, n6, n1, n4, n7, n2, n5, n8, x - px, y - py, z - pz)
+    t0, t1, t2 = a + px - x, b + py - y, c + pz - z
+    _put_transform(transforms + TRANSFORM, one, zero, zero, zero, one, zero, zero, zero, one, t0, t1, t2)
     for joint in tl.static_range(2, 5):
         rotation = jaw if joint == 2 else eyes + 6 * (joint - 3)
-        l0, l1, l2, l3, l4, l5, l6, l7, l8 = matrix_of_6d(rotation)
-        _put_feature(coefficients + stride + 9 * (joint - 1), l0, l1, l2, l3, l4, l5, l6, l7, l8)
-        r0, r3, r6 = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l0, l3, l6)
-        r1, r4, r7 = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l1, l4, l7)
-        r2, r5, r8 = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, l2, l5, l8)
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = matrix_of_6d(rotation)
+        _put_feature(coefficients + stride + 9 * (joint - 1), r0, r1, r2, r3, r4, r5, r6, r7, r8)
         x, y, z = _joint(identity_joints, joint_directions, weights, joint, stride, e, e < stride)
-        a, b, c = rotated(n0, n1, n2, n3, n4, n5, n6, n7, n8, x, y, z)
         u, v, w = rotated(r0, r1, r2, r3, r4, r5, r6, r7, r8, x, y, z)
         to = transforms + TRANSFORM * joint
-        _put_transform(to, r0, r1, r2, r3, r4, r5, r6, r7, r8, a + t0 - u, b + t1 - v, c + t2 - w)
+        _put_transform(to, r0, r1, r2, r3, r4, r5, r6, r7, r8, x + t0 - u, y + t1 - v, z + t2 - w)
 
 
 @triton.jit

@@ -19,7 +19,7 @@ from avatar.types import HeadParams
 COMPONENTS = 12  # of head models whose coefficients have no names
 EDGE = 1.0  # percent of the training frames beyond either end of a range
 LEAST_RANGE = 0.02  # radians, or share of a closed lid: what has moved less, training has not shown
-JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "nod": "neck", "turn": "neck"}  # else eyes
+JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "lean": "neck", "turn": "neck"}  # else eyes
 PARTS = (
     ("Mouth", r"mouth|lip|smile|tongue|pucker|funnel|frown"),
     ("Jaw", r"jaw|chin"),
@@ -71,8 +71,8 @@ def principal_directions(values: Float[Tensor, "T E"]) -> Float[Tensor, "K E"]:
 def joint_ranges(training: Sequence[HeadParams]) -> dict[str, tuple[float, float]]:
     """How far jaw, gaze, lids and neck have moved in training; what has not moved is left out.
 
-    Radians about the x axis (jaw: opens; look_down, nod) and the y axis (look_left, turn: to the person's own left); lids
-    from 0 (open) to about 1.
+    Radians about the x axis (jaw: opens; look_down; lean: the torso backwards) and the y axis (look_left: to the person's
+    own left; turn: the torso to the right); lids from 0 (open) to about 1.
     """
     stacked = {name: torch.stack([getattr(p, name) for p in training]) for name in ("jaw", "eyes", "neck", "eyelids")}
     values = {
@@ -81,7 +81,7 @@ def joint_ranges(training: Sequence[HeadParams]) -> dict[str, tuple[float, float
         "look_left": _about_y(stacked["eyes"][:, :6]),
         "left_lid": stacked["eyelids"][:, 0],
         "right_lid": stacked["eyelids"][:, 1],
-        "nod": _about_x(stacked["neck"]),
+        "lean": _about_x(stacked["neck"]),
         "turn": _about_y(stacked["neck"]),
     }
     ranges = {name: shown_range(value.double().numpy()) for name, value in values.items()}
@@ -104,7 +104,7 @@ def posed(
         jaw=jaw,
         eyes=gaze.repeat(2),
         eyelids=lids,
-        neck=turned(joints.get("nod", 0.0), joints.get("turn", 0.0)),
+        neck=turned(joints.get("lean", 0.0), joints.get("turn", 0.0)),
     )
 
 

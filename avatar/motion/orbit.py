@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.head.model import matrix_from_6d
-from avatar.types import Camera, HeadParams
+from avatar.types import Camera
 
 EDGE = 1.0  # percent of the training frames beyond either end of a range
 
@@ -32,10 +31,9 @@ class OrbitLimits(NamedTuple):
     pitch: tuple[float, float]
 
 
-def seen_from(camera: Camera, params: HeadParams) -> Angles:
-    """From where the camera sees the head. The neck's rotation counts as the head's."""
-    position = -camera.R_cam_world.T @ camera.t_cam_world  # of the camera in the head's world
-    x, y, z = (matrix_from_6d(params.neck).T @ position).tolist()
+def seen_from(camera: Camera) -> Angles:
+    """From where the camera sees the head."""
+    x, y, z = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()  # of the camera in the head's world
     return Angles(math.degrees(math.atan2(x, z)), math.degrees(math.atan2(y, math.hypot(x, z))))
 
 
@@ -58,10 +56,10 @@ def orbited(camera: Camera, yaw: float = 0.0, pitch: float = 0.0, zoom: float = 
     )
 
 
-def orbit_limits(rest: tuple[Camera, HeadParams], training: Sequence[tuple[Camera, HeadParams]]) -> OrbitLimits:
+def orbit_limits(rest: Camera, training: Sequence[Camera]) -> OrbitLimits:
     """The turns that show the head as 98% of the training frames do."""
-    own = seen_from(*rest)
-    seen = np.array([seen_from(*frame) for frame in training])
+    own = seen_from(rest)
+    seen = np.array([seen_from(camera) for camera in training])
     (yaw_low, elevation_low), (yaw_high, elevation_high) = np.percentile(seen, [EDGE, 100 - EDGE], axis=0)
     # A head that turns to its left is seen from its right.
     return OrbitLimits(

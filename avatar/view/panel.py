@@ -11,7 +11,12 @@ from avatar.view.view_renderer import Setting
 if TYPE_CHECKING:
     from avatar.view.server import Viewer
 
-LABELS = {"jaw": "jaw open", "look_left": "look to its left", "turn": "turn to its left"}
+LABELS = {
+    "jaw": "jaw open",
+    "look_left": "look to its left",
+    "turn": "torso: turn to its right",
+    "lean": "torso: lean back",
+}
 
 
 class Panel:

@@ -66,7 +66,7 @@ class Viewer:
         self.milliseconds, self.pace = 0.0, Pace()
         self.complaints, self.door = Complaints(), Door()
         camera = renderer.trained.rest_camera()
-        self._own: Angles = seen_from(camera, renderer.trained.rest_params())
+        self._own: Angles = seen_from(camera)
         x, y, z = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
         self._distance = math.hypot(x, y, z)
         listening = _listen(host, port)

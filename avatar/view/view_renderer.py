@@ -63,8 +63,8 @@ class ViewRenderer:
             recording.tracks["expression"][recording.times(train)], rest.expression, trained.avatar.head
         )
         self.joints = joint_ranges(recording.motion(train))
-        frames = [(recording.camera(i), recording.params(i)) for i in train]
-        self.limits: OrbitLimits = orbit_limits((trained.rest_camera(), rest), frames)
+        cameras = [recording.camera(i) for i in train]
+        self.limits: OrbitLimits = orbit_limits(trained.rest_camera(), cameras)
 
     @property
     def overlays(self) -> tuple[Overlay, ...]:

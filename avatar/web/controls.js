@@ -3,7 +3,7 @@
 const JOINTS = [ // name in the header, group, label
   ["jaw", "Jaw", "open"], ["left_lid", "Eyes", "left lid"], ["right_lid", "Eyes", "right lid"],
   ["look_left", "Eyes", "look to its left"], ["look_down", "Eyes", "look down"],
-  ["turn", "Neck", "turn to its left"], ["nod", "Neck", "nod"],
+  ["turn", "Torso", "turn right"], ["lean", "Torso", "lean back"],
 ];
 const FIRST = ["Mouth", "Jaw", "Eyes", "Brows"]; // groups in this order, then the others
 
@@ -15,7 +15,7 @@ export function makeSliders(view, header, form) {
     if (name === "jaw") view.setPose({ jaw: [value, 0, 0] });
     else if (name.endsWith("lid")) view.setPose({ lids: [joints.left_lid, joints.right_lid] });
     else if (name.startsWith("look")) view.setPose({ gaze: [joints.look_down, joints.look_left, 0] });
-    else view.setPose({ neck: [joints.nod, joints.turn, 0] });
+    else view.setPose({ neck: [joints.lean, joints.turn, 0] });
   };
   for (const { group, name, range } of header.controls)
     sliders.push({ group, name, range, set: (value) => view.setExpression({ [`${group}: ${name}`]: value }) });

@@ -7,7 +7,7 @@ export interface Header {
   size: number; // width of the training pictures
   expressions: string[]; // names of the coefficients
   controls: { group: string; name: string; values: number[]; range: Range }[]; // directions among them
-  joints: Partial<Record<"jaw" | "look_down" | "look_left" | "left_lid" | "right_lid" | "nod" | "turn", Range>>;
+  joints: Partial<Record<"jaw" | "look_down" | "look_left" | "left_lid" | "right_lid" | "lean" | "turn", Range>>;
   orbit: { yaw: Range; pitch: Range }; // what the training video shows
   drive: { // what a face moves: places are expression, jaw 3, eyes 6 and eyelids 2, as departures from the neutral face
     blendshapes: Record<string, [place: number, weight: number][]>; // by ARKit's names: mouthSmileLeft

@@ -19,13 +19,13 @@ INTRINSICS_NOTE, INTRINSICS_ERROR = 1e-3, 5e-2  # relative change of fx, fy, cx,
 
 @dataclass(frozen=True)
 class FrameTrack:
-    """One frame's tracking, float64, checked for shape and finiteness; the head's pose is in R and t."""
+    """One frame's tracking, float64, checked for shape and finiteness; R and t are the pose of the head, neck included."""
 
     expression: np.ndarray  # [E]
     jaw: np.ndarray  # [6]
     eyes: np.ndarray  # [12]
     eyelids: np.ndarray  # [2]
-    neck: np.ndarray  # [6]
+    neck: np.ndarray  # [6], by which the head is turned against the torso
     R: np.ndarray  # [3, 3], a rotation
     t: np.ndarray  # [3]
     shape: np.ndarray  # [S]

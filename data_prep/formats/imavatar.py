@@ -19,10 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from avatar.head.assets import HeadAssets
+from avatar.head.model import NECK, ROOT
 from data_prep.formats.face_parsing import decode_numbers
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, nearest_rotation
-from data_prep.formats.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
+from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
 from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.formats.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate, read_frames
 
@@ -54,8 +55,8 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
     )
 
     def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        root = RootJoint(head)
-        return read_frames(listed, files.tracking, lambda frame: _read_frame(frame, root, size), complain)
+        root, neck = Joint(head, ROOT), Joint(head, NECK)
+        return read_frames(listed, files.tracking, lambda frame: _read_frame(frame, root, neck, size), complain)
 
     fps, fps_notes = frame_rate(frames)
     notes = (*matte_notes(files), *fps_notes)
@@ -67,17 +68,18 @@ def _beside(image: Path, kind: str) -> Path:
     return image.parent.parent / kind / f"{image.stem}.png"
 
 
-def _read_frame(frame: ListedFrame, root: RootJoint, size: tuple[int, int]) -> FrameTrack:
+def _read_frame(frame: ListedFrame, root: Joint, neck: Joint, size: tuple[int, int]) -> FrameTrack:
     expression, shape = frame.numbers("expression"), frame.numbers("shape_params")
     pose = frame.numbers("pose", 15)
     world_mat = frame.numbers("world_mat", 12).reshape(3, 4)
-    R, t = camera_of_head(
+    torso = camera_of_head(
         OPENCV_FROM_OPENGL @ nearest_rotation(world_mat[:, :3], "world_mat"),
         OPENCV_FROM_OPENGL @ world_mat[:, 3] / WORLD_SCALE,
         rotation_matrix(pose[:3]),
         np.zeros(3),
         root.position(shape, expression),
     )
+    R, t = turned_with_neck(torso, pose[3:6], neck.position(shape))
     return FrameTrack(
         expression=expression,
         neck=six_d(pose[3:6]),

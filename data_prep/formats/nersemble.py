@@ -23,11 +23,13 @@ from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.places import cache_folder
 from avatar.head.assets import HeadAssets
+from avatar.head.model import NECK
 from data_prep.formats.division import named_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking
 from data_prep.formats.nersemble_cameras import CALIBRATION, CalibratedCamera, read_cameras
 from data_prep.formats.nersemble_tracking import FILES, SequenceTracking, find_tracking, read_tracking
+from data_prep.formats.root_pose import Joint
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
 from data_prep.formats.video_frames import WantedVideo, decode_videos, look_into
 
@@ -79,8 +81,8 @@ def open_folder(folder: Path, cameras: str = ALL) -> TrackedFolder:
     if is_rig:
         _refuse_scales(sequences)
 
-    def read(_head: HeadAssets, _size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        return _read_frames(sequences, rows, shots, calibrated, files.tracking, complain)
+    def read(head: HeadAssets, _size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
+        return _read_frames(sequences, rows, shots, calibrated, files.tracking, Joint(head, NECK), complain)
 
     return TrackedFolder(
         NAME,
@@ -266,6 +268,7 @@ def _read_frames(
     shots: dict[int, Shot],
     calibrated: dict[str, CalibratedCamera],
     paths: dict[int, Path],
+    neck: Joint,
     complain: Callable[[str], object],
 ) -> Tracking:
     frames: dict[int, FrameTrack] = {}
@@ -273,7 +276,8 @@ def _read_frames(
     shape = sequences[0].tracking.shape
     for number, of in rows.items():
         try:
-            frames[number] = sequences[of.sequence].tracking.frame(of.row, shape, calibrated[shots[number].camera])
+            camera = calibrated[shots[number].camera]
+            frames[number] = sequences[of.sequence].tracking.frame(of.row, shape, neck, camera)
         except BadFrame as error:
             bad[number] = str(error)
     return checked_tracking(frames, bad, paths, complain, {number: shot.camera for number, shot in shots.items()})

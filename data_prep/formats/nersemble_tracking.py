@@ -16,7 +16,7 @@ from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
 from data_prep.formats.frame_track import BadFrame, FrameTrack, nearest_rotation, vector
 from data_prep.formats.nersemble_cameras import CalibratedCamera
-from data_prep.formats.root_pose import rotation_matrix, six_d
+from data_prep.formats.root_pose import Joint, rotation_matrix, six_d, turned_with_neck
 
 FILES = ("flame2023_tracking_v2.npz", "flame2023_tracking.npz")  # the newer first
 _TURNS = {"rotation_matrices": 9, "rotation": 3}  # the first that is there is taken
@@ -46,17 +46,19 @@ class SequenceTracking(NamedTuple):
             f"{count}; download both again"
         )
 
-    def frame(self, row: int, shape: np.ndarray, camera: CalibratedCamera) -> FrameTrack:
+    def frame(self, row: int, shape: np.ndarray, neck: Joint, camera: CalibratedCamera) -> FrameTrack:
         """The head before a camera, in units of the head model. Raises BadFrame for a row that is not finite."""
         of = {name: vector(values[row], name) for name, values in self.rows.items()}
+        torso = camera.R @ _turn(of), (camera.R @ of["translation"] + camera.t) / self.scale
+        R, t = turned_with_neck(torso, of["neck"], neck.position(shape))
         return FrameTrack(
             expression=of["expression"],
             jaw=six_d(of["jaw"]),
             eyes=six_d(of["eyes"]),
             eyelids=np.zeros(2),
             neck=six_d(of["neck"]),
-            R=camera.R @ _turn(of),
-            t=(camera.R @ of["translation"] + camera.t) / self.scale,
+            R=R,
+            t=t,
             shape=shape,
             intrinsics=camera.intrinsics,
             size=camera.size,

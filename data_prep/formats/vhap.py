@@ -27,10 +27,11 @@ from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
+from avatar.head.model import NECK, ROOT
 from data_prep.formats.division import named_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, vector
-from data_prep.formats.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
+from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
 from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.formats.transforms import (
     OPENCV_FROM_OPENGL,
@@ -75,10 +76,10 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
     )
 
     def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        root, read_file = RootJoint(head), _OnceRead()
+        joints, read_file = (Joint(head, ROOT), Joint(head, NECK)), _OnceRead()
         of = {number: shot.camera for number, shot in shots.items()} or None
         tracking = read_frames(
-            listed, parameters, lambda frame: _read_frame(frame, read_file(frame), root, size), complain, of
+            listed, parameters, lambda frame: _read_frame(frame, read_file(frame), joints, size), complain, of
         )
         return _one_identity(tracking) if is_union(folder) else tracking
 
@@ -109,7 +110,11 @@ class _OnceRead:
         return self._content
 
 
-def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint, size: tuple[int, int]) -> FrameTrack:
+def _read_frame(
+    frame: ListedFrame, raw: dict[str, np.ndarray], joints: tuple[Joint, Joint], size: tuple[int, int]
+) -> FrameTrack:
+    root, neck = joints
+
     def values(key: str, count: int | None = None) -> np.ndarray:
         if key not in raw:
             raise BadFrame(f"{key} is missing in {_parameter_file(frame).name}")
@@ -120,13 +125,15 @@ def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint,
     if "static_offset" in raw and raw["static_offset"].size:
         offset = _static_offset(values("static_offset"), root.num_vertices, _parameter_file(frame).name)
     R_cam_world, t_cam_world = _opencv_pose(frame)
-    R, t = camera_of_head(
+    torso = camera_of_head(
         R_cam_world,
         t_cam_world,
         rotation_matrix(values("rotation", 3)),
         values("translation", 3),
         root.position(shape, expression, offset),
     )
+    neck_pose = values("neck_pose", 3)
+    R, t = turned_with_neck(torso, neck_pose, neck.position(shape, None, offset))
     intrinsics, tracked_size = pinhole(frame, size)
     intrinsics[3] = tracked_size[1] - intrinsics[3]
     return FrameTrack(
@@ -134,7 +141,7 @@ def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint,
         jaw=six_d(values("jaw_pose", 3)),
         eyes=six_d(values("eyes_pose", 6)),
         eyelids=np.zeros(2),
-        neck=six_d(values("neck_pose", 3)),
+        neck=six_d(neck_pose),
         R=R,
         t=t,
         shape=shape,

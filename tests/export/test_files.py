@@ -166,13 +166,13 @@ def lively_copy(trained: TrainedAvatar) -> TrainedAvatar:
 
 def test_paths_stay_where_the_training_video_was(trained: TrainedAvatar) -> None:
     limits = limits_of(trained)
-    rest, params = trained.rest_camera(), trained.rest_params()
-    own = seen_from(rest, params)
-    turns = [seen_from(path_camera(rest, limits, "turntable", s / 10), params).yaw - own.yaw for s in range(60)]
+    rest = trained.rest_camera()
+    own = seen_from(rest)
+    turns = [seen_from(path_camera(rest, limits, "turntable", s / 10)).yaw - own.yaw for s in range(60)]
     assert min(turns) == pytest.approx(-limits.yaw[1], abs=0.2) and max(turns) == pytest.approx(-limits.yaw[0], abs=0.2)
     assert max(turns) - min(turns) > 4
     heights = [path_camera(rest, limits, "orbit", s / 10) for s in range(60)]
-    elevations = [seen_from(camera, params).elevation - own.elevation for camera in heights]
+    elevations = [seen_from(camera).elevation - own.elevation for camera in heights]
     assert max(elevations) - min(elevations) > 4 and max(elevations) < limits.pitch[1] + 1
     assert path_camera(rest, limits, "still", 1.0) == rest
 

@@ -8,12 +8,17 @@ import torch
 from heads import EXPRESSIONS, grid_head, random_params, rest_params
 
 from avatar.head.assets import load_head_assets
-from avatar.head.model import HeadModel, matrix_from_6d, nearest_rotation
+from avatar.head.model import NECK, HeadModel, matrix_from_6d, nearest_rotation
 from avatar.types import IDENTITY_6D
+from data_prep.formats.root_pose import Joint, rotation_matrix, turned_with_neck
 
 
-def oracle(assets, identity, params) -> np.ndarray:
-    """FLAME's equations written out, one vertex and one joint at a time, in float64."""
+def oracle(assets, identity, params, anchor: str = "head") -> np.ndarray:
+    """FLAME's equations written out, one vertex and one joint at a time, in float64.
+
+    anchor  what stays in its place: "torso", as in FLAME, or "head": all is put back, by the inverse of the neck's turn
+            about the identity's neck joint
+    """
     f64 = lambda tensor: tensor.double().numpy()  # noqa: E731
     V, J = assets.num_vertices, 5
     shaped = f64(assets.template).copy()
@@ -22,10 +27,12 @@ def oracle(assets, identity, params) -> np.ndarray:
             shaped[v] += f64(assets.shape_dirs)[v, :, s] * value
         for e, value in enumerate(f64(params.expression)):
             shaped[v] += f64(assets.expression_dirs)[v, :, e] * value
-    joints = np.zeros((J, 3))
-    for j in range(J):
-        for v in range(V):
+    joints, pivot = np.zeros((J, 3)), np.zeros(3)
+    for v in range(V):
+        for j in range(J):
             joints[j] += f64(assets.joint_regressor)[j, v] * shaped[v]
+        neutral = f64(assets.template)[v] + f64(assets.shape_dirs)[v, :, : len(identity)] @ f64(identity)
+        pivot += f64(assets.joint_regressor)[1, v] * neutral
 
     def rotation(six: np.ndarray) -> np.ndarray:
         a = six[:3] / np.linalg.norm(six[:3])
@@ -43,6 +50,10 @@ def oracle(assets, identity, params) -> np.ndarray:
         own[:3, :3] = local[j]
         own[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0)
         transforms.append(own if parent < 0 else transforms[parent] @ own)
+    if anchor == "head":
+        back = np.eye(4)
+        back[:3, :3], back[:3, 3] = local[1].T, pivot - local[1].T @ pivot
+        transforms = [back @ transform for transform in transforms]
     result = np.zeros((V, 3))
     for v in range(V):
         position = shaped[v] + f64(assets.pose_dirs)[v] @ feature
@@ -63,6 +74,17 @@ def test_skinning_agrees_with_the_loop_written_oracle(seed: int) -> None:
     np.testing.assert_allclose(in_float64.numpy(), expected, rtol=0, atol=1e-12)
     in_float32 = HeadModel(assets, identity).vertices(params)
     np.testing.assert_allclose(in_float32.numpy(), expected, rtol=0, atol=2e-6)
+
+
+def test_an_imported_neck_turns_the_head_before_the_camera() -> None:
+    assets, params, identity = grid_head(), random_params(), torch.randn(7).double()
+    turn = np.array([0.2, -0.4, 0.1])
+    params = replace(params, eyelids=torch.zeros(2), neck=torch.from_numpy(rotation_matrix(turn)[:2].ravel()))
+    torso = rotation_matrix(np.array([0.1, 0.3, 3.0])), np.array([0.01, -0.02, 0.7])
+    R, t = turned_with_neck(torso, turn, Joint(assets, NECK).position(identity.numpy()))
+    seen = HeadModel(assets, identity, torch.float64).vertices(params).numpy() @ R.T + t
+    expected = oracle(assets, identity, params, "torso")
+    np.testing.assert_allclose(seen, expected @ torso[0].T + torso[1], rtol=0, atol=1e-8)  # float32 weights do not sum to 1
 
 
 def test_at_rest_the_head_is_the_neutral_identity() -> None:

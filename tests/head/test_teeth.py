@@ -13,7 +13,7 @@ from avatar.gaussians.mesh_embedding import knn_scales
 from avatar.gaussians.uv import bound_texels, painted, uv_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.features import mouth_rim
-from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.head.model import HeadModel
 from avatar.head.teeth import GRID, ROWS, with_teeth
 from avatar.runs.model_registry import make_avatar
 from avatar.types import IDENTITY_6D, HeadParams
@@ -64,10 +64,9 @@ def test_the_upper_row_keeps_with_the_skull_and_the_lower_with_the_chin(assets: 
         chin = moved[chin_of(assets)].mean(dim=0)
         assert float(chin.norm()) > 3e-4
         assert float((lower.mean(dim=0) - chin).norm()) < 0.5 * float(chin.norm())
-    turned = rows_of(assets, head.vertices(replace(still, neck=tilt)))
-    for there, row in zip(turned, rows_of(assets, rest), strict=True):
-        arms = row - row[0]
-        torch.testing.assert_close(there - there[0], arms @ matrix_from_6d(tilt).T, rtol=0, atol=1e-5)
+    beneath = rows_of(assets, head.vertices(replace(still, neck=tilt)))
+    for there, row in zip(beneath, rows_of(assets, rest), strict=True):
+        torch.testing.assert_close(there, row, rtol=0, atol=1e-5)  # the torso turns, the teeth do not
 
 
 def test_teeth_are_found_without_named_regions(assets: HeadAssets) -> None:

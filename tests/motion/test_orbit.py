@@ -16,22 +16,22 @@ FRONT = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0
 
 
 def test_a_turned_head_is_seen_from_its_other_side() -> None:
-    assert seen_from(FRONT, PARAMS) == pytest.approx((0.0, 0.0), abs=1e-4)
-    assert seen_from(orbited(FRONT, yaw=20.0), PARAMS) == pytest.approx((-20.0, 0.0), abs=1e-4)
-    assert seen_from(orbited(FRONT, pitch=10.0), PARAMS) == pytest.approx((0.0, 10.0), abs=1e-4)
+    assert seen_from(FRONT) == pytest.approx((0.0, 0.0), abs=1e-4)
+    assert seen_from(orbited(FRONT, yaw=20.0)) == pytest.approx((-20.0, 0.0), abs=1e-4)
+    assert seen_from(orbited(FRONT, pitch=10.0)) == pytest.approx((0.0, 10.0), abs=1e-4)
 
 
 def test_limits_are_the_turns_that_training_has_shown() -> None:
     """Of a video that shows much more of one side, and more from above."""
-    training = [(orbited(FRONT, yaw, pitch), PARAMS) for yaw in (-5.0, 0.0, 12.0, 30.0) for pitch in (-2.0, 6.0)]
-    seen = [seen_from(*frame) for frame in training]
-    limits = orbit_limits((FRONT, PARAMS), training)
-    ends = [seen_from(orbited(FRONT, yaw=turn), PARAMS).yaw for turn in limits.yaw]
+    training = [orbited(FRONT, yaw, pitch) for yaw in (-5.0, 0.0, 12.0, 30.0) for pitch in (-2.0, 6.0)]
+    seen = [seen_from(camera) for camera in training]
+    limits = orbit_limits(FRONT, training)
+    ends = [seen_from(orbited(FRONT, yaw=turn)).yaw for turn in limits.yaw]
     assert sorted(ends) == pytest.approx([min(seen).yaw, max(seen).yaw], abs=2.0)
-    heights = [seen_from(orbited(FRONT, pitch=turn), PARAMS).elevation for turn in limits.pitch]
+    heights = [seen_from(orbited(FRONT, pitch=turn)).elevation for turn in limits.pitch]
     elevations = [angles.elevation for angles in seen]
     assert heights == pytest.approx([min(elevations), max(elevations)], abs=1.0)
-    assert orbit_limits((FRONT, PARAMS), training[-2:]).yaw[0] == 0.0  # the camera at rest is always within
+    assert orbit_limits(FRONT, training[-2:]).yaw[0] == 0.0  # the camera at rest is always within
 
 
 def test_zoom_is_about_the_middle_of_the_picture() -> None:

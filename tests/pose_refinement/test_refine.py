@@ -78,7 +78,7 @@ def test_what_all_training_frames_share_stays(
     own = refine_module.smoothed
 
     def shared(moves: torch.Tensor, *rest: Any) -> torch.Tensor:
-        return own(moves, *rest) + torch.where(torch.arange(moves.shape[1]) < 6, 0.045, 0.0)
+        return own(moves, *rest) + torch.where(torch.arange(moves.shape[1]) < 6, 0.03, 0.0)
 
     monkeypatch.setattr(refine_module, "smoothed", shared)
     found = refined(avatar, wrong, tmp_path / "progress")

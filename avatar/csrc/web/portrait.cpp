@@ -36,6 +36,10 @@ Rotation rotation_from_6d(const float* v) {
     return r;
 }
 
+Rotation transposed(const Rotation& a) {
+    return {{a.m[0], a.m[3], a.m[6], a.m[1], a.m[4], a.m[7], a.m[2], a.m[5], a.m[8]}};
+}
+
 Rotation product(const Rotation& a, const Rotation& b) {
     Rotation r{};
     for (int i = 0; i < 3; ++i)
@@ -118,18 +122,21 @@ void Portrait::skin() {
             const float away = own[joint].m[i] - own[0].m[i];
             if (away != 0.0f) add_scaled(shape_, arrays_[kPoseDirs].data() + ((joint - 1) * 9 + i) * V * 3, away);
         }
+    // The head stays where the camera expects it: the root turns backwards about the neck's joint at rest.
+    const float* pivot = arrays_[kJointsAtRest].data() + 3 * kNeckJoint;
     Rotation R[kJoints];
     float t[kJoints][3];
     for (int joint = 0; joint < kJoints; ++joint) {
         const int parent = parents[joint];
-        R[joint] = joint == 0 ? own[0] : product(R[parent], own[joint]);
+        R[joint] = joint == 0 ? transposed(own[kNeckJoint]) : product(R[parent], own[joint]);
+        const float* at = joint == 0 ? pivot : joints + 3 * joint;
         for (int i = 0; i < 3; ++i) {
-            float at = joint == 0 ? joints[i] : t[parent][i], turned = 0;
+            float to = joint == 0 ? pivot[i] : t[parent][i], turned = 0;
             for (int k = 0; k < 3; ++k) {
-                if (joint != 0) at += R[parent].m[3 * i + k] * joints[3 * joint + k];
-                turned += R[joint].m[3 * i + k] * joints[3 * joint + k];
+                if (joint != 0) to += R[parent].m[3 * i + k] * at[k];
+                turned += R[joint].m[3 * i + k] * at[k];
             }
-            t[joint][i] = at - turned;
+            t[joint][i] = to - turned;
         }
     }
     const float *weights = arrays_[kWeights].data(), *lids = arrays_[kEyelidDirs].data();
@@ -152,37 +159,18 @@ void Portrait::skin() {
             for (int k = 0; k < 3; ++k) sum += barycentric[3 * g + k] * posed_[3 * corners_[3 * g + k] + i];
             points_[3 * g + i] = sum;
         }
-    if (sizes_.has_rigidity) hold(own[kNeckJoint]);
+    if (sizes_.has_rigidity) hold();
 }
 
-// Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py. `turn` is the neck's.
-void Portrait::hold(const Rotation& turn) {
-    bool carried[kJoints] = {};
-    for (int joint = kNeckJoint; joint < kJoints; ++joint)
-        carried[joint] = joint == kNeckJoint || (parents[joint] >= 0 && carried[parents[joint]]);
-    const float *barycentric = arrays_[kBarycentric].data(), *shape = arrays_[kShape].data(),
-                *weights = arrays_[kWeights].data(), *pivot = arrays_[kJointsAtRest].data() + 3 * kNeckJoint;
-    for (std::int64_t g = 0; g < sizes_.gaussians; ++g) {
-        float at_rest[3] = {}, arm[3] = {};
-        for (int k = 0; k < 3; ++k) {
-            const float b = barycentric[3 * g + k];
-            const std::int64_t v = corners_[3 * g + k];
-            float share = 0;
-            for (int joint = 0; joint < kJoints; ++joint)
-                if (carried[joint]) share += weights[v * kJoints + joint];
-            for (int i = 0; i < 3; ++i) {
-                at_rest[i] += b * shape[3 * v + i];
-                arm[i] += b * share * (shape[3 * v + i] - pivot[i]);
-            }
-        }
-        const float rigidity = arrays_[kRigidity][g];
+// Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py.
+void Portrait::hold() {
+    const float *barycentric = arrays_[kBarycentric].data(), *shape = arrays_[kShape].data();
+    for (std::int64_t g = 0; g < sizes_.gaussians; ++g)
         for (int i = 0; i < 3; ++i) {
-            float on_skull = at_rest[i];
-            for (int k = 0; k < 3; ++k)
-                on_skull += (turn.m[3 * i + k] - (i == k ? 1.0f : 0.0f)) * arm[k];
-            points_[3 * g + i] += rigidity * (on_skull - points_[3 * g + i]);
+            float on_skull = 0;
+            for (int k = 0; k < 3; ++k) on_skull += barycentric[3 * g + k] * shape[3 * corners_[3 * g + k] + i];
+            points_[3 * g + i] += arrays_[kRigidity][g] * (on_skull - points_[3 * g + i]);
         }
-    }
 }
 
 // As FoldedNetwork in avatar/render.py.

@@ -96,7 +96,7 @@ public:
 
 private:
     void skin();
-    void hold(const Rotation& turn);
+    void hold();
     void evaluate_network();
     void offset();
 
