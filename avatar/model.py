@@ -18,7 +18,7 @@ from avatar.gaussians.encoding import positional_encoding
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.gaussians.latent_grid import latent_grid
-from avatar.gaussians.skull_binding import INITIAL_LOGIT, SkullBinding, bind_to_skull
+from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv_avatar import UVAvatar
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams
@@ -30,7 +30,6 @@ class FlashAvatar(UVAvatar):
     heads: ClassVar[type[Any] | None] = None  # made of the numbers of Gaussians and latent values; None: no latents
     is_fused = True
     unknown_to_browsers = None
-    skull: Tensor  # the Gaussians' points on the head at rest, metres
     code: Tensor  # positional code of the places where the network is evaluated
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
@@ -40,7 +39,7 @@ class FlashAvatar(UVAvatar):
         if self.heads is not None and config.latent_grid is not None:
             self.grid, places = latent_grid(self.mesh.assets, self.embedding.texels, places, config.latent_grid)
         self.register_buffer("code", positional_encoding(places), persistent=False)
-        self.register_buffer("skull", self.neutral_points(), persistent=False)
+        self.skull = None if self.skull_logits is None else Skull.of(self.mesh, self.embedding)
 
     def make_parameters(self, config: ModelConfig, num_expressions: int, N: int) -> None:
         super().make_parameters(config, num_expressions, N)
@@ -53,19 +52,21 @@ class FlashAvatar(UVAvatar):
         vertices = self.vertices(params) if vertices is None else vertices
         values = self.deformation(self.code, self.condition(params, rotation))
         if self.is_fused and on_gpu(values) and values.dtype == torch.float32:
-            packed, binding = None if self.hyper is None else self.hyper.packed, self.skull_binding()
+            packed, binding = None if self.hyper is None else self.hyper.packed, self.skull_binding(params)
             make = gpu_function("make Gaussians")
             return make(vertices, values, packed, *self.base(), self.embedding, self.grid, binding)
         latents = self.interpolate(values)
-        return self.compose(self.points(vertices), self.offsets(latents))
+        return self.compose(self.points(vertices, params), self.offsets(latents))
 
-    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
+    def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "N 3"]:
         """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""
-        return bind_to_skull(self.embedding.points(vertices), self.skull_binding())
+        return bind_to_skull(self.embedding.points(vertices), self.skull_binding(params))
 
-    def skull_binding(self) -> SkullBinding | None:
-        """What brings the points to the skull."""
-        return None if self.skull_logits is None else SkullBinding(self.skull, self.skull_logits)
+    def skull_binding(self, params: HeadParams) -> SkullBinding | None:
+        """What brings the points to the skull in a frame."""
+        if self.skull is None or self.skull_logits is None:
+            return None
+        return SkullBinding(self.skull, params.neck, self.skull_logits)
 
     def interpolate(self, values: Float[Tensor, "M n"]) -> Float[Tensor, "N n"]:
         """The network's values at the Gaussians."""

@@ -21,6 +21,7 @@ from avatar.gaussians.mesh_embedding import knn_scales
 from avatar.gaussians.uv import UVTexels
 from avatar.head.assets import HeadAssets
 from avatar.model import FlashAvatar
+from avatar.types import HeadParams
 
 DOUBLINGS, EVERY = 4, 0.1  # from 1/16 of the points; each doubling after so large a share of the steps
 # Of every 4 x 4 texels, which comes when: each prefix of 1, 2, 4, 8 and 16 is spread evenly (an ordered-dither matrix).
@@ -77,7 +78,7 @@ class MonoGaussianAvatar(FlashAvatar):
         quats, log_scales, opacity_logits, sh = map(self.active, super().base())
         return quats, log_scales, opacity_logits, sh
 
-    def points(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "alive 3"]:
+    def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "alive 3"]:
         return self.active(self.mesh_points.points(vertices))
 
     def encode_points(self) -> None:

@@ -9,8 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from avatar.compute.device import to_device
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
 from avatar.gaussians.skull_binding import SkullBinding
+from avatar.head.model import matrix_from_6d
 from avatar.kernels.fused import fused_gaussians
 from avatar.kernels.fused_backward import fused_gaussians_backward, gather_nodes
 from avatar.kernels.launch import start
@@ -62,11 +64,12 @@ def fused_gaussians_gpu(
         raise ValueError(f"packed must have shape {list(packed_shape(N, n))}, got {list(packed.shape)}")
     if packed is None and grid is not None:
         raise ValueError("offsets are not smooth over the map: there is no grid without HyperGaussians")
-    skull = logits = None
+    skull = neck = logits = None
     if skull_binding is not None:
-        skull, logits = skull_binding
-        check_shapes(quats=(quats, "N 4"), skull=(skull, "N 3"), skull_logits=(logits, "N"))
-    given = (vertices, logits, values, packed, quats, log_scales, opacity_logits)
+        skull, logits, neck = skull_binding.skull, skull_binding.logits, to_device(skull_binding.neck, quats.device)
+        check_shapes(quats=(quats, "N 4"), at_rest=(skull.at_rest, "N 3"), arms=(skull.arms, "N 3"))
+        check_shapes(quats=(quats, "N 4"), neck=(neck, "6"), skull_logits=(logits, "N"))
+    given = (vertices, neck, logits, values, packed, quats, log_scales, opacity_logits)
     placed: Any = _Fused.apply(*given, embedding, grid, skull)
     means, turned, scales, opacities = placed
     return Gaussians(means, turned, scales, opacities, sh)
@@ -77,7 +80,7 @@ class _Fused(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *given, embedding, grid, skull = arguments
         tensors: list[Any] = [None if t is None else t.detach().contiguous() for t in given]
-        vertices, logits, values, packed, quats, log_scales, opacity_logits = tensors
+        vertices, neck, logits, values, packed, quats, log_scales, opacity_logits = tensors
         N, n, has_skull = len(quats), values.shape[1], skull is not None
         is_hyper, saves = packed is not None, any(ctx.needs_input_grad)
         raw = torch.empty((N, 10), dtype=torch.float32, device=quats.device) if is_hyper and saves else values
@@ -90,7 +93,9 @@ class _Fused(torch.autograd.Function):
             vertices,
             embedding.corners,
             embedding.barycentric,
-            skull if has_skull else vertices,
+            skull.at_rest if has_skull else vertices,
+            skull.arms if has_skull else vertices,
+            neck if has_skull else vertices,
             logits if has_skull else vertices,
             values,
             cells,
@@ -111,15 +116,15 @@ class _Fused(torch.autograd.Function):
             SAVE=saves,
             BLOCK=LANES,
         )
-        ctx.embedding, ctx.grid, ctx.num_vertices = embedding, grid, len(vertices)
-        ctx.save_for_backward(values, packed, raw, away, logits, quats, log_scales, placed[2], placed[3])
+        ctx.embedding, ctx.grid, ctx.skull, ctx.num_vertices = embedding, grid, skull, len(vertices)
+        ctx.save_for_backward(values, packed, raw, away, neck, logits, quats, log_scales, placed[2], placed[3])
         return tuple(placed)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         saved: tuple[Any, ...] = ctx.saved_tensors
-        values, packed, raw, away, logits, quats, log_scales, scales, opacities = saved
+        values, packed, raw, away, neck, logits, quats, log_scales, scales, opacities = saved
         grid: Interpolation | None = ctx.grid
         by_means, by_quats, by_scales, by_opacities = (gradient.contiguous() for gradient in upstream)
         N, n, is_hyper, has_skull = len(quats), values.shape[1], packed is not None, logits is not None
@@ -157,13 +162,24 @@ class _Fused(torch.autograd.Function):
         by_values, by_packed, *by_base, by_logits = gradients
         if grid is not None:
             by_values = summed_at_nodes(grid.touching, by_values)
-        by_vertices = None
-        if ctx.needs_input_grad[0]:
-            on_mesh = by_means - by_means * torch.sigmoid(logits)[:, None] if has_skull else by_means
+        by_vertices = by_neck = None
+        needs_vertices, needs_neck = ctx.needs_input_grad[:2]
+        on_skull = by_means * torch.sigmoid(logits)[:, None] if has_skull and (needs_vertices or needs_neck) else None
+        if on_skull is not None and needs_neck:
+            by_neck = _neck_gradient(neck, on_skull.T @ ctx.skull.arms)
+        if needs_vertices:
+            on_mesh = by_means if on_skull is None else by_means - on_skull
             by_vertices = summed_at_nodes(ctx.embedding.touching(ctx.num_vertices), on_mesh)
         by_logits = by_logits if has_skull else None
         by_packed = by_packed if is_hyper else None
-        return by_vertices, by_logits, by_values, by_packed, *by_base, None, None, None
+        return by_vertices, by_neck, by_logits, by_values, by_packed, *by_base, None, None, None
+
+
+def _neck_gradient(neck: Float[Tensor, 6], by_turn: Float[Tensor, "3 3"]) -> Float[Tensor, 6]:
+    with torch.enable_grad():
+        leaf = neck.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(matrix_from_6d(leaf).mT, leaf, by_turn)
+    return gradient
 
 
 def summed_at_nodes(lists: Touching, gradients: Float[Tensor, "N w"]) -> Float[Tensor, "M w"]:

@@ -21,6 +21,7 @@ from avatar.kernels.hyper import (
     solve4_upper,
 )
 from avatar.kernels.load_store import load3, load4, load10, store3, store4, store10
+from avatar.kernels.pose import matrix_of_6d, rotated
 
 
 @triton.jit
@@ -84,7 +85,9 @@ def fused_gaussians(
     vertices,
     corners,
     barycentric,
-    skull,
+    at_rest,
+    arms,
+    neck,
     skull_logits,
     nodes,
     cells,
@@ -110,8 +113,8 @@ def fused_gaussians(
     """Write means, quats, scales and opacities of all Gaussians and, with SAVE, what the gradients take: their ten raw
     offsets [N, 10] and, with HAS_SKULL, how far their points on the skull are `away` from those on the mesh [N, 3].
 
-    vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; with HAS_SKULL, the points on the skull [N, 3] and
-    skull_logits [N];
+    vertices [V, 3]; corners int32 [N, 3], barycentric [N, 3]; with HAS_SKULL, at_rest and arms [N, 3] of the skull, the
+    6D rotation `neck`, whose inverse turns it, and skull_logits [N];
     nodes [M, latents] with cells int32 [N, 4] and weights [N, 4], or, without HAS_GRID, [N, latents]; packed: see `hyper`.
     Without HAS_HYPER the network's values are the offsets.
     """
@@ -127,8 +130,11 @@ def fused_gaussians(
         o0, o1, o2, o3, o4, o5, o6, o7, o8, o9 = load10(nodes, i, here)
     x, y, z = point_on_mesh(vertices, corners, barycentric, i, here)
     if HAS_SKULL:
-        a_x, a_y, a_z = load3(skull, i, here)
-        a_x, a_y, a_z = a_x - x, a_y - y, a_z - z
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = matrix_of_6d(neck)
+        a_x, a_y, a_z = load3(arms, i, here)
+        a_x, a_y, a_z = rotated(r0 - 1.0, r3, r6, r1, r4 - 1.0, r7, r2, r5, r8 - 1.0, a_x, a_y, a_z)
+        n_x, n_y, n_z = load3(at_rest, i, here)
+        a_x, a_y, a_z = n_x + a_x - x, n_y + a_y - y, n_z + a_z - z
         if SAVE:
             store3(away, i, a_x, a_y, a_z, here)
         share = sigmoid(tl.load(skull_logits + i, mask=here, other=0.0))

@@ -15,7 +15,7 @@ from avatar.errors import UserError
 from avatar.gaussians.apply_offsets import apply_offsets
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, condition, touching_lists
-from avatar.gaussians.skull_binding import SkullBinding, bind_to_skull
+from avatar.gaussians.skull_binding import Skull, SkullBinding, bind_to_skull
 from avatar.losses.photometric import dssim, photometric_loss
 from avatar.splat import splat
 from avatar.splat.scenes import head_camera, head_shell
@@ -76,15 +76,16 @@ def placed(device: torch.device) -> Fields:
     heads = HyperHeads(COUNT, LATENT)
     shapes = {"vertices": (VERTICES, 3), "values": (NODES, LATENT), "packed": tuple(heads.packed.shape)}
     shapes |= {"quats": (COUNT, 4), "log_scales": (COUNT, 3), "opacity_logits": (COUNT,)}
-    shapes |= {"skull_logits": (COUNT,)}
+    shapes |= {"neck": (6,), "skull_logits": (COUNT,)}
     noise = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
     heads.packed.data.copy_(0.3 * noise["packed"])
     heads.set_heads(heads.heads())  # zeros where no Gaussian is
     noise["packed"] = heads.packed.detach()
     noise["log_scales"] -= 4.0
     leaves = {name: value.to(device).requires_grad_() for name, value in noise.items()}
-    vertices, values, packed, quats, log_scales, logits, skull_logits = leaves.values()
-    skull_binding = SkullBinding(torch.randn(COUNT, 3, generator=generator).to(device), skull_logits)
+    vertices, values, packed, quats, log_scales, logits, neck, skull_logits = leaves.values()
+    skull = Skull(*(torch.randn(COUNT, 3, generator=generator).to(device) for _ in range(2)))
+    skull_binding = SkullBinding(skull, neck, skull_logits)
     sh = torch.zeros(COUNT, 1, 3, device=device)
     if on_gpu(sh):
         base, make = (quats, log_scales, logits, sh), gpu_function("make Gaussians")

@@ -15,7 +15,7 @@ from avatar.gaussians.apply_offsets import apply_offsets
 from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.latent_grid import latent_grid
 from avatar.gaussians.mesh_embedding import Embedding
-from avatar.gaussians.skull_binding import SkullBinding, bind_to_skull
+from avatar.gaussians.skull_binding import Skull, SkullBinding, bind_to_skull
 from avatar.gaussians.uv import uv_texels
 from avatar.head.model import HeadModel
 from avatar.types import Gaussians
@@ -56,21 +56,22 @@ class Scene:
             "quats": torch.randn(N, 4, generator=g),
             "log_scales": torch.randn(N, 3, generator=g) - 4,
             "opacity_logits": 3 * torch.randn(N, generator=g),
+            "neck": random_params().neck if has_skull else None,
             "skull_logits": torch.randn(N, generator=g) if has_skull else None,
         }
-        self.skull = neutral
+        self.skull = Skull.of(head, self.embedding)
         self.heads = heads
         self.sh = torch.randn(N, 4, 3, generator=g)
         self.cotangents = [torch.randn(shape, generator=g) for shape in ((N, 3), (N, 4), (N, 3), (N,))]
 
     def expected(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
-        *base, logits = rest
+        *base, neck, logits = rest
         with the_cpus_way():
             if self.grid is not None:
                 values = self.grid(values)
             if packed is not None:
                 values = torch.func.functional_call(self.heads, {"packed": packed}, (values,))
-            skull_binding = None if logits is None else SkullBinding(self.skull, logits)
+            skull_binding = None if logits is None else SkullBinding(self.skull, neck, logits)
             points = bind_to_skull(self.embedding.points(vertices), skull_binding)
             return apply_offsets(points, *base, self.sh, values)
 
@@ -80,8 +81,9 @@ class Scene:
         self.embedding.move(DEVICE)
         if self.grid is not None:
             self.grid.move(DEVICE)
-        *base, logits = rest
-        skull_binding = None if logits is None else SkullBinding(self.skull.to(DEVICE), logits)
+        *base, neck, logits = rest
+        skull = Skull(self.skull.at_rest.to(DEVICE), self.skull.arms.to(DEVICE))
+        skull_binding = None if logits is None else SkullBinding(skull, neck, logits)
         return fused_gaussians_gpu(
             vertices, values, packed, *base, self.sh.to(DEVICE), self.embedding, self.grid, skull_binding
         )
@@ -144,6 +146,7 @@ def test_zero_quaternions_and_saturated_offsets_have_finite_gradients() -> None:
         ("packed", (3, 4, 16), "packed must have shape"),
         ("quats", (7, 4), "log_scales has N = |quats has N = 7"),
         ("opacity_logits", (7,), "opacity_logits has N = 7"),
+        ("neck", (5,), "neck"),
         ("skull_logits", (7,), "skull_logits has N = 7"),
     ],
 )

@@ -84,7 +84,9 @@ def test_an_imported_neck_turns_the_head_before_the_camera() -> None:
     R, t = turned_with_neck(torso, turn, Joint(assets, NECK).position(identity.numpy()))
     seen = HeadModel(assets, identity, torch.float64).vertices(params).numpy() @ R.T + t
     expected = oracle(assets, identity, params, "torso")
-    np.testing.assert_allclose(seen, expected @ torso[0].T + torso[1], rtol=0, atol=1e-8)  # float32 weights do not sum to 1
+    np.testing.assert_allclose(
+        seen, expected @ torso[0].T + torso[1], rtol=0, atol=1e-8
+    )  # float32 weights do not sum to 1
 
 
 def test_at_rest_the_head_is_the_neutral_identity() -> None:

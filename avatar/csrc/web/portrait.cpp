@@ -159,18 +159,37 @@ void Portrait::skin() {
             for (int k = 0; k < 3; ++k) sum += barycentric[3 * g + k] * posed_[3 * corners_[3 * g + k] + i];
             points_[3 * g + i] = sum;
         }
-    if (sizes_.has_rigidity) hold();
+    if (sizes_.has_rigidity) hold(R[0]);
 }
 
-// Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py.
-void Portrait::hold() {
-    const float *barycentric = arrays_[kBarycentric].data(), *shape = arrays_[kShape].data();
-    for (std::int64_t g = 0; g < sizes_.gaussians; ++g)
-        for (int i = 0; i < 3; ++i) {
-            float on_skull = 0;
-            for (int k = 0; k < 3; ++k) on_skull += barycentric[3 * g + k] * shape[3 * corners_[3 * g + k] + i];
-            points_[3 * g + i] += arrays_[kRigidity][g] * (on_skull - points_[3 * g + i]);
+// Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py. `turn` is the torso's.
+void Portrait::hold(const Rotation& turn) {
+    bool carried[kJoints] = {};
+    for (int joint = kNeckJoint; joint < kJoints; ++joint)
+        carried[joint] = joint == kNeckJoint || (parents[joint] >= 0 && carried[parents[joint]]);
+    const float *barycentric = arrays_[kBarycentric].data(), *shape = arrays_[kShape].data(),
+                *weights = arrays_[kWeights].data(), *pivot = arrays_[kJointsAtRest].data() + 3 * kNeckJoint;
+    for (std::int64_t g = 0; g < sizes_.gaussians; ++g) {
+        float at_rest[3] = {}, arm[3] = {};
+        for (int k = 0; k < 3; ++k) {
+            const float b = barycentric[3 * g + k];
+            const std::int64_t v = corners_[3 * g + k];
+            float share = 0;
+            for (int joint = 0; joint < kJoints; ++joint)
+                if (carried[joint]) share += weights[v * kJoints + joint];
+            for (int i = 0; i < 3; ++i) {
+                at_rest[i] += b * shape[3 * v + i];
+                arm[i] += b * (1 - share) * (shape[3 * v + i] - pivot[i]);
+            }
         }
+        const float rigidity = arrays_[kRigidity][g];
+        for (int i = 0; i < 3; ++i) {
+            float on_skull = at_rest[i];
+            for (int k = 0; k < 3; ++k)
+                on_skull += (turn.m[3 * i + k] - (i == k ? 1.0f : 0.0f)) * arm[k];
+            points_[3 * g + i] += rigidity * (on_skull - points_[3 * g + i]);
+        }
+    }
 }
 
 // As FoldedNetwork in avatar/render.py.

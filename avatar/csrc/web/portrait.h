@@ -96,7 +96,7 @@ public:
 
 private:
     void skin();
-    void hold();
+    void hold(const Rotation& turn);
     void evaluate_network();
     void offset();
 
