@@ -87,6 +87,7 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Ou
             "look at overlay/: is the matte whole, and the head in its place?", True,
         ),
         *_of_outline(outline),
+        *_torso(own["torso"]),
         Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
     ]  # fmt: skip
     figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
@@ -107,6 +108,11 @@ def _of_outline(outline: Outline | None) -> list[Figure]:
         Figure("jitter of the outline, at 512", outline.jitter, "px", 0.5, 1.0, advice),
         Figure("width of the matte's edge, at 512", outline.width, "px"),
     ]
+
+
+def _torso(share: float | None) -> list[Figure]:
+    advice = "keep the shoulders in the picture, and hands away from the collar"
+    return [] if share is None else [Figure("frames whose torso was followed", 100 * share, "%", 90, 50, advice, True)]
 
 
 def coverage(fit: Fit, landmarks: Landmarks) -> list[Figure]:

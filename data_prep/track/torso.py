@@ -4,7 +4,7 @@ A neck that turned with the head would carry the collar along; a real collar sta
 every frame are aligned with those of one reference frame, after the shift and the size that the head's own motion
 explains, by the enhanced correlation coefficient. What is left moves the base of the neck in the picture, and the torso
 turns about the neck's joint until the base lies there. Where the clothes cannot be aligned, behind a hand say, the
-neighbours in time stand in.
+neighbours in time stand in. A turn moves the base aside, hardly up and down: what breath and shrugs do stays.
 
 Source of the alignment: Evangelidis and Psarakis, "Parametric image alignment using enhanced correlation coefficient
 maximization" (2008), as in OpenCV.
@@ -33,6 +33,7 @@ _STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)
 _ALIGNED = 0.7  # correlation from which on an alignment is believed
 _FARTHEST = 0.35  # radians that a torso turns from where it is on average
 _MEDIAN = 5  # frames
+LEAST_FOLLOWED = 0.5  # share of the frames; with less the torso stays with the head
 
 
 class Picture(NamedTuple):

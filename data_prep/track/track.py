@@ -7,6 +7,7 @@ despilled  the frames again, where the background's colours have run into the pe
 fit      identity, and pose and expression of every frame: by landmarks, then by pictures where that gains
 head     head and neck without clothes
 mouth    the lips and what is between them
+torso    how the torso is turned against the head, by the clothes
 overlay  the tracked mesh over the frames, for the eye
 """
 
@@ -110,6 +111,7 @@ def track(
         notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
         fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
         overlaps, outline = work.masks(landmarks, fit)
+        fit = work.torso(fit)
         work.overlay(fit, look)
         quality = judge(landmarks, fit, overlaps, outline, focal)
         for line in quality.lines():
@@ -138,9 +140,9 @@ def track(
         )
         write_tracking(stages.path, info, fit.tracks)
         if spill:
-            stages.finish(out, ("look", "fit"), {DESPILLED: FRAMES}, seal)
+            stages.finish(out, ("look", "fit", "torso"), {DESPILLED: FRAMES}, seal)
         else:
-            stages.finish(out, ("look", "fit", DESPILLED), seal=seal)
+            stages.finish(out, ("look", "fit", "torso", DESPILLED), seal=seal)
     say(f"tracked {len(fit.tracks)} frames in {out}")
     return info
 

@@ -40,6 +40,7 @@ from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.outline import Outline, measure_outline
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.stage_folder import StageFolder
+from data_prep.track.torso import LEAST_FOLLOWED, Picture, TorsoTracker, neck_of, with_torso
 from data_prep.track.user_mattes import OwnMattes
 
 DESPILLED = "despilled"  # the stage that stands in for the frames
@@ -190,6 +191,27 @@ class TrackingStages:
         result, _ = self._stages.run(HEAD, {"fit": fit.key}, make_heads)
         self._stages.run(MOUTH, {"fit": fit.key}, make_mouths)
         return result["overlaps"], result["outline"] and Outline(*result["outline"])
+
+    def torso(self, fit: Fit) -> Fit:
+        """The fit with the torso beneath the head as the clothes show it, by the masks."""
+
+        def make(folder: Path) -> dict[str, Any]:
+            neck = neck_of(fit.model(self._head), neck_ring(self._head.template.numpy(), self._faces))
+            tracker = TorsoTracker(
+                fit.tracks, neck, lambda n: Picture(self._image(n), self._mask(n), self._mask(n, HEAD))
+            )
+            followed = ahead(list(fit.tracks), tracker.shift, self._progress, "following the torso")
+            shifts = [shift for _, shift in followed] if tracker.has_clothes else []
+            known = sum(shift is not None for shift in shifts)
+            is_followed = known >= LEAST_FOLLOWED * len(fit.tracks)
+            tracks = with_torso(fit.tracks, tracker, shifts) if is_followed else fit.tracks
+            figures = fit.figures | {"torso": known / len(fit.tracks) if tracker.has_clothes else None}
+            Fit(tracks, figures).save(folder / TRACKS_FILE)
+            return figures
+
+        figures, key = self._stages.run("torso", {"fit": fit.key}, make)
+        first = next(iter(fit.tracks.values()))
+        return Fit.load(self._folder / "torso" / TRACKS_FILE, first.intrinsics.tolist(), first.size, figures, key)
 
     def overlay(self, fit: Fit, look: Look) -> None:
         def read(number: int) -> FrameParts:

@@ -26,5 +26,6 @@ def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"data_prep.track.{module}.FaceDetector", MarkDetector)
     monkeypatch.setattr("data_prep.track.tracking_stages.fit_tracks", fitted)
     monkeypatch.setattr(tracking.TrackingStages, "masks", lambda *_: ([1.0], None))
+    monkeypatch.setattr(tracking.TrackingStages, "torso", lambda _, fit: fit)
     monkeypatch.setattr(tracking.TrackingStages, "overlay", lambda *_: None)
     monkeypatch.setattr(tracking, "judge", lambda *_: Quality((), (), ""))
