@@ -27,9 +27,9 @@ from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
-from data_prep.formats.division import named_cameras
+from data_prep.formats.division import ALL, chosen_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, vector
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, read_frames, vector
 from data_prep.formats.root_pose import RootJoint, camera_of_head, rotation_matrix, six_d
 from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.formats.transforms import (
@@ -39,13 +39,11 @@ from data_prep.formats.transforms import (
     frame_rate,
     is_union,
     pinhole,
-    read_frames,
 )
 
 NAME = "VHAP"
 NAMES = KindNames("fg_masks/", "head masks", "mouth masks", images="images/", tracking="flame_param/")
 FRONTAL_FRAMES = 8  # by which the front camera is told
-ALL, FRONT = "all", "front"  # what --cameras may say beside names
 
 
 def recognise(frames: list[ListedFrame]) -> bool:
@@ -67,8 +65,6 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
         folder=folder.parent if is_union(folder) else folder,
         images=images,
         alphas=mattes or transparent(images),
-        head_masks={},
-        mouth_masks={},
         tracking=parameters,
         listings=listings_of(frames),
         names=NAMES,
@@ -78,7 +74,7 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
         root, read_file = RootJoint(head), _OnceRead()
         of = {number: shot.camera for number, shot in shots.items()} or None
         tracking = read_frames(
-            listed, parameters, lambda frame: _read_frame(frame, read_file(frame), root, size), complain, of
+            listed, lambda frame: _read_frame(frame, read_file(frame), root, size), parameters, complain, of
         )
         return _one_identity(tracking) if is_union(folder) else tracking
 
@@ -180,17 +176,8 @@ def _by_camera(frames: list[ListedFrame]) -> dict[str, list[ListedFrame]]:
 def _chosen(frames: list[ListedFrame], cameras: str, folder: Path) -> tuple[list[ListedFrame], tuple[str, ...]]:
     """The frames of the chosen cameras, and a note where these are not all."""
     by_camera = _by_camera(frames)
-    if cameras == ALL:
-        return frames, ()
-    try:
-        chosen = {_front(by_camera)} if cameras == FRONT else named_cameras(cameras, by_camera)
-    except UserError as error:
-        raise UserError(f"--cameras: {error} in {folder} (or say {ALL} or {FRONT})") from None
-    if chosen is None or chosen == by_camera.keys():
-        return frames, ()
-    names, are = ", ".join(sorted(chosen)), "is" if len(chosen) == 1 else "are"
-    note = f"of the folder's {len(by_camera)} cameras {names} {are} used"
-    return [frame for frame in frames if _camera(frame) in chosen], (note,)
+    chosen, notes = chosen_cameras(cameras, by_camera, lambda: _front(by_camera), folder)
+    return [frame for frame in frames if _camera(frame) in chosen], notes
 
 
 def _camera(frame: ListedFrame) -> str:
