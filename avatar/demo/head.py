@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from avatar.demo.blendshape_fields import IDENTITY_FIELDS, expression_displacement, identity_displacement, smooth_step
+from avatar.demo.blendshape_fields import expression_displacement, identity_displacement, smooth_step
 from avatar.demo.features import lip_line
 from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, MOUTH_HALF_WIDTH
 from avatar.demo.topology import HeadMesh, build_head_mesh
@@ -72,10 +72,6 @@ def demo_head() -> DemoHead:
         eyelid_dirs=eyelids.astype(np.float32),
         regions=_regions(mesh, skin),
     )
-
-
-def identity_names() -> tuple[str, ...]:
-    return tuple(IDENTITY_FIELDS)
 
 
 def _lip_side(mesh: HeadMesh) -> np.ndarray:
