@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avatar.demo.sculpt import EYE_CENTRE, MOUTH_CENTRE, MOUTH_HALF_WIDTH
+from avatar.demo.mesh import EYE_CENTRE, MOUTH_CENTRE, MOUTH_HALF_WIDTH
 
 
 def _bump(p: np.ndarray, centre: tuple[float, float, float], radius: float | tuple[float, float, float]) -> np.ndarray:

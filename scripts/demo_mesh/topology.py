@@ -7,35 +7,19 @@ triangulated (feature rings, and a centroidal Voronoi arrangement of vertices be
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.spatial import Delaunay, KDTree
 from skimage.measure import points_in_poly
 
-from avatar.demo.features import Rings, ear_rings, eye_rings, mouth_rings
-from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, RAY_ORIGIN, cast
-from avatar.demo.uv_chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
+from avatar.demo.mesh import EYE_CENTRE, EYE_RADIUS, HeadMesh
+from demo_mesh.features import Rings, ear_rings, eye_rings, mouth_rings
+from demo_mesh.sculpt import RAY_ORIGIN, cast
+from demo_mesh.uv_chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
 
 EYE_DISC_CENTRE, EYE_DISC_RADIUS = np.array([0.932, 0.932]), 0.062  # left eyeball; u is mirrored for the right
 EYEBALL_RINGS, EYEBALL_SECTORS, EYEBALL_REACH = 11, 24, np.radians(112.0)
 LLOYD_STEPS = 40
 NECK_STRETCH = 1.6
-
-
-class HeadMesh(NamedTuple):
-    """The neutral head in metres; UV vertices have their own indices, as in an OBJ file."""
-
-    vertices: np.ndarray  # float64 [V, 3]
-    faces: np.ndarray  # int32 [F, 3], counter-clockwise from outside
-    uvs: np.ndarray  # float64 [T, 2]
-    uv_faces: np.ndarray  # int32 [F, 3]
-    mirror: np.ndarray  # int64 [V], the vertex on the other side
-    eye_rings: np.ndarray  # int64 [2, R, K] left and right, innermost first
-    mouth_rings: np.ndarray  # int64 [2, R, K] left and right halves
-    ear_rings: np.ndarray  # int64 [2, R, K]
-    eyeballs: tuple[np.ndarray, np.ndarray]  # vertex indices, left and right
-    rim: np.ndarray  # vertex indices of the neck's open end
 
 
 def _spacing(points: np.ndarray) -> np.ndarray:
@@ -247,7 +231,7 @@ def _assemble(uv: np.ndarray, half: np.ndarray, triangles: np.ndarray, rings: li
         eye_rings=eye,
         mouth_rings=mouth,
         ear_rings=ear,
-        eyeballs=(new[eyeballs[0]], new[eyeballs[1]]),
+        eyeballs=new[np.array(eyeballs)],
         rim=np.unique(new[np.concatenate((bottom, right[bottom]))]),
     )
 
