@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -71,10 +72,14 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
     )
 
     def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        root, read_file = RootJoint(head), _OnceRead()
+        root, read_file = RootJoint(head), lru_cache(maxsize=1)(_parameters)  # the frames of one time share a file
         of = {number: shot.camera for number, shot in shots.items()} or None
         tracking = read_frames(
-            listed, lambda frame: _read_frame(frame, read_file(frame), root, size), parameters, complain, of
+            listed,
+            lambda frame: _read_frame(frame, read_file(_parameter_file(frame)), root, size),
+            parameters,
+            complain,
+            of,
         )
         return _one_identity(tracking) if is_union(folder) else tracking
 
@@ -88,21 +93,6 @@ def _parameter_file(frame: ListedFrame) -> Path:
     if path is None:
         raise UserError(f"{frame.listing}: frame {frame.position} has no flame_param_path; export the folder again")
     return path
-
-
-class _OnceRead:
-    """Parameter files, which the cameras' frames of one time share."""
-
-    def __init__(self) -> None:
-        self._path: Path | None = None
-        self._content: dict[str, np.ndarray] = {}
-
-    def __call__(self, frame: ListedFrame) -> dict[str, np.ndarray]:
-        path = _parameter_file(frame)
-        if path != self._path:
-            self._path, self._content = None, _parameters(frame)
-            self._path = path
-        return self._content
 
 
 def _read_frame(frame: ListedFrame, raw: dict[str, np.ndarray], root: RootJoint, size: tuple[int, int]) -> FrameTrack:
@@ -152,8 +142,7 @@ def _static_offset(values: np.ndarray, vertices: int, file: str) -> np.ndarray:
     return values.reshape(-1, 3)
 
 
-def _parameters(frame: ListedFrame) -> dict[str, np.ndarray]:
-    file = _parameter_file(frame)
+def _parameters(file: Path) -> dict[str, np.ndarray]:
     try:
         return load_npz(file)
     except UserError as error:
@@ -237,7 +226,7 @@ def _front(by_camera: dict[str, list[ListedFrame]]) -> str:
 def _frontality(frame: ListedFrame) -> float:
     """Cosine of the angle between where the face looks and where its camera is; -2 where the frame is unusable."""
     try:
-        rotation = vector(_parameters(frame).get("rotation", ()), "rotation", 3)
+        rotation = vector(_parameters(_parameter_file(frame)).get("rotation", ()), "rotation", 3)
         R, _ = _opencv_pose(frame)
     except BadFrame:
         return -2.0
