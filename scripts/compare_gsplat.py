@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from avatar.bench.clock import paired_medians
-from avatar.bench.splat_gpu import settle, splat_gsplat
+from avatar.bench.splat_gpu import settle
 from avatar.pipeline.choose_device import choose_device
 from avatar.runs.run import open_trained
 from avatar.splat import splat
@@ -78,6 +78,26 @@ class Splatter:
 
 def ours(gaussians: Gaussians, camera: Camera) -> Rendering:
     return splat(gaussians, camera, torch.zeros(3, device="cuda"))
+
+
+def splat_gsplat(gaussians: Gaussians, camera: Camera) -> Rendering:
+    """By gsplat (Ye et al., 2024), over black, with its own cut-offs; its ellipses end where ours do, or before."""
+    from gsplat import rasterization  # pyright: ignore[reportMissingImports]  # nobody has to have it
+
+    device = gaussians.means.device
+    view = torch.eye(4)
+    view[:3, :3], view[:3, 3] = camera.R_cam_world, camera.t_cam_world
+    intrinsics = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    image, alpha, _ = rasterization(
+        *gaussians,
+        view[None].to(device),
+        intrinsics[None].to(device),
+        camera.width,
+        camera.height,
+        sh_degree=round(gaussians.sh.shape[1] ** 0.5) - 1,
+        packed=False,
+    )
+    return Rendering(image[0], alpha[0, ..., 0])
 
 
 def captured(scene: Scene) -> Callable[[], None]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import available_simd, limited_to
-from avatar.bench.splat_gpu import device_of, gpu_backends, settle, splat_gsplat
+from avatar.bench.splat_gpu import device_of, settle
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
@@ -33,7 +33,7 @@ OWN_SIZE = 128  # pixels, at most, where a variant with its own cut-offs is comp
 
 @dataclass(frozen=True)
 class Variant:
-    backend: Literal["cpu", "gpu", "gsplat", "reference"]
+    backend: Literal["cpu", "gpu", "reference"]
     count: int  # splats
     size: int  # pixels, width and height
     threads: int
@@ -104,12 +104,13 @@ def all_variants(
     count: int = HEAD_SPLATS,
     size: int = 512,
     all_threads: bool = False,
+    on_gpu: bool = False,
 ) -> list[Variant]:
     """What is measured, by default with all threads and the best instruction set.
 
     Every size with `count` splats and every count at `size`, with one thread and with all; at (`count`, `size`) also the
     numbers of threads between (with `all_threads`), the other instruction sets, other cut-offs, and the float64 reference.
-    Where there is a GPU, every scene is drawn there too.
+    With `on_gpu` every scene is drawn there too.
     """
     *others, best = available_simd()
     most = torch.get_num_threads()
@@ -121,7 +122,7 @@ def all_variants(
     variants += [Variant("cpu", count, size, t, simd) for simd in others for t in threads]
     variants += [Variant("cpu", count, size, most, best, alpha_min=value) for value in OTHER_ALPHA_MINS]
     variants += [Variant("cpu", count, size, most, best, t_min=value) for value in OTHER_T_MINS]
-    variants += [Variant(backend, n, s, most, "") for backend in gpu_backends() for n, s in scenes]  # type: ignore[arg-type]
+    variants += [Variant("gpu", n, s, most, "") for n, s in scenes if on_gpu]
     return [*variants, Variant("reference", count, size, most, "")]
 
 
@@ -166,14 +167,12 @@ def reference_of(gaussians: Gaussians, size: int, *, alpha_min: float = ALPHA_MI
 
 
 def validate(variant: Variant, gaussians: Gaussians, size: int, truth: Truth) -> Accuracy:
-    """The variant's errors at `size` pixels; UserError if they are above the tolerances, unless it is somebody else's.
+    """The variant's errors at `size` pixels; UserError if they are above the tolerances.
 
     Where the variant has its own cut-offs, its errors against a reference with the same ones decide, at OWN_SIZE or less.
     """
     accuracy = accuracy_of(variant, gaussians, size, truth)
     found = accuracy
-    if variant.backend == "gsplat":
-        return accuracy
     if not variant.has_usual_cutoffs:
         size = min(size, OWN_SIZE)
         own = reference_of(gaussians, size, alpha_min=variant.alpha_min, t_min=variant.t_min)
@@ -242,8 +241,6 @@ def leaves_of(variant: Variant, gaussians: Gaussians) -> Gaussians:
 def draw(variant: Variant, gaussians: Gaussians, size: int) -> Rendering:
     camera, black = head_camera(size), torch.zeros(3, device=gaussians.means.device)
     with limited_to(threads=variant.threads, simd=variant.simd):
-        if variant.backend == "gsplat":
-            return splat_gsplat(gaussians, camera)
         return splat(
             gaussians, camera, black, backend=variant.backend, alpha_min=variant.alpha_min, t_min=variant.t_min
         )

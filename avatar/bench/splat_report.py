@@ -9,7 +9,6 @@ from dataclasses import asdict
 from avatar.bench import Request
 from avatar.bench.results import Line, Panel, write_report
 from avatar.bench.splat import Row, Variant, all_variants, measure
-from avatar.bench.splat_gpu import ON_GPU
 from avatar.bench.splat_work import peak_memory
 from avatar.splat.scenes import HEAD_SPLATS
 
@@ -20,14 +19,16 @@ FULL_SIZES, FULL_COUNTS = (128, 256, 512, 1024), (1_000, 5_000, HEAD_SPLATS, 50_
 
 def run(request: Request) -> None:
     """Measure, print and write; `quick` takes scenes too small to say anything. A GPU is measured beside the CPU."""
-    is_left_out = ON_GPU if request.device == "cpu" else ()
+    on_gpu = request.device != "cpu"
     if request.quick:
-        variants = all_variants(QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE, all_threads=True)
+        variants = all_variants(
+            QUICK_SIZES, QUICK_COUNTS, count=QUICK_COUNT, size=QUICK_SIZE, all_threads=True, on_gpu=on_gpu
+        )
         repeats, validation_size = 3, QUICK_SIZE
     else:
         sizes, counts = (FULL_SIZES, FULL_COUNTS) if request.full else (USUAL_SIZES, USUAL_COUNTS)
-        variants, repeats, validation_size = all_variants(sizes, counts, all_threads=request.full), 21, 512
-    variants = [variant for variant in variants if variant.backend not in is_left_out]
+        variants = all_variants(sizes, counts, all_threads=request.full, on_gpu=on_gpu)
+        repeats, validation_size = 21, 512
     rows = measure(variants, repeats=repeats, validation_size=validation_size)
     is_measured = sys.platform == "linux" and not request.quick
     scenes = dict.fromkeys((row.variant.count, row.variant.size) for row in rows) if is_measured else ()

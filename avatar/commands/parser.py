@@ -174,7 +174,6 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     send.add_argument("port", type=int, metavar="PORT", help="of avatar view --stream on this machine")
     send.add_argument("--head", type=Path, metavar="PATH", required=True, help="the avatar's head model")
     add_token(send, "that of avatar view (default: $AVATAR_TOKEN)")
-    send.add_argument("--loop", action="store_true", help="again and again, until Ctrl-C")
 
     drive_file = commands.add_parser("drive-file", help="write a tracked folder's motion as a drive file")
     add_source(drive_file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from dataclasses import fields
 from pathlib import Path
 
 from avatar.commands.outputs import check_file, check_outputs
@@ -20,15 +21,7 @@ from avatar.runs.trained import TrainedAvatar
 def run_reenact(arguments: Namespace) -> int:
     trained = open_trained(arguments.run, arguments.head)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
-    choices = Choices(
-        arguments.transfer,
-        arguments.strength,
-        arguments.smoothing,
-        arguments.camera,
-        arguments.intrinsics,
-        arguments.neutral,
-        arguments.driver_neutral,
-    )
+    choices = Choices(**{field.name: getattr(arguments, field.name) for field in fields(Choices)})
     driver: Path = arguments.driver
     out = arguments.out or default_video(arguments.run, driver, choices)
     check_file(out, VIDEO_SUFFIXES, "a video")

@@ -13,6 +13,6 @@ from avatar.view.sender import send
 
 def run_send(arguments: Namespace) -> int:
     drive = read_drive(arguments.drive, load_head_assets(arguments.head), width=512)
-    count = send(drive, "127.0.0.1", arguments.port, arguments.loop, token=checked_token(arguments.token))
+    count = send(drive, "127.0.0.1", arguments.port, token=checked_token(arguments.token))
     print(f"{count} frames of {arguments.drive} sent to port {arguments.port}")
     return OK

@@ -6,13 +6,9 @@ Identity fields are also applied to what only the renderer has (glasses, teeth),
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from avatar.demo.sculpt import EYE_CENTRE, MOUTH_CENTRE, MOUTH_HALF_WIDTH
-
-Field = Callable[[np.ndarray], np.ndarray]
+from avatar.demo.mesh import EYE_CENTRE, MOUTH_CENTRE, MOUTH_HALF_WIDTH
 
 
 def _bump(p: np.ndarray, centre: tuple[float, float, float], radius: float | tuple[float, float, float]) -> np.ndarray:
@@ -39,91 +35,48 @@ def smooth_step(value: np.ndarray, low: float | np.ndarray, high: float | np.nda
     return t * t * (3.0 - 2.0 * t)
 
 
-def _identity_fields() -> dict[str, Field]:
-    def width(p: np.ndarray) -> np.ndarray:
-        return p * np.array([0.05, 0.0, 0.0])
-
-    def height(p: np.ndarray) -> np.ndarray:
-        return p * np.array([0.0, 0.04, 0.0])
-
-    def depth(p: np.ndarray) -> np.ndarray:
-        back = np.minimum(p[:, 2], 0.0)
-        return np.stack((0 * back, 0 * back, 0.06 * back), -1)
-
-    def face_length(p: np.ndarray) -> np.ndarray:
-        front = smooth_step(p[:, 2], -30, 40)
-        return np.stack((0 * front, -5.0 * smooth_step(-p[:, 1], 10, 90) * front, 0 * front), -1)
-
-    def jaw_width(p: np.ndarray) -> np.ndarray:
-        weight = np.exp(-(((p[:, 1] + 62) / 32) ** 2)) * np.exp(-(((p[:, 2] - 22) / 45) ** 2))
-        return np.stack((0.11 * p[:, 0] * weight, 0 * weight, 0 * weight), -1)
-
-    def cranium(p: np.ndarray) -> np.ndarray:
-        weight = smooth_step(p[:, 1], 45, 130)
-        return np.stack((0.05 * p[:, 0] * weight, 5.0 * weight, 0.02 * p[:, 2] * weight), -1)
-
-    def neck_girth(p: np.ndarray) -> np.ndarray:
-        weight = smooth_step(-p[:, 1], 70, 125)
-        return np.stack((0.09 * p[:, 0], 0 * weight, 0.09 * (p[:, 2] + 26)), -1) * weight[:, None]
-
-    def nose_length(p: np.ndarray) -> np.ndarray:
-        return _bump(p, (0, -18, 102), (15, 14, 20))[:, None] * np.array([0.0, -3.6, 0.6])
-
-    def nose_projection(p: np.ndarray) -> np.ndarray:
-        return _bump(p, (0, -12, 106), (14, 19, 22))[:, None] * np.array([0.0, 0.6, 3.6])
-
-    def nose_width(p: np.ndarray) -> np.ndarray:
-        weight = _bump(p, (0, -17, 96), (20, 11, 17))
-        return np.stack((0.17 * p[:, 0] * weight, 0 * weight, 0 * weight), -1)
-
-    def nose_bridge(p: np.ndarray) -> np.ndarray:
-        return _bump(p, (0, 12, 96), (9, 15, 20))[:, None] * np.array([0.0, 0.0, 3.2])
-
-    def mouth_width(p: np.ndarray) -> np.ndarray:
-        weight = _bump(p, (0, -47, 85), (34, 17, 34))
-        return np.stack((0.11 * p[:, 0] * weight, 0 * weight, 0 * weight), -1)
-
-    def lip_fullness(p: np.ndarray) -> np.ndarray:
-        weight = _bump(p, (0, -48, 96), (20, 12, 16))
-        return np.stack((0 * weight, 0.17 * (p[:, 1] + 47.5) * weight, 2.0 * weight), -1)
-
-    def eye_spacing(p: np.ndarray) -> np.ndarray:
-        side = np.tanh(p[:, 0] / 9.0)
-        weight = np.exp(-(((np.abs(p[:, 0]) - 31) / 26) ** 4) - ((p[:, 1] - 22) / 28) ** 4) * smooth_step(
-            p[:, 2], 10, 45
-        )
-        return np.stack((1.6 * side * weight, 0 * weight, 0 * weight), -1)
-
-    return {
-        "width": width,
-        "height": height,
-        "depth": depth,
-        "face_length": face_length,
-        "jaw_width": jaw_width,
-        "cranium": cranium,
-        "neck_girth": neck_girth,
-        "chin": lambda p: _bump(p, (0, -80, 82), (24, 20, 30))[:, None] * np.array([0.0, -1.5, 5.0]),
-        "cheekbones": lambda p: _pair(p, (50, 0, 52), (24, 18, 30), (3.6, 0.5, 2.4)),
-        "cheeks": lambda p: _pair(p, (38, -35, 58), (22, 24, 30), (4.6, 0.0, 2.8)),
-        "brow_ridge": lambda p: _pair(p, (22, 40, 84), (24, 10, 20), (0.0, -1.2, 3.2)),
-        "brow_height": lambda p: _pair(p, (26, 40, 80), (28, 9, 24), (0.0, 2.8, 0.4)),
-        "eye_spacing": eye_spacing,
-        "nose_length": nose_length,
-        "nose_projection": nose_projection,
-        "nose_width": nose_width,
-        "nose_bridge": nose_bridge,
-        "mouth_width": mouth_width,
-        "lip_fullness": lip_fullness,
-        "ear_flare": lambda p: _pair(p, (88, 8, -22), (15, 34, 18), (4.0, 0.0, 1.0)),
-    }
+def _identity_fields(p: np.ndarray) -> dict[str, np.ndarray]:
+    """Displacements [N, 3] of points [N, 3] by name, both in millimetres."""
+    out: dict[str, np.ndarray] = {}
+    out["width"] = p * np.array([0.05, 0.0, 0.0])
+    out["height"] = p * np.array([0.0, 0.04, 0.0])
+    back = np.minimum(p[:, 2], 0.0)
+    out["depth"] = np.stack((0 * back, 0 * back, 0.06 * back), -1)
+    front = smooth_step(p[:, 2], -30, 40)
+    out["face_length"] = np.stack((0 * front, -5.0 * smooth_step(-p[:, 1], 10, 90) * front, 0 * front), -1)
+    jaw = np.exp(-(((p[:, 1] + 62) / 32) ** 2)) * np.exp(-(((p[:, 2] - 22) / 45) ** 2))
+    out["jaw_width"] = np.stack((0.11 * p[:, 0] * jaw, 0 * jaw, 0 * jaw), -1)
+    top = smooth_step(p[:, 1], 45, 130)
+    out["cranium"] = np.stack((0.05 * p[:, 0] * top, 5.0 * top, 0.02 * p[:, 2] * top), -1)
+    neck = smooth_step(-p[:, 1], 70, 125)
+    out["neck_girth"] = np.stack((0.09 * p[:, 0], 0 * neck, 0.09 * (p[:, 2] + 26)), -1) * neck[:, None]
+    out["chin"] = _bump(p, (0, -80, 82), (24, 20, 30))[:, None] * np.array([0.0, -1.5, 5.0])
+    out["cheekbones"] = _pair(p, (50, 0, 52), (24, 18, 30), (3.6, 0.5, 2.4))
+    out["cheeks"] = _pair(p, (38, -35, 58), (22, 24, 30), (4.6, 0.0, 2.8))
+    out["brow_ridge"] = _pair(p, (22, 40, 84), (24, 10, 20), (0.0, -1.2, 3.2))
+    out["brow_height"] = _pair(p, (26, 40, 80), (28, 9, 24), (0.0, 2.8, 0.4))
+    side = np.tanh(p[:, 0] / 9.0)
+    eyes = np.exp(-(((np.abs(p[:, 0]) - 31) / 26) ** 4) - ((p[:, 1] - 22) / 28) ** 4) * smooth_step(p[:, 2], 10, 45)
+    out["eye_spacing"] = np.stack((1.6 * side * eyes, 0 * eyes, 0 * eyes), -1)
+    out["nose_length"] = _bump(p, (0, -18, 102), (15, 14, 20))[:, None] * np.array([0.0, -3.6, 0.6])
+    out["nose_projection"] = _bump(p, (0, -12, 106), (14, 19, 22))[:, None] * np.array([0.0, 0.6, 3.6])
+    wings = _bump(p, (0, -17, 96), (20, 11, 17))
+    out["nose_width"] = np.stack((0.17 * p[:, 0] * wings, 0 * wings, 0 * wings), -1)
+    out["nose_bridge"] = _bump(p, (0, 12, 96), (9, 15, 20))[:, None] * np.array([0.0, 0.0, 3.2])
+    mouth = _bump(p, (0, -47, 85), (34, 17, 34))
+    out["mouth_width"] = np.stack((0.11 * p[:, 0] * mouth, 0 * mouth, 0 * mouth), -1)
+    lips = _bump(p, (0, -48, 96), (20, 12, 16))
+    out["lip_fullness"] = np.stack((0 * lips, 0.17 * (p[:, 1] + 47.5) * lips, 2.0 * lips), -1)
+    out["ear_flare"] = _pair(p, (88, 8, -22), (15, 34, 18), (4.0, 0.0, 1.0))
+    return out
 
 
-IDENTITY_FIELDS = _identity_fields()  # millimetres to millimetres
+IDENTITY_NAMES = tuple(_identity_fields(np.zeros((1, 3))))
 
 
 def identity_displacement(points: np.ndarray) -> np.ndarray:
-    """Displacements [N, 3, K] in metres of points [N, 3] in metres, one for each of `IDENTITY_FIELDS`."""
-    return np.stack([field(points * 1e3) for field in IDENTITY_FIELDS.values()], -1) * 1e-3
+    """Displacements [N, 3, K] in metres of points [N, 3] in metres, one for each of `IDENTITY_NAMES`."""
+    return np.stack(list(_identity_fields(points * 1e3).values()), -1) * 1e-3
 
 
 class Mouth:

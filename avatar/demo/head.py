@@ -7,10 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from avatar.demo.blendshape_fields import IDENTITY_FIELDS, expression_displacement, identity_displacement, smooth_step
-from avatar.demo.features import lip_line
-from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, MOUTH_HALF_WIDTH
-from avatar.demo.topology import HeadMesh, build_head_mesh
+from avatar.demo.blendshape_fields import expression_displacement, identity_displacement, smooth_step
+from avatar.demo.mesh import EYE_CENTRE, EYE_RADIUS, MOUTH_HALF_WIDTH, HeadMesh, lip_line, load_head_mesh
 
 # Metres; FLAME's joints: root at the base of the neck, neck (which carries the head), jaw, left eye, right eye.
 JOINTS = (
@@ -47,8 +45,8 @@ class DemoHead:
 
 @cache
 def demo_head() -> DemoHead:
-    """The head; built once per process (about five seconds), the same bits every time."""
-    mesh = build_head_mesh()
+    """The head; made once per process, the same bits every time."""
+    mesh = load_head_mesh()
     points = mesh.vertices
     skin = np.ones(len(points), bool)
     skin[np.concatenate(mesh.eyeballs)] = False
@@ -72,10 +70,6 @@ def demo_head() -> DemoHead:
         eyelid_dirs=eyelids.astype(np.float32),
         regions=_regions(mesh, skin),
     )
-
-
-def identity_names() -> tuple[str, ...]:
-    return tuple(IDENTITY_FIELDS)
 
 
 def _lip_side(mesh: HeadMesh) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.demo.head import identity_names
+from avatar.demo.blendshape_fields import IDENTITY_NAMES
 
 # Skin, hair and eye colours in linear RGB: skin from pale to dark, each with the lips that go with it.
 _SKIN = np.array([[0.70, 0.46, 0.37], [0.62, 0.38, 0.28], [0.52, 0.30, 0.20], [0.38, 0.20, 0.12], [0.22, 0.11, 0.065]])
@@ -58,7 +58,7 @@ class Identity:
 def sample_identity(seed: int) -> Identity:
     """The person that belongs to a seed."""
     rng = np.random.default_rng((seed, 1))
-    names = identity_names()
+    names = IDENTITY_NAMES
     shape = np.zeros(300, np.float32)
     shape[: len(names)] = np.clip(rng.normal(0.0, 0.75, len(names)), -1.6, 1.6)
     tone = rng.beta(1.1, 1.5) * (len(_SKIN) - 1)

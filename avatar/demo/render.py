@@ -17,9 +17,9 @@ import torch
 
 from avatar.demo import lighting, scene, shading
 from avatar.demo.identity import Identity, sample_identity
+from avatar.demo.mesh import EYE_RADIUS
 from avatar.demo.occlusion import ambient_occlusion
 from avatar.demo.pixels import Pixels, covered, to_screen
-from avatar.demo.sculpt import EYE_RADIUS
 from avatar.demo.skin import bake_skin, paint_iris, strand_tile
 from avatar.head.rasterize import MeshRaster, rasterize_mesh
 from avatar.types import Camera, HeadParams

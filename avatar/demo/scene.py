@@ -61,15 +61,7 @@ def _vertex_normal_operator(faces: np.ndarray, count: int) -> csr_matrix:
 def face_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Normals [F, 3], as long as twice the area."""
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
-    u, v = b - a, c - a
-    return np.stack(
-        (
-            u[:, 1] * v[:, 2] - u[:, 2] * v[:, 1],
-            u[:, 2] * v[:, 0] - u[:, 0] * v[:, 2],
-            u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0],
-        ),
-        -1,
-    )
+    return np.cross(b - a, c - a)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from avatar.demo import lighting
 from avatar.demo.lighting import FILL_COLOUR, KEY_COLOUR, RIM_COLOUR, Lights, along, lookup, turn, unit
-from avatar.demo.sculpt import EYE_RADIUS
+from avatar.demo.mesh import EYE_RADIUS
 
 SKIN_WRAP = np.array([0.42, 0.20, 0.13], np.float32)
 _CLOTH_WRAP = np.array([0.25, 0.25, 0.25], np.float32)

@@ -13,10 +13,9 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.spatial import KDTree
 
 from avatar.demo.blendshape_fields import smooth_step
-from avatar.demo.features import lip_line
 from avatar.demo.head import DemoHead
 from avatar.demo.identity import Identity
-from avatar.demo.sculpt import EYE_CENTRE, smooth_max, smooth_min
+from avatar.demo.mesh import EYE_CENTRE, lip_line, smooth_max, smooth_min
 from avatar.head.rasterize import rasterize_mesh
 
 

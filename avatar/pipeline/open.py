@@ -32,16 +32,9 @@ def source_of(arguments: Namespace) -> Source:
 
 def source_options(arguments: Namespace, tracking: Path | None) -> dict[str, Any]:
     """What the options say of a tracked folder, as fields of a Source."""
-    options = {
-        "tracking": tracking,
-        "frame_offset": arguments.frame_offset,
-        "format": arguments.format,
-        "fps": arguments.fps,
-        "ignore_misfit": arguments.ignore_misfit,
-        "cameras": arguments.cameras,
-    }
-    left_out = arguments.max_left_out
-    return options if left_out is None else {**options, "max_left_out": left_out}
+    names = ("frame_offset", "format", "fps", "ignore_misfit", "cameras", "max_left_out")
+    given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
+    return {"tracking": tracking, **given}
 
 
 def open_run(

@@ -54,16 +54,7 @@ class Plan:
     spent: float = 0.0  # seconds of the minutes when the plan was written
 
     def save(self, run: Path) -> None:
-        content = {
-            "format": PLAN_FORMAT,
-            "rounds": self.rounds,
-            "source": self.source.to_dict(),
-            "overrides": self.overrides,
-            "minutes": self.minutes,
-            "iterations": self.iterations,
-            "round_iterations": self.round_iterations,
-            "spent": self.spent,
-        }
+        content = {"format": PLAN_FORMAT, **self.__dict__, "source": self.source.to_dict()}
         write_atomically(plan_file(run), json.dumps(content, indent=1, allow_nan=False).encode())
 
     @classmethod

@@ -22,13 +22,7 @@ from avatar.sweep.output import BoundedLog, end_of, old_of
 from avatar.sweep.spec import Job
 from avatar.sweep.state import HEARTBEAT_SECONDS, State, beat, read_job, read_state, worker_name, write_state
 
-OPTIONS = {
-    "head": "--head",
-    "tracking": "--tracking",
-    "frame_offset": "--frame-offset",
-    "format": "--format",
-    "fps": "--fps",
-}
+OPTIONS = ("head", "tracking", "frame_offset", "format", "fps")  # of a source, as `avatar train` calls them
 OK, EXIT_ERROR, EXIT_INTERRUPTED = 0, 1, 130
 Command = Callable[[list[str]], int]  # `avatar WORDS`, its exit status
 
@@ -73,9 +67,9 @@ def work(job: Job, folder: Path, command: Command) -> State:
 
 def source_words(job: Job) -> list[str]:
     words = [str(job.source["folder"])]
-    for key, option in OPTIONS.items():
+    for key in OPTIONS:
         if key in job.source:
-            words += [option, str(job.source[key])]
+            words += [f"--{key.replace('_', '-')}", str(job.source[key])]
     return words
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
@@ -30,23 +30,16 @@ def send(
     drive: Drive,
     host: str,
     port: int,
-    loop: bool = False,
     wait: Callable[[float], None] = time.sleep,
     token: str | None = None,
 ) -> int:
     """The number of frames sent. Raises UserError when nobody listens, or stops to."""
     sent, begin = 0, time.monotonic()
-
-    def frames() -> Iterator[HeadParams]:
-        yield from drive.params
-        while loop:
-            yield from drive.params
-
     try:
         with socket.create_connection((host, port), timeout=10) as connection:
             if token is not None:
                 connection.sendall(json.dumps({"token": token}, allow_nan=False).encode() + b"\n")
-            for params in frames():
+            for params in drive.params:
                 wait(max(begin + sent / drive.fps - time.monotonic(), 0.0))
                 connection.sendall(encode_line(params))
                 sent += 1

@@ -18,11 +18,11 @@ from avatar.head.model import HeadModel
 from data_prep.check.findings import Severity, frames_phrase
 from data_prep.check.view import View, look_at
 from data_prep.formats.detect import METRICAL_TRACKER, open_tracked_folder
+from data_prep.formats.division import ALL, FRONT
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, TRACKING, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder
-from data_prep.formats.vhap import ALL, FRONT
 from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
@@ -202,9 +202,8 @@ def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View],
     steps: dict[int, float] = {}
     previous: tuple[int, np.ndarray] | None = None
     numbers = list(files.images)
-    decoders = files.decoders()
     with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
-        looks = pool.map(lambda n: look_at(_files_of(files, n), decoders), numbers)
+        looks = pool.map(lambda n: look_at(_files_of(files, n), files.decode), numbers)
         for number, view in zip(numbers, progress(looks, len(numbers), "images"), strict=True):
             views[number] = replace(view, grey=None)
             if view.grey is None:

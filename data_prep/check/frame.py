@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.data.images import read_bytes, read_image
+from avatar.data.images import read_image
 from avatar.data.subject import head_of_matte
 from avatar.types import Camera, Frame
 from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage
+from data_prep.formats.frame_files import ALPHA
 from data_prep.prepare.masks import read_masks
 from data_prep.prepare.projection import head_params
 
@@ -27,9 +28,9 @@ def _frame(clip: Clip, number: int) -> Frame:
     files = clip.files
     image = read_image(files.images[number])
     height, width = image.shape[:2]
-    alpha = np.full((height, width), 255, np.uint8)
-    if number in files.alphas:
-        alpha = files.decode_alpha(read_bytes(files.alphas[number]), files.alphas[number])
+    alpha = files.read(ALPHA, number)
+    if alpha is None:
+        alpha = np.full((height, width), 255, np.uint8)
     head, mouth = read_masks(files, number)
     if head is None or not (files.head_masks or files.parsing):
         head = head_of_matte(alpha)

@@ -22,7 +22,6 @@ from data_prep.prepare.projection import filled
 
 FAR = 0.05  # of the image width: further from the person than soft hair reaches
 _ON = 127
-Decode = Callable[[bytes, Path], np.ndarray]
 _MIN_PIXELS = 64  # below, a mean colour says nothing
 
 
@@ -50,10 +49,10 @@ class View:
     cut: float = 0.0  # share of the picture's upper edge that the head mask covers
 
 
-def look_at(paths: Mapping[str, Path], decoders: Mapping[str, Decode]) -> View:
+def look_at(paths: Mapping[str, Path], decode: Callable[[str, bytes, Path], np.ndarray]) -> View:
     """Decode the files of one frame (kind -> path, the image among them) and measure them. Raises nothing.
 
-    The decoder of PARSING gives classes, out of which the head mask is made.
+    decode  gives the pixels of a kind's file; of PARSING classes, out of which the head mask is made
     """
     problems: dict[str, str] = {}
     pixels: dict[str, np.ndarray] = {}
@@ -61,7 +60,7 @@ def look_at(paths: Mapping[str, Path], decoders: Mapping[str, Decode]) -> View:
     for kind, path in paths.items():
         try:
             data = read_bytes(path)
-            pixels[kind] = decoders[kind](data, path)
+            pixels[kind] = decode(kind, data, path)
         except UserError as error:
             problems[kind] = str(error)
             continue

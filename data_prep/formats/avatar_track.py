@@ -29,7 +29,7 @@ from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_files import FrameFiles, KindNames, find_numbered
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.formats.frame_track import FrameTrack, Tracking, nearest_rotation, read_frames, vector
 from data_prep.formats.tracked_folder import TrackedFolder
 from data_prep.formats.transforms import read_json
 
@@ -170,18 +170,14 @@ def _read_arrays(folder: Path, name: str = TRACKS_FILE) -> dict[str, np.ndarray]
 def _tracks(
     arrays: dict[str, np.ndarray], info: TrackingInfo, paths: dict[int, Path], complain: Callable[[str], object]
 ) -> Tracking:
-    frames: dict[int, FrameTrack] = {}
-    bad: dict[int, str] = {}
-    for row, number in enumerate(arrays["number"].tolist()):
-        try:
-            values: dict[str, Any] = {name: vector(arrays[name][row], name) for name in ARRAYS}
-            values["R"] = nearest_rotation(values["R"].reshape(3, 3), "R")
-            frames[number] = FrameTrack(
-                **values,
-                shape=vector(arrays["shape"], "shape"),
-                intrinsics=np.array(info.intrinsics),
-                size=(info.width, info.height),
-            )
-        except BadFrame as error:
-            bad[number] = str(error)
-    return checked_tracking(frames, bad, paths, complain)
+    def read(row: int) -> FrameTrack:
+        values: dict[str, Any] = {name: vector(arrays[name][row], name) for name in ARRAYS}
+        values["R"] = nearest_rotation(values["R"].reshape(3, 3), "R")
+        return FrameTrack(
+            **values,
+            shape=vector(arrays["shape"], "shape"),
+            intrinsics=np.array(info.intrinsics),
+            size=(info.width, info.height),
+        )
+
+    return read_frames({number: row for row, number in enumerate(arrays["number"].tolist())}, read, paths, complain)

@@ -36,8 +36,6 @@ def open_folder(folder: Path) -> TrackedFolder:
         folder=folder,
         images=images,
         alphas=mattes or transparent(images),
-        head_masks={},
-        mouth_masks={},
         tracking=find_tracking(folder),
         paired_by="the number in their names",
         names=NAMES,

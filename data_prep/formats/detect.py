@@ -7,6 +7,7 @@ from pathlib import Path
 
 from avatar.errors import UserError, refuse
 from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, refined, vhap
+from data_prep.formats.division import ALL, FRONT
 from data_prep.formats.frame_files import find_frame_files
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, matte_notes
@@ -37,13 +38,13 @@ def open_tracked_folder(
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
-        if cameras not in (None, vhap.ALL, vhap.FRONT):
+        if cameras not in (None, ALL, FRONT):
             raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
         return refined.open_folder(folder)
     is_listed = folder.is_dir() and (format is None or format in _LISTED)
     frames = read_listings(folder) if is_listed else []
     name = format or detect_format(folder, frames)
-    if cameras not in (None, vhap.ALL, vhap.FRONT) and name not in (vhap.NAME, nersemble.NAME):
+    if cameras not in (None, ALL, FRONT) and name not in (vhap.NAME, nersemble.NAME):
         raise UserError(f"--cameras is for folders of several cameras, and {folder} is {name}'s, of one")
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)
@@ -62,9 +63,9 @@ def open_tracked_folder(
         where = "is in the folder itself" if name in _BY_FILES else "is named by the listing"
         raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking {where}")
     if name == vhap.NAME:
-        return vhap.open_folder(folder, frames, cameras or vhap.ALL)
+        return vhap.open_folder(folder, frames, cameras or ALL)
     if name == nersemble.NAME:
-        return nersemble.open_folder(folder, cameras or nersemble.ALL)
+        return nersemble.open_folder(folder, cameras or ALL)
     if name == blendshapes.NAME:
         return blendshapes.open_folder(folder)
     return _LISTED[name].open_folder(folder, frames)

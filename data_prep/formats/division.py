@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 
 from avatar.data.split import Split, split_frames
 from avatar.errors import UserError
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
 
+ALL, FRONT = "all", "front"  # what --cameras may say beside names
 NO_CAMERA = "none"
 
 
@@ -78,6 +80,25 @@ def _divide_shots(
     if not train:
         raise UserError("no picture is left to train on: every time or camera is held out")
     return Split(tuple(train), tuple(i for i in range(len(shots)) if i not in seen)), notes
+
+
+def chosen_cameras(
+    chosen: str, cameras: Collection[str], front: Callable[[], str], folder: Path
+) -> tuple[set[str], tuple[str, ...]]:
+    """Those that --cameras names of a folder's: ALL, FRONT or names between commas; and a note where these are not all.
+
+    front  the camera before the face
+    Raises UserError for a name that no camera has.
+    """
+    try:
+        found = set(cameras) if chosen == ALL else {front()} if chosen == FRONT else named_cameras(chosen, cameras)
+    except UserError as error:
+        raise UserError(f"--cameras: {error} in {folder} (or say {ALL} or {FRONT})") from None
+    found = found or set(cameras)
+    if len(found) == len(cameras):
+        return found, ()
+    are = "is" if len(found) == 1 else "are"
+    return found, (f"of the folder's {len(cameras)} cameras {', '.join(sorted(found))} {are} used",)
 
 
 def named_cameras(names: str | None, cameras: Collection[str]) -> set[str] | None:

@@ -10,18 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.images import decode_image, decode_mask
+from avatar.data.images import decode_image
 
 HEAD = (*range(1, 15), 17, 18)
 MOUTH = (11, 12, 13)
 _INSTA_RED = (0, 250, 240, 230, 210, 200, 190, 180, 170, 160, 150, 140, 130, 120, 110, 100, 90, 80, 70)
 _CLASS_OF_RED = np.zeros(256, np.uint8)
 _CLASS_OF_RED[list(_INSTA_RED)] = np.arange(len(_INSTA_RED))
-
-
-def decode_numbers(data: bytes, path: Path) -> np.ndarray:
-    """uint8 [H, W] classes of a grey image that holds their numbers. Raises UserError naming the file."""
-    return decode_mask(data, path)
 
 
 def decode_reds(data: bytes, path: Path) -> np.ndarray:

@@ -48,10 +48,10 @@ class FrameFiles:
 
     folder: Path
     images: dict[int, Path]
-    alphas: dict[int, Path]
-    head_masks: dict[int, Path]
-    mouth_masks: dict[int, Path]
-    tracking: dict[int, Path]
+    alphas: dict[int, Path] = field(default_factory=dict)
+    head_masks: dict[int, Path] = field(default_factory=dict)
+    mouth_masks: dict[int, Path] = field(default_factory=dict)
+    tracking: dict[int, Path] = field(default_factory=dict)
     parsing: dict[int, Path] = field(default_factory=dict)  # class maps that stand in for head and mouth masks
     decode_parsing: Callable[[bytes, Path], np.ndarray] = decode_mask  # to the classes of `face_parsing`
     listings: tuple[Path, ...] = ()  # files that say which image and which tracking belong together
@@ -74,29 +74,21 @@ class FrameFiles:
         """Whether the images are their own mattes."""
         return any(self.alphas.get(number) == path for number, path in self.images.items())
 
-    def decode_alpha(self, data: bytes, path: Path) -> np.ndarray:
-        """A file of `alphas` as its matte, uint8 [H, W]. Raises UserError naming the file."""
-        if self.is_transparent:
+    def decode(self, kind: str, data: bytes, path: Path) -> np.ndarray:
+        """A file of a kind of `of_kind` but the tracking: uint8 [H, W, 3] of an image, [H, W] of a mask, classes of a
+        parsing. Raises UserError naming the file."""
+        if kind == IMAGE:
+            return decode_image(data, path)
+        if kind == PARSING:
+            return self.decode_parsing(data, path)
+        if kind == ALPHA and self.is_transparent:
             return decode_transparency(data, path)
-        return decode_mask(data, path, self.labels.get(ALPHA))
+        return decode_mask(data, path, self.labels.get(kind))
 
-    def decode_head(self, data: bytes, path: Path) -> np.ndarray:
-        """The same for a file of `head_masks`."""
-        return decode_mask(data, path, self.labels.get(HEAD))
-
-    def decode_mouth(self, data: bytes, path: Path) -> np.ndarray:
-        """The same for a file of `mouth_masks`."""
-        return decode_mask(data, path, self.labels.get(MOUTH))
-
-    def decoders(self) -> dict[str, Callable[[bytes, Path], np.ndarray]]:
-        """How the files of each kind of `of_kind` are decoded, but for the tracking."""
-        return {
-            IMAGE: decode_image,
-            ALPHA: self.decode_alpha,
-            HEAD: self.decode_head,
-            MOUTH: self.decode_mouth,
-            PARSING: self.decode_parsing,
-        }
+    def read(self, kind: str, number: int) -> np.ndarray | None:
+        """The file of a frame, decoded; None where the frame has none of the kind. Raises UserError naming the file."""
+        path = self.of_kind().get(kind, {}).get(number)
+        return None if path is None else self.decode(kind, read_bytes(path), path)
 
     def of_kind(self) -> dict[str, dict[int, Path]]:
         """By the name that a person knows each kind by."""

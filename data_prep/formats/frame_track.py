@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from data_prep.formats.identity import MAX_CHANGE, compare_identities
 
 ROTATION_TOLERANCE = 1e-2  # float16 and rounding; larger errors are not a rotation
+Item = TypeVar("Item")
 INTRINSICS_NOTE, INTRINSICS_ERROR = 1e-3, 5e-2  # relative change of fx, fy, cx, cy within a clip
 
 
@@ -51,18 +52,26 @@ class BadFrame(Exception):
     """One frame cannot be used, and why; the others may be fine."""
 
 
-def checked_tracking(
-    frames: dict[int, FrameTrack],
-    bad: dict[int, str],
+def read_frames(
+    items: Mapping[int, Item],
+    read: Callable[[Item], FrameTrack],
     paths: dict[int, Path],
     complain: Callable[[str], object] = refuse,
     cameras: Mapping[int, str] | None = None,
 ) -> Tracking:
-    """Move frames with another number of coefficients to `bad`; `complain` of a camera that changes.
+    """`read` what each frame is made of. BadFrames, and frames with another number of coefficients, end up in `bad`;
+    `complain` of a camera that changes.
 
     cameras  which camera each frame is of, where there are several
     """
-    frames, bad, flaws = dict(frames), dict(bad), []
+    frames: dict[int, FrameTrack] = {}
+    bad: dict[int, str] = {}
+    flaws: list[str] = []
+    for number, item in items.items():
+        try:
+            frames[number] = read(item)
+        except BadFrame as error:
+            bad[number] = str(error)
     if frames:
         first = next(iter(frames))
         for number, frame in list(frames.items()):
@@ -137,6 +146,21 @@ def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
     if not np.isfinite(values).all():
         raise BadFrame(f"{name} is not finite ({int((~np.isfinite(values)).sum())} of {len(values)} values)")
     return values
+
+
+def rigid_motion(matrix: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation [3, 3] and translation [3] of a matrix [4, 4]. Raises BadFrame where it is none."""
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise BadFrame(f"the last row of {name} is not 0 0 0 1")
+    return nearest_rotation(matrix[:3, :3], name), matrix[:3, 3]
+
+
+def pinhole_of(K: np.ndarray, name: str) -> np.ndarray:
+    """fx, fy, cx, cy [4] of a matrix [3, 3]. Raises BadFrame, which begins with `name`, where it has another form."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if fx <= 0 or fy <= 0 or np.abs(K - [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]).max() > 1e-4 * fx:
+        raise BadFrame(f"{name} not of the form [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")
+    return np.array([fx, fy, cx, cy])
 
 
 def nearest_rotation(R: np.ndarray, name: str) -> np.ndarray:

@@ -20,12 +20,11 @@ import numpy as np
 
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK, ROOT
-from data_prep.formats.face_parsing import decode_numbers
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, nearest_rotation
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, nearest_rotation, read_frames
 from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
 from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, matte_notes, numbered
-from data_prep.formats.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate, read_frames
+from data_prep.formats.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate
 
 NAME = "IMavatar"
 NAMES = KindNames("mask/", "semantic/", "semantic/", images="image/", tracking="flame_params.json")
@@ -45,18 +44,15 @@ def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
         folder=folder,
         images=images,
         alphas=existing({number: _beside(path, "mask") for number, path in images.items()}) or transparent(images),
-        head_masks={},
-        mouth_masks={},
         tracking={number: frame.listing for number, frame in listed.items()},
         parsing=existing({number: _beside(path, "semantic") for number, path in images.items()}),
-        decode_parsing=decode_numbers,
         listings=listings_of(frames),
         names=NAMES,
     )
 
     def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
         root, neck = Joint(head, ROOT), Joint(head, NECK)
-        return read_frames(listed, files.tracking, lambda frame: _read_frame(frame, root, neck, size), complain)
+        return read_frames(listed, lambda frame: _read_frame(frame, root, neck, size), files.tracking, complain)
 
     fps, fps_notes = frame_rate(frames)
     notes = (*matte_notes(files), *fps_notes)

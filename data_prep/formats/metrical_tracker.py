@@ -11,7 +11,15 @@ import numpy as np
 from avatar.errors import UserError, refuse
 from avatar.files.pickles import UnsafeFileError, load_torch_pickle
 from avatar.types import IDENTITY_6D
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.formats.frame_track import (
+    BadFrame,
+    FrameTrack,
+    Tracking,
+    nearest_rotation,
+    pinhole_of,
+    read_frames,
+    vector,
+)
 
 
 def read_tracking(
@@ -22,27 +30,18 @@ def read_tracking(
     Calls `complain`, which raises UserError by default, for a file that holds code, for intrinsics or image sizes that
     change, and, where the files are named by their numbers, for mixed-up files.
     """
-    frames: dict[int, FrameTrack] = {}
-    bad: dict[int, str] = {}
-    for number, path in paths.items():
-        try:
-            frames[number] = _read_frame(path)
-        except BadFrame as error:
-            bad[number] = str(error)
-        except UnsafeFileError as error:
-            complain(str(error))
-            bad[number] = "it holds more than data"
-    tracking = checked_tracking(frames, bad, paths, complain)
+    tracking = read_frames(paths, lambda path: _read_frame(path, complain), paths, complain)
     if named_by_number:
         _check_frame_ids(tracking.frames, paths, tracking.notes, complain)
     return tracking
 
 
-def _read_frame(path: Path) -> FrameTrack:
+def _read_frame(path: Path, complain: Callable[[str], object]) -> FrameTrack:
     try:
         content = load_torch_pickle(path)
-    except UnsafeFileError:
-        raise
+    except UnsafeFileError as error:
+        complain(str(error))
+        raise BadFrame("it holds more than data") from None
     except UserError as error:
         raise BadFrame(str(error).removeprefix(f"{path} ")) from None
     flame, opencv = _section(content, "flame"), _section(content, "opencv")
@@ -64,7 +63,7 @@ def _read_frame(path: Path) -> FrameTrack:
         R=nearest_rotation(R, "opencv.R"),
         t=t,
         shape=_values(flame, "flame.shape"),
-        intrinsics=_intrinsics(_values(opencv, "opencv.K", 9).reshape(3, 3)),
+        intrinsics=pinhole_of(_values(opencv, "opencv.K", 9).reshape(3, 3), "opencv.K is"),
         size=_size(content),
         frame_id=_frame_id(content.get("frame_id")),
     )
@@ -82,14 +81,6 @@ def _values(section: dict[str, Any], name: str, count: int | None = None) -> np.
     if key not in section:
         raise BadFrame(f"{name} is missing")
     return vector(section[key], name, count)
-
-
-def _intrinsics(K: np.ndarray) -> np.ndarray:
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    expected = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    if fx <= 0 or fy <= 0 or np.abs(K - expected).max() > 1e-4 * fx:
-        raise BadFrame("opencv.K is not of the form [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")
-    return np.array([fx, fy, cx, cy])
 
 
 def _size(content: dict[str, Any]) -> tuple[int, int]:

@@ -24,9 +24,9 @@ from avatar.files.names import safe_name
 from avatar.files.places import cache_folder
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK
-from data_prep.formats.division import named_cameras
+from data_prep.formats.division import ALL, chosen_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking
+from data_prep.formats.frame_track import FrameTrack, Tracking, read_frames
 from data_prep.formats.nersemble_cameras import CALIBRATION, CalibratedCamera, read_cameras
 from data_prep.formats.nersemble_tracking import FILES, SequenceTracking, find_tracking, read_tracking
 from data_prep.formats.root_pose import Joint
@@ -38,7 +38,6 @@ NAMES = KindNames("alpha_maps/", "head masks", "mouth masks", images="images/", 
 SEQUENCES = "sequences"
 TRAINED_CAMERA = "222200037"  # the front one; the benchmark holds the others out
 TESTED = re.compile(r"(FREE|EMO-1|SEN-09|SEN-10)(?![0-9A-Za-z])", re.I)  # beginnings of sequences' names
-ALL, FRONT = "all", "front"  # what --cameras may say beside serials
 MAX_SCALE_CHANGE = 1e-3  # between sequences of several cameras; 1 mm of a metre
 
 
@@ -138,22 +137,15 @@ def _videos(folder: Path) -> dict[str, Path]:
 def _of_cameras(sequences: list[Sequence], cameras: str, folder: Path) -> tuple[list[Sequence], list[str]]:
     """The sequences with the videos of the chosen cameras alone; and notes on those that are not there."""
     serials = sorted({serial for sequence in sequences for serial in sequence.images})
-    try:
-        front = TRAINED_CAMERA if TRAINED_CAMERA in serials else serials[0]
-        chosen = set(serials) if cameras == ALL else named_cameras(front if cameras == FRONT else cameras, serials)
-    except UserError as error:
-        raise UserError(f"--cameras: {error} in {folder} (or say {ALL} or {FRONT})") from None
-    chosen = chosen or set(serials)
+    front = TRAINED_CAMERA if TRAINED_CAMERA in serials else serials[0]
+    chosen, notes = chosen_cameras(cameras, serials, lambda: front, folder)
     kept = [
         one._replace(images={serial: path for serial, path in one.images.items() if serial in chosen})
         for one in sequences
     ]
     lacking = [f"{one.folder.name} by {c}" for one in kept for c in sorted(chosen) if c not in one.images]
-    notes = [f"there is no video of {', '.join(lacking)}"] if lacking else []
-    if len(chosen) < len(serials):
-        are = "is" if len(chosen) == 1 else "are"
-        notes.append(f"of the folder's {len(serials)} cameras {', '.join(sorted(chosen))} {are} used")
-    return [one for one in kept if one.images], notes
+    absent = [f"there is no video of {', '.join(lacking)}"] if lacking else []
+    return [one for one in kept if one.images], [*absent, *notes]
 
 
 def _wanted(sequences: list[Sequence], root: Path) -> tuple[Wanted, Wanted]:
@@ -231,8 +223,6 @@ def _numbered(
         folder=root,
         images=images,
         alphas=alphas,
-        head_masks={},
-        mouth_masks={},
         tracking={number: sequences[of.sequence].tracking.path for number, of in rows.items()},
         listings=(calibration,),
         paired_by=f"the frames in {sequences[0].tracking.path.name}",
@@ -271,16 +261,13 @@ def _read_frames(
     neck: Joint,
     complain: Callable[[str], object],
 ) -> Tracking:
-    frames: dict[int, FrameTrack] = {}
-    bad: dict[int, str] = {}
-    shape = sequences[0].tracking.shape
-    for number, of in rows.items():
-        try:
-            camera = calibrated[shots[number].camera]
-            frames[number] = sequences[of.sequence].tracking.frame(of.row, shape, neck, camera)
-        except BadFrame as error:
-            bad[number] = str(error)
-    return checked_tracking(frames, bad, paths, complain, {number: shot.camera for number, shot in shots.items()})
+    shape, cameras = sequences[0].tracking.shape, {number: shot.camera for number, shot in shots.items()}
+
+    def read(number: int) -> FrameTrack:
+        sequence, row = rows[number]
+        return sequences[sequence].tracking.frame(row, shape, neck, calibrated[cameras[number]])
+
+    return read_frames({number: number for number in rows}, read, paths, complain, cameras)
 
 
 def _rate(videos: Wanted) -> float | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.opening import read_text
-from data_prep.formats.frame_track import BadFrame, nearest_rotation, vector
+from data_prep.formats.frame_track import BadFrame, pinhole_of, rigid_motion, vector
 
 CALIBRATION = Path("calibration", "camera_params.json")
 _MAX_BYTES = 2**20  # 16 cameras take 6 KB
@@ -42,7 +42,11 @@ def read_cameras(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str
                 f"{path} has nothing on camera {serial}, of which there are videos; leave it out with --cameras"
             )
         try:
-            camera = CalibratedCamera(*_pose(poses[serial]), _intrinsics(lens), (width, height))
+            pose = vector(poses[serial], "world_2_cam", 16).reshape(4, 4)
+            K = vector(lens, "intrinsics", 9).reshape(3, 3)
+            camera = CalibratedCamera(
+                *rigid_motion(pose, "world_2_cam"), pinhole_of(K, "intrinsics are"), (width, height)
+            )
         except BadFrame as error:
             raise UserError(f"{path}: camera {serial}: {error}; download it again") from None
         cx, cy = camera.intrinsics[2:]
@@ -70,18 +74,3 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
         raise BadFrame(f"{next(name for name in names if names.count(name) > 1)} is there twice")
     return values
-
-
-def _pose(value: Any) -> tuple[np.ndarray, np.ndarray]:
-    matrix = vector(value, "world_2_cam", 16).reshape(4, 4)
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise BadFrame("the last row of world_2_cam is not 0 0 0 1")
-    return nearest_rotation(matrix[:3, :3], "world_2_cam"), matrix[:3, 3]
-
-
-def _intrinsics(value: Any) -> np.ndarray:
-    K = vector(value, "intrinsics", 9).reshape(3, 3)
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    if fx <= 0 or fy <= 0 or np.abs(K - [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]).max() > 1e-4 * abs(fx):
-        raise BadFrame("intrinsics are not [fx 0 cx; 0 fy cy; 0 0 1] with positive focal lengths")
-    return np.array([fx, fy, cx, cy])

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -19,9 +19,9 @@ import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS
-from avatar.errors import UserError, refuse
+from avatar.errors import UserError
 from avatar.files import opening
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, checked_tracking, nearest_rotation, vector
+from data_prep.formats.frame_track import BadFrame, rigid_motion, vector
 
 SPLITS = ("train", "val", "test")
 MAX_BYTES = 2**28
@@ -126,7 +126,7 @@ def read_listings(folder: Path) -> list[ListedFrame]:
         frames = _read_listing(whole[0], None, folder)
     elif frames and not any(frame.split == "test" for frame in frames.values()):
         held_out = {path for path, frame in frames.items() if frame.split == "val"}
-        frames = {path: _resplit(frame, "test") if path in held_out else frame for path, frame in frames.items()}
+        frames = {path: replace(frame, split="test") if path in held_out else frame for path, frame in frames.items()}
     return _in_order(frames)
 
 
@@ -137,10 +137,6 @@ def _in_order(frames: dict[Path, ListedFrame]) -> list[ListedFrame]:
             first_use[path.parent] = min(first_use[path.parent], SPLITS.index(frame.split))
     order = sorted(frames, key=lambda path: (first_use[path.parent], _natural(path)))
     return [frames[path] for path in order]
-
-
-def _resplit(frame: ListedFrame, split: str) -> ListedFrame:
-    return ListedFrame(frame.listing, frame.position, frame.values, frame.shared, split, frame.root)
 
 
 def _read_listing(file: Path, split: str | None, root: Path) -> dict[Path, ListedFrame]:
@@ -178,24 +174,6 @@ def _natural(path: Path) -> tuple[Any, ...]:
     return tuple((int(part[:300]), "") if part.isdigit() and part.isascii() else (-1, part) for part in parts if part)
 
 
-def read_frames(
-    listed: dict[int, ListedFrame],
-    paths: dict[int, Path],
-    read: Callable[[ListedFrame], FrameTrack],
-    complain: Callable[[str], object] = refuse,
-    cameras: Mapping[int, str] | None = None,
-) -> Tracking:
-    """`read` every frame; the BadFrames among them end up in `bad`. `complain` and `cameras` as in `checked_tracking`."""
-    frames: dict[int, FrameTrack] = {}
-    bad: dict[int, str] = {}
-    for number, frame in listed.items():
-        try:
-            frames[number] = read(frame)
-        except BadFrame as error:
-            bad[number] = str(error)
-    return checked_tracking(frames, bad, paths, complain, cameras)
-
-
 def frame_rate(frames: Sequence[ListedFrame]) -> tuple[float | None, tuple[str, ...]]:
     """Frames a second of the video, where the listing has it under `fps`; and a note where that is no frame rate."""
     given = next((frame for frame in frames if "fps" in frame.shared), None)
@@ -213,11 +191,8 @@ def frame_rate(frames: Sequence[ListedFrame]) -> tuple[float | None, tuple[str, 
 
 def camera_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:
     """R [3, 3], t [3] from the world to the camera's own axes, out of `transform_matrix`, the camera in the world."""
-    matrix = frame.numbers("transform_matrix", 16).reshape(4, 4)
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise BadFrame("the last row of transform_matrix is not 0 0 0 1")
-    R = nearest_rotation(matrix[:3, :3], "transform_matrix").T
-    return R, -R @ matrix[:3, 3]
+    R, t = rigid_motion(frame.numbers("transform_matrix", 16).reshape(4, 4), "transform_matrix")
+    return R.T, -R.T @ t
 
 
 def pinhole(frame: ListedFrame, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,9 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK, ROOT
-from data_prep.formats.division import named_cameras
+from data_prep.formats.division import ALL, chosen_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
-from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, vector
+from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, read_frames, vector
 from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
 from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes, numbered
 from data_prep.formats.transforms import (
@@ -40,13 +41,11 @@ from data_prep.formats.transforms import (
     frame_rate,
     is_union,
     pinhole,
-    read_frames,
 )
 
 NAME = "VHAP"
 NAMES = KindNames("fg_masks/", "head masks", "mouth masks", images="images/", tracking="flame_param/")
 FRONTAL_FRAMES = 8  # by which the front camera is told
-ALL, FRONT = "all", "front"  # what --cameras may say beside names
 
 
 def recognise(frames: list[ListedFrame]) -> bool:
@@ -68,18 +67,21 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
         folder=folder.parent if is_union(folder) else folder,
         images=images,
         alphas=mattes or transparent(images),
-        head_masks={},
-        mouth_masks={},
         tracking=parameters,
         listings=listings_of(frames),
         names=NAMES,
     )
 
     def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        joints, read_file = (Joint(head, ROOT), Joint(head, NECK)), _OnceRead()
+        joints = Joint(head, ROOT), Joint(head, NECK)
+        read_file = lru_cache(maxsize=1)(_parameters)  # the frames of one time share a file
         of = {number: shot.camera for number, shot in shots.items()} or None
         tracking = read_frames(
-            listed, parameters, lambda frame: _read_frame(frame, read_file(frame), joints, size), complain, of
+            listed,
+            lambda frame: _read_frame(frame, read_file(_parameter_file(frame)), joints, size),
+            parameters,
+            complain,
+            of,
         )
         return _one_identity(tracking) if is_union(folder) else tracking
 
@@ -93,21 +95,6 @@ def _parameter_file(frame: ListedFrame) -> Path:
     if path is None:
         raise UserError(f"{frame.listing}: frame {frame.position} has no flame_param_path; export the folder again")
     return path
-
-
-class _OnceRead:
-    """Parameter files, which the cameras' frames of one time share."""
-
-    def __init__(self) -> None:
-        self._path: Path | None = None
-        self._content: dict[str, np.ndarray] = {}
-
-    def __call__(self, frame: ListedFrame) -> dict[str, np.ndarray]:
-        path = _parameter_file(frame)
-        if path != self._path:
-            self._path, self._content = None, _parameters(frame)
-            self._path = path
-        return self._content
 
 
 def _read_frame(
@@ -163,8 +150,7 @@ def _static_offset(values: np.ndarray, vertices: int, file: str) -> np.ndarray:
     return values.reshape(-1, 3)
 
 
-def _parameters(frame: ListedFrame) -> dict[str, np.ndarray]:
-    file = _parameter_file(frame)
+def _parameters(file: Path) -> dict[str, np.ndarray]:
     try:
         return load_npz(file)
     except UserError as error:
@@ -187,17 +173,8 @@ def _by_camera(frames: list[ListedFrame]) -> dict[str, list[ListedFrame]]:
 def _chosen(frames: list[ListedFrame], cameras: str, folder: Path) -> tuple[list[ListedFrame], tuple[str, ...]]:
     """The frames of the chosen cameras, and a note where these are not all."""
     by_camera = _by_camera(frames)
-    if cameras == ALL:
-        return frames, ()
-    try:
-        chosen = {_front(by_camera)} if cameras == FRONT else named_cameras(cameras, by_camera)
-    except UserError as error:
-        raise UserError(f"--cameras: {error} in {folder} (or say {ALL} or {FRONT})") from None
-    if chosen is None or chosen == by_camera.keys():
-        return frames, ()
-    names, are = ", ".join(sorted(chosen)), "is" if len(chosen) == 1 else "are"
-    note = f"of the folder's {len(by_camera)} cameras {names} {are} used"
-    return [frame for frame in frames if _camera(frame) in chosen], (note,)
+    chosen, notes = chosen_cameras(cameras, by_camera, lambda: _front(by_camera), folder)
+    return [frame for frame in frames if _camera(frame) in chosen], notes
 
 
 def _camera(frame: ListedFrame) -> str:
@@ -257,7 +234,7 @@ def _front(by_camera: dict[str, list[ListedFrame]]) -> str:
 def _frontality(frame: ListedFrame) -> float:
     """Cosine of the angle between where the face looks and where its camera is; -2 where the frame is unusable."""
     try:
-        rotation = vector(_parameters(frame).get("rotation", ()), "rotation", 3)
+        rotation = vector(_parameters(_parameter_file(frame)).get("rotation", ()), "rotation", 3)
         R, _ = _opencv_pose(frame)
     except BadFrame:
         return -2.0

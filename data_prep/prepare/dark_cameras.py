@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from avatar.data.images import read_bytes, read_image
+from avatar.data.images import read_image
 from avatar.errors import UserError
-from data_prep.formats.frame_files import FrameFiles
+from data_prep.formats.frame_files import ALPHA, FrameFiles
 from data_prep.formats.tracked_folder import Shot
 from data_prep.prepare.misfit import SAMPLED_OF_A_CAMERA, sample
 
@@ -34,6 +34,6 @@ def refuse_dark_cameras(files: FrameFiles, pairs: Sequence[tuple[int, int]], sho
 def _brightness(files: FrameFiles, image: int) -> float:
     """Mean grey value inside the matte, 0 to 255."""
     grey = read_image(files.images[image]).mean(axis=2)
-    matte = files.alphas.get(image)
-    inside = np.ones(grey.shape, bool) if matte is None else files.decode_alpha(read_bytes(matte), matte) > 127
+    matte = files.read(ALPHA, image)
+    inside = np.ones(grey.shape, bool) if matte is None else matte > 127
     return float(grey[inside].mean()) if inside.any() else 0.0

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from avatar.data.images import decode_image, read_bytes, read_image
+from avatar.data.images import read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
 from data_prep.formats.tracked_folder import Shot
@@ -46,7 +46,7 @@ class _Seen:
 def inspect_images(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -> Inspection:
     """Decode everything once. Raises UserError when sizes differ within a camera or masks are not 0 to 255, naming both."""
     refuse_colours(files)
-    images = _look_at(files.images, decode_image)
+    images = _look_at(files, IMAGE, files.images)
     bad = {n: seen.problem for n, seen in images.items() if seen.problem is not None}
     sizes = {n: seen.size for n, seen in images.items() if seen.problem is None}
     if not sizes:
@@ -64,11 +64,11 @@ def inspect_images(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -
             )
     digests = {n: [seen.digest] for n, seen in images.items()}
     notes: list[str] = []
-    own_masks, decoders = mask_kinds(files), files.decoders()
+    own_masks = mask_kinds(files)
     for kind, paths in files.of_kind().items():
         if not paths or kind in (IMAGE, TRACKING):
             continue
-        masks = _look_at({n: p for n, p in paths.items() if n in files.images}, decoders[kind])
+        masks = _look_at(files, kind, {n: p for n, p in paths.items() if n in files.images})
         for number, seen in masks.items():
             digests[number].append(seen.digest)
             if seen.problem is not None:
@@ -109,8 +109,9 @@ def composited_background(files: FrameFiles, bad: Mapping[int, str]) -> str | No
     usable = [n for n in files.images if n in files.alphas and n not in bad]
     sums, count, pixels = np.zeros((len(_BACKGROUNDS),)), 0, 0
     for number in usable[:: max(1, len(usable) // _SAMPLES)]:
-        path = files.alphas[number]
-        background = files.decode_alpha(read_bytes(path), path) <= 2
+        matte = files.read(ALPHA, number)
+        assert matte is not None
+        background = matte <= 2
         colours = read_image(files.images[number])[background].astype(np.float64)
         for i, flat in enumerate(_BACKGROUNDS.values()):
             sums[i] += np.abs(colours - flat).sum() / 3
@@ -122,12 +123,12 @@ def composited_background(files: FrameFiles, bad: Mapping[int, str]) -> str | No
     return list(_BACKGROUNDS)[nearest] if sums[nearest] / count <= _BACKGROUND_TOLERANCE else None
 
 
-def _look_at(paths: Mapping[int, Path], decode: Callable[[bytes, Path], np.ndarray]) -> dict[int, _Seen]:
+def _look_at(files: FrameFiles, kind: str, paths: Mapping[int, Path]) -> dict[int, _Seen]:
     def look(path: Path) -> _Seen:
         data = b""
         try:
             data = read_bytes(path)
-            pixels = decode(data, path)
+            pixels = files.decode(kind, data, path)
         except UserError as error:
             return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (0, 0), 0, 0, str(error))
         height, width = pixels.shape[:2]

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from avatar.data.images import read_bytes
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles, describe_numbers
 from data_prep.formats.frame_track import FrameTrack
@@ -100,13 +99,11 @@ def _frames(
         return
     tracked = list(tracks.values())
     project = MeshProjector(head)
-    decoders = files.decoders()
     places = np.linspace(0, len(tracked) - 1, len(usable)).round().astype(int).tolist()
     for number, place in sample(list(zip(usable, places, strict=True))):
         masks, size = {}, None
-        for kind, paths in ((ALPHA, files.alphas), (HEAD, files.head_masks), (MOUTH, files.mouth_masks)):
-            if number in paths:
-                pixels = decoders[kind](read_bytes(paths[number]), paths[number])
+        for kind in (ALPHA, HEAD, MOUTH):
+            if (pixels := files.read(kind, number)) is not None:
                 size = measured_size(pixels.shape[1], pixels.shape[0])
                 masks[kind] = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         if size is not None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avatar.data.images import read_bytes
 from avatar.data.manifest import Manifest
 from avatar.head.model import HeadModel
+from data_prep.formats import frame_files
 from data_prep.formats.face_parsing import HEAD, MOUTH, mask_of
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.frame_track import Tracking
@@ -22,14 +22,10 @@ def read_masks(files: FrameFiles, number: int) -> tuple[np.ndarray | None, np.nd
 
     Raises UserError naming the file when one cannot be read.
     """
-    if number in files.parsing:
-        path = files.parsing[number]
-        classes = files.decode_parsing(read_bytes(path), path)
+    if (classes := files.read(frame_files.PARSING, number)) is not None:
         return mask_of(classes, HEAD), mask_of(classes, MOUTH)
-    paths, decode = (files.head_masks, files.decode_head) if files.head_masks else (files.alphas, files.decode_alpha)
-    head = decode(read_bytes(paths[number]), paths[number]) if number in paths else None
-    mouth = files.mouth_masks.get(number)
-    return head, None if mouth is None else files.decode_mouth(read_bytes(mouth), mouth)
+    head = frame_files.HEAD if files.head_masks else frame_files.ALPHA
+    return files.read(head, number), files.read(frame_files.MOUTH, number)
 
 
 def derive_masks(

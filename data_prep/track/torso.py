@@ -66,7 +66,8 @@ class TorsoTracker:
         self._tracks, self._neck, self._picture = tracks, neck, picture
         first = next(iter(tracks.values()))
         self._scale = SIDE / max(first.size)
-        self.size = tuple(max(1, round(side * self._scale)) for side in first.size)
+        width, height = first.size
+        self.size = max(1, round(width * self._scale)), max(1, round(height * self._scale))
         self.mean = _mean_rotation(np.stack([track.R for track in tracks.values()]))
         self.reference = self._typical_frame()
         self._place = self._base(self.reference)
@@ -139,12 +140,11 @@ def with_torso(
     tracks: dict[int, FrameTrack], tracker: TorsoTracker, shifts: Iterable[Float[np.ndarray, "2"] | None]
 ) -> dict[int, FrameTrack]:
     """The tracks with the neck's turns for these shifts of all frames; None is filled in. The same where all are None."""
-    known = [None if shift is None else np.asarray(shift) for shift in shifts]
-    rows = [row for row, shift in enumerate(known) if shift is not None]
-    if not rows:
+    known = {row: shift for row, shift in enumerate(shifts) if shift is not None}
+    if not known:
         return tracks
-    values = np.stack([known[row] for row in rows])
-    every = np.stack([np.interp(np.arange(len(known)), rows, column) for column in values.T], axis=1)
+    columns = np.stack(list(known.values()), axis=1)
+    every = np.stack([np.interp(np.arange(len(tracks)), list(known), column) for column in columns], axis=1)
     every = median_filter(every, size=(_MEDIAN, 1), mode="nearest")
     found = {}
     for (number, track), shift in zip(tracks.items(), every, strict=True):

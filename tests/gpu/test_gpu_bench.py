@@ -1,4 +1,4 @@
-"""`avatar bench splat` on a GPU: what it draws there is compared like everything else, and gsplat is asked correctly."""
+"""`avatar bench splat` on a GPU: what it draws there is compared like everything else. What asks gsplat asks correctly."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 
 import pytest
 import torch
-from interpreter import HAS_GPU
+from compare_gsplat import splat_gsplat
 
 from avatar.bench import splat as bench
-from avatar.bench import splat_gpu
 from avatar.bench.splat import Variant, all_variants, passes_of, reference_of, validate
-from avatar.bench.splat_gpu import gpu_backends, splat_gsplat
 from avatar.errors import UserError
 from avatar.splat.scenes import head_camera, head_shell
 from avatar.types import Rendering
@@ -39,21 +37,12 @@ def test_wrong_pictures_are_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.without_kernels
-def test_what_draws_here_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    backends: dict[tuple[bool, bool], set[str]] = {}
-    for has_gpu in (False, True):
-        for has_gsplat in (False, True):
-            monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
-            monkeypatch.setattr(splat_gpu, "find_spec", lambda _, has_gsplat=has_gsplat: has_gsplat or None)
-            variants = all_variants((16,), (20,), count=20, size=16)
-            backends[has_gpu, has_gsplat] = {v.backend for v in variants} - {"cpu", "reference"}
-    assert backends == {
-        (False, False): set(),
-        (False, True): set(),
-        (True, False): {"gpu"},
-        (True, True): {"gpu", "gsplat"},
+def test_the_gpu_is_measured_where_it_is_asked_for() -> None:
+    backends = {
+        on_gpu: {v.backend for v in all_variants((16,), (20,), count=20, size=16, on_gpu=on_gpu)} - {"cpu", "reference"}
+        for on_gpu in (False, True)
     }
-    assert gpu_backends() == ("gpu", "gsplat")
+    assert backends == {False: set(), True: {"gpu"}}
 
 
 @pytest.mark.without_kernels
@@ -79,9 +68,3 @@ def test_gsplat_is_asked_for_the_same_picture(monkeypatch: pytest.MonkeyPatch) -
     assert torch.equal(intrinsics[0], wanted)
     assert (width, height, asked["named"]["sh_degree"]) == (SIZE, SIZE, 3)
     assert asked["colors"].shape == (40, 16, 3) and asked["opacities"].shape == (40,)
-
-
-@pytest.mark.without_kernels
-@pytest.mark.skipif(HAS_GPU, reason="there is a GPU")
-def test_without_a_gpu_no_other_splatter_is_timed() -> None:
-    assert gpu_backends() == ()

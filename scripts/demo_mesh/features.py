@@ -11,14 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.demo.sculpt import (
-    EYE_CENTRE,
-    EYE_RADIUS,
-    MOUTH_CENTRE,
-    MOUTH_HALF_WIDTH,
-    cast_front,
-    cast_side,
-)
+from avatar.demo.mesh import EYE_CENTRE, EYE_RADIUS, lip_line
+from demo_mesh.sculpt import cast_front, cast_side
 
 EYE_RING_POINTS = 36
 MOUTH_QUARTER_POINTS = 16
@@ -66,11 +60,6 @@ def eye_rings() -> Rings:
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     position.insert(0, EYE_CENTRE + direction * (EYE_RADIUS + 0.1))
     return Rings(np.stack(chart), np.stack(position), levels, True)
-
-
-def lip_line(x: np.ndarray) -> np.ndarray:
-    """Frontal y of the closed lips' contact line at frontal x."""
-    return MOUTH_CENTRE[1] + 0.9 * (x / MOUTH_HALF_WIDTH) ** 2 - 0.7 * np.exp(-((x / 5.0) ** 2))
 
 
 # Rings of the mouth, from the inside out: (level, half width, upper height, lower height, forward displacement of the

@@ -7,34 +7,19 @@ triangulated (feature rings, and a centroidal Voronoi arrangement of vertices be
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.spatial import Delaunay, KDTree
+from skimage.measure import points_in_poly
 
-from avatar.demo.features import Rings, ear_rings, eye_rings, mouth_rings
-from avatar.demo.sculpt import EYE_CENTRE, EYE_RADIUS, RAY_ORIGIN, cast
-from avatar.demo.uv_chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
+from avatar.demo.mesh import EYE_CENTRE, EYE_RADIUS, HeadMesh
+from demo_mesh.features import Rings, ear_rings, eye_rings, mouth_rings
+from demo_mesh.sculpt import RAY_ORIGIN, cast
+from demo_mesh.uv_chart import HALF_WIDTH, V_CROWN, V_RIM, SkinChart, directions
 
 EYE_DISC_CENTRE, EYE_DISC_RADIUS = np.array([0.932, 0.932]), 0.062  # left eyeball; u is mirrored for the right
 EYEBALL_RINGS, EYEBALL_SECTORS, EYEBALL_REACH = 11, 24, np.radians(112.0)
 LLOYD_STEPS = 40
 NECK_STRETCH = 1.6
-
-
-class HeadMesh(NamedTuple):
-    """The neutral head in metres; UV vertices have their own indices, as in an OBJ file."""
-
-    vertices: np.ndarray  # float64 [V, 3]
-    faces: np.ndarray  # int32 [F, 3], counter-clockwise from outside
-    uvs: np.ndarray  # float64 [T, 2]
-    uv_faces: np.ndarray  # int32 [F, 3]
-    mirror: np.ndarray  # int64 [V], the vertex on the other side
-    eye_rings: np.ndarray  # int64 [2, R, K] left and right, innermost first
-    mouth_rings: np.ndarray  # int64 [2, R, K] left and right halves
-    ear_rings: np.ndarray  # int64 [2, R, K]
-    eyeballs: tuple[np.ndarray, np.ndarray]  # vertex indices, left and right
-    rim: np.ndarray  # vertex indices of the neck's open end
 
 
 def _spacing(points: np.ndarray) -> np.ndarray:
@@ -72,15 +57,6 @@ def _edge(chart: SkinChart, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return at(_along(dense))
 
 
-def _inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which points [N, 2] are inside the closed polygon [K, 2] (even-odd rule)."""
-    a, b = polygon, np.roll(polygon, -1, axis=0)
-    y = points[:, None, 1]
-    crosses = (a[:, 1] > y) != (b[:, 1] > y)
-    slope = (b[:, 0] - a[:, 0]) / np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
-    return (crosses & (points[:, None, 0] < a[:, 0] + (y - a[:, 1]) * slope)).sum(1) % 2 == 1
-
-
 def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) -> np.ndarray:
     """Vertices [N, 2] between the fixed ones: Lloyd's algorithm on surface samples weighted by the wanted density."""
     side = np.linspace(0.0, 1.0, 190)
@@ -92,7 +68,7 @@ def _fill(chart: SkinChart, fixed_uv: np.ndarray, outlines: list[np.ndarray]) ->
     samples = centre.reshape(-1, 3) / 4.0
     weight = area.reshape(-1) / (0.5 * np.sqrt(3.0) * _spacing(samples) ** 2)
     sample_uv = chart.uv(samples)
-    free = ~np.any([_inside(outline, sample_uv) for outline in outlines], axis=0)
+    free = ~np.any([points_in_poly(sample_uv, outline) for outline in outlines], axis=0)
     free &= samples[:, 0] > 0.45 * _spacing(samples)  # nor close to the midline and the seam
     samples, weight, sample_uv = samples[free], weight[free], sample_uv[free]
 
@@ -169,12 +145,7 @@ def _closing(ring: np.ndarray) -> np.ndarray:
     up, down = ring[: count // 2 + 1], np.concatenate((ring[:1], ring[: count // 2 - 1 : -1]))
     faces = np.stack((up[:-1], up[1:], down[1:]), -1), np.stack((up[:-1], down[1:], down[:-1]), -1)
     triangles = np.concatenate(faces)
-    repeated = (
-        (triangles[:, 0] == triangles[:, 1])
-        | (triangles[:, 1] == triangles[:, 2])
-        | (triangles[:, 0] == triangles[:, 2])
-    )
-    return triangles[~repeated]
+    return triangles[(triangles != np.roll(triangles, 1, axis=1)).all(1)]
 
 
 def _triangulate(chart: SkinChart, uv: np.ndarray, rings: list[tuple[np.ndarray, bool]]) -> np.ndarray:
@@ -199,7 +170,7 @@ def _triangulate(chart: SkinChart, uv: np.ndarray, rings: list[tuple[np.ndarray,
     triangles = Delaunay(np.concatenate((disc, *guards))).simplices
     triangles = triangles[(triangles < len(uv)).all(1)]
     for ring, _ in rings:
-        triangles = triangles[~_inside(disc[ring], disc[triangles].mean(1))]
+        triangles = triangles[~points_in_poly(disc[triangles].mean(1), disc[ring])]
     rim = np.abs(uv[:, 1] - V_RIM) < 1e-9
     triangles = triangles[rim[triangles].sum(1) < 3]
     a, b, c = (d[triangles[:, k]] for k in range(3))
@@ -260,7 +231,7 @@ def _assemble(uv: np.ndarray, half: np.ndarray, triangles: np.ndarray, rings: li
         eye_rings=eye,
         mouth_rings=mouth,
         ear_rings=ear,
-        eyeballs=(new[eyeballs[0]], new[eyeballs[1]]),
+        eyeballs=new[np.array(eyeballs)],
         rim=np.unique(new[np.concatenate((bottom, right[bottom]))]),
     )
 

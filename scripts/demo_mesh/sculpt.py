@@ -9,21 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-EYE_CENTRE = np.array([31.5, 21.0, 64.0])  # left eye; the right one is its mirror image
-EYE_RADIUS = 13.2
+from avatar.demo.mesh import EYE_CENTRE, EYE_RADIUS, smooth_max, smooth_min
+
 LID_RADIUS = EYE_RADIUS + 1.1
 RAY_ORIGIN = np.array([0.0, 0.0, -5.0])  # every part of the skin but the ears is seen from here
-MOUTH_CENTRE = np.array([0.0, -47.5])  # frontal x, y
-MOUTH_HALF_WIDTH = 25.0
-
-
-def smooth_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    h = np.maximum(k - np.abs(a - b), 0.0) / k
-    return np.minimum(a, b) - h * h * (k / 4.0)
-
-
-def smooth_max(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    return -smooth_min(-a, -b, k)
 
 
 def _ellipsoid(p: np.ndarray, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from avatar.demo.sculpt import RAY_ORIGIN, cast, cast_front
+from demo_mesh.sculpt import RAY_ORIGIN, cast, cast_front
 
 V_RIM, V_CROWN = 0.008, 0.992
 _U_OF_DEGREES = PchipInterpolator((0, 20, 45, 70, 90, 130, 180), (0.0, 0.25, 0.53, 0.745, 0.835, 0.92, 1.0))
