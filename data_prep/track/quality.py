@@ -87,7 +87,7 @@ def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Ou
             "look at overlay/: is the matte whole, and the head in its place?", True,
         ),
         *_of_outline(outline),
-        *_torso(own["torso"]),
+        *_torso(own.get("torso")),
         Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
     ]  # fmt: skip
     figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
