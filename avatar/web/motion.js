@@ -81,7 +81,16 @@ const noise = (n) => {
   return x - Math.floor(x);
 };
 
-/** Blend of two parameter arrays; rotations stay rotations to first order, and the module makes them orthonormal. */
-export function mix(from, to, share) {
-  return Float32Array.from(from, (value, i) => value + share * (to[i] - value));
+/** Between two poses with cameras. What parameters hold of rotations stays one to first order; the module makes it exact. */
+export function blended(from, to, share) {
+  const mix = (name) => Float32Array.from(from[name], (value, i) => value + share * (to[name][i] - value));
+  const [translation, rotation, turn] = ["translation", "rotation", "turn"].map((name) => Array.from(mix(name)));
+  return { parameters: mix("parameters"), translation, rotation: orthonormal(rotation), turn };
+}
+
+/** The rotation whose first rows are nearest to a matrix's. */
+function orthonormal(m) {
+  const unit = (v) => v.map((x) => x / Math.hypot(...v)), a = unit(m.slice(0, 3));
+  const along = a.reduce((sum, x, i) => sum + x * m[3 + i], 0), b = unit(m.slice(3, 6).map((x, i) => x - along * a[i]));
+  return [...a, ...b, a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
