@@ -167,7 +167,15 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     reenact.add_argument("--camera", choices=("driver", "target"), default="driver", help="whose head pose is shown")
     reenact.add_argument("--intrinsics", choices=("driver", "target"), default="driver", help="through whose lens")
     reenact.add_argument(
-        "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
+        "--background",
+        metavar="COLOUR|IMAGE|transparent",
+        help="the avatar alone over it; transparent: .webm, .mov or .png (default: beside the driver)",
+    )
+    reenact.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="video, or .png for pictures (default: RUN/reenact/DRIVER-TRANSFER.mp4)",
     )
     add_device(reenact)
 
