@@ -19,6 +19,7 @@ const PRESETS = { // name -> sliders and shares of their range, which may depend
   Wink: [[/: left lid$/, 1], [/: (mouth )?smile( left)?$/, 0.7], [/cheek up left/, 0.8]],
   Talk: [[FIRST["Open mouth"], (t) => 0.75 * wave(t, 2.6) * wave(t, 0.9, 2)], [/funnel/, (t) => 0.5 * wave(t, 1.7, 4)], [FIRST.Pucker, (t) => 0.35 * wave(t, 1.1, 1) * wave(t, 0.7)]],
 };
+const PAUSE = 80; // milliseconds after which sliders follow a motion: they cost time that the picture could have
 const EASE = 0.25; // seconds that a preset takes to come and to go
 
 /** Fill the page with sliders and presets. `putBack` puts them all back; `isGazeHeld` tells whether a slider has set the eyes. */
@@ -44,7 +45,8 @@ export function makeControls(view, header, { presets, first, more }) {
   }
   const details = more.closest("details");
   const follow = () => [first, ...(details.open ? [more] : [])].forEach((list) => followers.get(list).forEach((one) => one()));
-  for (const type of ["drawn", "view"]) view.addEventListener(type, follow);
+  let due;
+  for (const type of ["drawn", "view"]) view.addEventListener(type, () => (due ??= setTimeout(() => follow((due = undefined)), PAUSE)));
   details.addEventListener("toggle", follow);
   const stop = makePresets(view, sliders, presets);
   const held = sliders.find((slider) => slider.held)?.held ?? new Map();

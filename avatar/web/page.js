@@ -68,7 +68,7 @@ function connectBar(view, header, putBack, putStageBack) {
   scrub.addEventListener("input", () => view.seek(Number(scrub.value)));
   view.addEventListener("motion", () => (play.textContent = view.isPlaying ? "Pause" : "Play"));
   view.addEventListener("drawn", () => {
-    if (view.isPlaying) scrub.value = String(view.time);
+    if (view.isPlaying || document.activeElement !== scrub) scrub.value = String(view.time);
     scrub.style.setProperty("--at", scrub.value / (scrub.max || 1));
     time.textContent = `${clock(view.time)} / ${clock(seconds)}`;
     scrub.setAttribute("aria-valuetext", `${view.time.toFixed(1)} seconds of ${seconds.toFixed(1)}`);
