@@ -24,8 +24,7 @@ export class AvatarView extends EventTarget {
     this.canvas = canvas;
     this.options = { renderer: "auto", still: false, ...options };
     this.view = { yaw: 0, pitch: 0, zoom: 1 };
-    /** Red, green and blue from 0 to 1; null for those of training. */
-    this.background = null;
+    this.background = null; // red, green and blue from 0 to 1; null for those of training
     this.statistics = { milliseconds: 0, framesPerSecond: 0 };
     this.#worker = parts.worker;
     this.#worker.onmessage = ({ data }) => this.#receive(data);
@@ -33,8 +32,8 @@ export class AvatarView extends EventTarget {
     /** Resolves with the avatar's header when it can be drawn. */
     this.ready = new Promise((resolve, reject) => (this.#settle = { resolve, reject }));
     this.#worker.postMessage({ type: "load", wasm: parts.wasm, file: parts.file });
-    const kind = this.options.renderer;
-    this.#wantsGpu = kind === "webgl" || (kind === "auto" && hasRealGpu()); // while the worker loads
+    const kind = this.options.renderer; // while the worker loads
+    this.#wantsGpu = kind === "webgl" || (kind === "auto" && hasRealGpu());
   }
 
   #worker;
@@ -78,18 +77,16 @@ export class AvatarView extends EventTarget {
     return this.#source.kind === "recorded" && !this.#source.paused;
   }
 
-  /** Whether a picture is being drawn. */
   get isBusy() {
-    return this.#inFlight;
+    return this.#inFlight; // a picture is being drawn
   }
 
   get frameCount() {
     return this.#core ? this.#core.poses.length / 12 : 0;
   }
 
-  /** What is shown, in the order of `header.rest`. */
   get parameters() {
-    return this.#pose?.parameters;
+    return this.#pose?.parameters; // what is shown, in the order of `header.rest`
   }
 
   /** Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); returns unknown names. */
@@ -219,9 +216,7 @@ export class AvatarView extends EventTarget {
     const { camera, width, height, background } = this.#shown;
     if (data.type === "gaussians") {
       this.#gpu.draw(data.values, camera, width, height, background, this.header.blur);
-    } else {
-      paint(this.canvas, this.#context, data.values, width, height);
-    }
+    } else paint(this.canvas, this.#context, data.values, width, height);
     this.#count(data.milliseconds);
     this.dispatchEvent(new CustomEvent("drawn", { detail: { taken: this.#shown.taken } }));
   }
@@ -284,8 +279,7 @@ export class AvatarView extends EventTarget {
     pose = { ...header.camera, turn: [0, 0], ...pose, parameters: Float32Array.from(pose.parameters) };
     if (since < BLEND_SECONDS) Object.assign(pose, blended(this.#previous.pose, pose, Math.max(since, 0) / BLEND_SECONDS));
     this.#settings.apply(pose.parameters);
-    this.#pose = pose;
-    return pose;
+    return (this.#pose = pose);
   }
 
   #count(milliseconds) {
