@@ -20,6 +20,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from playwright.sync_api import sync_playwright
 
+from avatar.export.stage import faded
 from avatar.export.web_page import write_page
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
@@ -48,7 +49,8 @@ def open_page(browser: Any, path: Path, renderer: str) -> tuple[Any, float]:
 
 def fitter(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
     """Lowest and mean PSNR to our renderer over FRAMES held-out frames, 8 bits a channel."""
-    test = list(trained.recording.split.test)
+    test, exported = list(trained.recording.split.test), faded(trained)
+    page.evaluate("avatar.background = null")  # that of training
     found = []
     for k in range(FRAMES):
         frame = k * len(test) // FRAMES
@@ -57,7 +59,7 @@ def fitter(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
         data = page.evaluate("avatar.screenshot().then(b => b.arrayBuffer()).then(b => Array.from(new Uint8Array(b)))")
         picture = iio.imread(io.BytesIO(bytes(data)))[..., :3].astype(np.float64)
         index = test[frame]
-        image = trained.render(trained.recording.params(index), trained.recording.camera(index, SIZE)).image
+        image = exported.render(trained.recording.params(index), trained.recording.camera(index, SIZE)).image
         truth = (image.clamp(0, 1) * 255).round().numpy().astype(np.float64)
         found.append(-10 * np.log10(max(np.square((picture - truth) / 255).mean(), 1e-12)))
     return min(found), statistics.mean(found)

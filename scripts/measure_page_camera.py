@@ -34,6 +34,7 @@ from torch import Tensor
 from avatar.commands.reenact import head_of
 from avatar.errors import UserError
 from avatar.export.mediapipe_pack import PACK, make_pack
+from avatar.export.stage import front_camera
 from avatar.export.web_arrays import reduce_avatar
 from avatar.export.web_page import WEB, write_page, write_web_avatar
 from avatar.head.lips import lip_gap, lip_pairs
@@ -223,13 +224,10 @@ def compare(trained: TrainedAvatar, program: dict[float, Live], page: dict[float
     times = sorted(set(program) & set(page))
     ours = [program[time].params for time in times]
     theirs = [as_params(trained, kept, page[time]["parameters"]) for time in times]
-    own = trained.rest_camera().R_cam_world
+    own, front = trained.rest_camera().R_cam_world, front_camera(trained).R_cam_world
     turns = [
-        [own.T @ R for R in side]
-        for side in (
-            [(program[time].camera or trained.rest_camera()).R_cam_world for time in times],
-            [torch.tensor(page[time]["rotation"]).reshape(3, 3) for time in times],
-        )
+        [own.T @ (program[time].camera or trained.rest_camera()).R_cam_world for time in times],
+        [front.T @ torch.tensor(page[time]["rotation"]).reshape(3, 3) for time in times],
     ]
     pairs = lip_pairs(head.assets)
     local = torch.arange(pairs.numel()).reshape(-1, 2)

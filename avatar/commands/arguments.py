@@ -72,7 +72,7 @@ def sort_train(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
     given = len(arguments.paths)
     if arguments.resume and given > 2:
         parser.error(f"train --resume takes a RUN, and its FOLDER where that has moved; {given} paths are given")
-    if not arguments.resume and given != 1:
+    if not arguments.resume and not arguments.print_config and given != 1:
         parser.error(f"train takes one FOLDER, {given} given")
 
 

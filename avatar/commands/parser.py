@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from avatar.bench import PARTS
+from avatar.commands.groups import GROUPS, list_commands
 from avatar.commands.options import (
     add_avatar,
     add_device,
@@ -35,15 +36,18 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     """The parser, and those of its commands."""
     parser = argparse.ArgumentParser(
         prog="avatar",
+        usage="avatar [-h] [--version] COMMAND ...",
         description="Animatable 3D Gaussian head avatars from a video of one person, on a CPU or a GPU.",
-        epilog="To begin: avatar demo OUT, or avatar create VIDEO. avatar COMMAND --help lists a command's options.",
+        epilog=list_commands(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"avatar {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    # The epilog lists them in groups.
+    commands = parser.add_subparsers(dest="command", required=True, help=argparse.SUPPRESS, prog="avatar")
 
-    add_create(commands.add_parser("create", help="make an avatar's page from a video: track, train, evaluate, export"))
+    add_create(commands.add_parser("create"))
 
-    track = commands.add_parser("track", help="track a face through a video, and write a folder to train on")
+    track = commands.add_parser("track")
     track.add_argument(
         "video", type=Path, metavar="VIDEO", help="a video, or a folder of numbered PNG or JPEG pictures"
     )
@@ -73,7 +77,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
         "--matte", type=Path, metavar="DIR", help="your own mattes: a folder or a video of all pictures, as filmed"
     )
 
-    train = commands.add_parser("train", help="train an avatar on a tracked video folder, or on a video")
+    train = commands.add_parser("train")
     train.add_argument(
         "words", nargs="*", metavar="FOLDER | VIDEO", help="what avatar track wrote; with --resume the RUN"
     )
@@ -86,6 +90,8 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the recipe's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on with RUN from its newest checkpoint")
+    train.add_argument("--dry-run", action="store_true", help="say what it would take, and train nothing")
+    train.add_argument("--print-config", action="store_true", help="print the configuration as key=value, and no more")
     train.add_argument(
         "--refine", type=int, metavar="N", help="first improve the tracking N times through a shorter training's avatar"
     )
@@ -101,7 +107,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
         "configuration", f"model=NAME, experiment=NAME, or KEY=VALUE of these keys:\n{list_keys()}"
     )
 
-    evaluate = commands.add_parser("eval", help="measure a trained avatar on the held-out frames")
+    evaluate = commands.add_parser("eval")
     add_run(evaluate)
     add_folder(evaluate)
     evaluate.add_argument(
@@ -118,17 +124,17 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     )
     add_device(evaluate)
 
-    refine = commands.add_parser("refine", help="improve the tracking of a run's video through its avatar")
+    refine = commands.add_parser("refine")
     add_run(refine)
     add_folder(refine)
     refine.add_argument("--out", type=Path, metavar="SUBJECT", help="a new tracked folder (default: RUN/refined/NAME)")
     add_device(refine)
 
-    report = commands.add_parser("report", help="write a run as one HTML page: figures, frames, curves, configuration")
+    report = commands.add_parser("report")
     add_run(report)
     add_folder(report)
 
-    compare = commands.add_parser("compare", help="set evaluated runs side by side, with differences to the first")
+    compare = commands.add_parser("compare")
     compare.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs that avatar eval has measured")
     compare.add_argument("--protocol", action="append", metavar="NAME", help="only this protocol; may be repeated")
     compare.add_argument(
@@ -136,7 +142,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     )
     compare.add_argument("--out", type=Path, metavar="DIR", help="write compare.txt, .md, .tex and .csv there too")
 
-    reenact = commands.add_parser("reenact", help="drive an avatar with another person's motion")
+    reenact = commands.add_parser("reenact")
     add_avatar(reenact)
     reenact.add_argument(
         "words", nargs="*", metavar="DRIVER", help="tracked folder, video, or a drive file (.npz, .csv)"
@@ -161,36 +167,44 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     reenact.add_argument("--camera", choices=("driver", "target"), default="driver", help="whose head pose is shown")
     reenact.add_argument("--intrinsics", choices=("driver", "target"), default="driver", help="through whose lens")
     reenact.add_argument(
-        "--out", type=Path, metavar="FILE", help="video file (default: RUN/reenact/DRIVER-TRANSFER.mp4)"
+        "--background",
+        metavar="COLOUR|IMAGE|transparent",
+        help="the avatar alone over it; transparent: .webm, .mov or .png (default: beside the driver)",
+    )
+    reenact.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="video, or .png for pictures (default: RUN/reenact/DRIVER-TRANSFER.mp4)",
     )
     add_device(reenact)
 
-    add_export(commands.add_parser("export", help="write an avatar as a file to take away"))
+    add_export(commands.add_parser("export"))
 
-    add_view(commands.add_parser("view", help="show an avatar in a browser, move it by hand and drive it live"))
+    add_view(commands.add_parser("view"))
 
-    send = commands.add_parser("send", help="replay a drive file to avatar view --stream")
+    send = commands.add_parser("send")
     send.add_argument("drive", type=Path, metavar="FILE", help="drive file (.npz, .csv)")
     send.add_argument("port", type=int, metavar="PORT", help="of avatar view --stream on this machine")
     send.add_argument("--head", type=Path, metavar="PATH", required=True, help="the avatar's head model")
     add_token(send, "that of avatar view (default: $AVATAR_TOKEN)")
 
-    drive_file = commands.add_parser("drive-file", help="write a tracked folder's motion as a drive file")
+    drive_file = commands.add_parser("drive-file")
     add_source(drive_file)
     drive_file.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
-    prepare = commands.add_parser("prepare", help="check and import a tracked folder; train does it by itself")
+    prepare = commands.add_parser("prepare")
     add_source(prepare)
     prepare.add_argument("--out", type=Path, metavar="DIR", help="where the prepared subject goes (default: the cache)")
 
-    check = commands.add_parser("check", help="say everything that is wrong with a tracked folder, before training")
+    check = commands.add_parser("check")
     add_source(check)
     check.add_argument(
         "--out", type=Path, metavar="DIR", help="write a page with pictures and plots, and a table of frames"
     )
     check.add_argument("--json", action="store_true", help="print the findings as JSON, and nothing else, to stdout")
 
-    demo_data = commands.add_parser("demo-data", help="make a talking-head subject, tracking and head model included")
+    demo_data = commands.add_parser("demo-data")
     demo_data.add_argument("out", type=Path, metavar="OUT")
     demo_data.add_argument("--frames", type=int, help="default: 600; with --cameras 100 in a sequence")
     demo_data.add_argument("--cameras", type=int, metavar="N", help="2 to 64: three sequences in VHAP's layout")
@@ -199,10 +213,10 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
     demo_data.add_argument("--motion", choices=("speech", "turn", "gaze"), help="default: speech")
 
-    demo = commands.add_parser("demo", help="make two subjects, train on one, evaluate, reenact with the other")
+    demo = commands.add_parser("demo")
     demo.add_argument("out", type=Path, metavar="OUT")
 
-    bench = commands.add_parser("bench", help="measure time and error of a part on this machine")
+    bench = commands.add_parser("bench")
     bench.add_argument("part", choices=tuple(PARTS))
     wanted = "; ".join(f"{name}: {part.inputs}" for name, part in PARTS.items() if part.inputs)
     bench.add_argument("words", nargs="*", metavar="FOLDER | RUN", help=f"what is measured ({wanted}) and key=value")
@@ -214,10 +228,10 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     extent.add_argument("--quick", action="store_true", help="tiny inputs, to see that the measurement works")
     extent.add_argument("--full", action="store_true", help="the long sweep over sizes, counts and threads")
 
-    models = commands.add_parser("models", help="list the files of others that the program can use, and where they are")
+    models = commands.add_parser("models")
     models.add_argument("--download", action="store_true", help="get what is missing from its publishers")
 
-    sweep = commands.add_parser("sweep", help="train and measure many subjects, configurations and seeds")
+    sweep = commands.add_parser("sweep")
     sweep.add_argument(
         "spec", type=Path, nargs="?", metavar="SPEC.yaml", help="what to train; without it, go on with --out"
     )
@@ -229,8 +243,15 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     sweep.add_argument("--status", action="store_true", help="say what has become of each job, and start nothing")
     sweep.add_argument("--retry-failed", action="store_true", help="try jobs again that have failed with a sentence")
 
-    # Without help, so that the list of commands does not name it: the engines call it.
+    completion = commands.add_parser("completion")
+    completion.add_argument("shell", choices=("bash", "zsh", "fish"))
+
+    # Not in a group, so that no list names it: the engines call it.
     commands.add_parser("sweep-job").add_argument("folder", type=Path)
 
-    commands.add_parser("doctor", help="say what this installation can do and what is missing")
+    commands.add_parser("doctor")
+    for group in GROUPS.values():
+        for name, (meaning, example) in group.items():
+            commands.choices[name].description = f"{meaning[0].upper()}{meaning[1:]}."
+            commands.choices[name].epilog = f"example: avatar {name} {example}".rstrip()
     return parser, commands.choices

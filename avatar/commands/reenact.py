@@ -8,11 +8,12 @@ from pathlib import Path
 
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.files.names import safe_name
-from avatar.files.video import VIDEO_SUFFIXES
+from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
+from avatar.pipeline.backdrop import parse_backdrop
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_driver
-from avatar.pipeline.reenact import Choices, reenact, sidecars
+from avatar.pipeline.reenact import PICTURES, Choices, reenact, sidecars
 from avatar.pipeline.track import is_video, tracked_once
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained import TrainedAvatar
@@ -24,15 +25,22 @@ def run_reenact(arguments: Namespace) -> int:
     choices = Choices(**{field.name: getattr(arguments, field.name) for field in fields(Choices)})
     driver: Path = arguments.driver
     out = arguments.out or default_video(arguments.run, driver, choices)
-    check_file(out, VIDEO_SUFFIXES, "a video")
+    backdrop = None if arguments.background is None else parse_backdrop(arguments.background)
+    has_alpha = backdrop is not None and backdrop.behind is None
+    check_file(
+        out,
+        [*(ALPHA_SUFFIXES if has_alpha else VIDEO_SUFFIXES), PICTURES],
+        "a transparent video" if has_alpha else "a video",
+    )
     inputs = [driver, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
     check_outputs([out, *sidecars(out)], inputs)
     if driver.suffix.lower() in DRIVE_SUFFIXES:
-        reenact(trained, open_drive_file(driver, trained), out, choices)
+        reenact(trained, open_drive_file(driver, trained), out, choices, backdrop=backdrop)
     else:
+        sound = driver if driver.is_file() else None
         if is_video(driver):
             driver = tracked_once(driver, head_of(arguments, trained), trained.assets)
-        reenact(trained, open_driver(driver, trained, arguments), out, choices)
+        reenact(trained, open_driver(driver, trained, arguments), out, choices, backdrop=backdrop, sound=sound)
     return OK
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 
 from avatar.commands.outputs import check_run_folder
 from avatar.config import chosen_options, flatten, load_config
+from avatar.config_values import shown
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.files.names import safe_name
 from avatar.pipeline import OK
+from avatar.pipeline.dry_run import foretell
 from avatar.pipeline.open import at_new_place, source_of
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, plan_file
 from avatar.pipeline.track import head_for_video, is_video, tracked_once
@@ -26,7 +28,12 @@ MAX_ROUNDS = 10
 
 
 def run_train(arguments: Namespace) -> int:
+    if arguments.print_config:
+        print_config(config_overrides(arguments))
+        return OK
     settle_paths(arguments)
+    if arguments.dry_run:
+        return foretell_run(arguments)
     run = arguments.out or default_run(arguments.folder)
     status = train_as_asked(run, arguments)
     print(f"Next         avatar eval {run}" if status == OK else "Add --resume to the same command to go on.")
@@ -63,6 +70,25 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
         return train_new(tracked_source(arguments), overrides, run, arguments.device)
     check_rounds(run, arguments.refine, arguments.minutes, overrides)
     return begin_rounds(run, arguments.refine, arguments.minutes, tracked_source(arguments), overrides, begin)
+
+
+def print_config(overrides: list[str]) -> None:
+    """The configuration as overrides of itself."""
+    for key, value in flatten(load_config(overrides).to_dict()).items():
+        print(f"{key}={shown(list(value) if isinstance(value, tuple) else value).replace(' ', '')}")
+
+
+def foretell_run(arguments: Namespace) -> int:
+    """What a new run would take, and its configuration."""
+    overrides = config_overrides(arguments)
+    if arguments.resume:
+        raise UserError("--dry-run is for a new run: leave --resume out")
+    if is_video(arguments.folder):
+        raise UserError(f"{arguments.folder} is a video: give the folder that avatar track writes of it to --dry-run")
+    check_folder(arguments.folder)
+    status = foretell(source_of(arguments), overrides, arguments.refine or 0, arguments.device)
+    print_config(overrides)
+    return status
 
 
 def settle_paths(arguments: Namespace) -> None:

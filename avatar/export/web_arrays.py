@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.export.stage import faded
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.model import FlashAvatar
@@ -42,6 +43,7 @@ ARRAYS = (
     "sh",
     "rigidity",
 )
+LEAST_ALPHA = 1 / 255  # what is drawn at all
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class WebArrays:
 
 @torch.no_grad()
 def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
-    """Fold what can be folded, and leave out expression directions and vertices that nothing uses.
+    """Fold what can be folded, fade the neck, and leave out Gaussians that are too faint to be seen, and expression
+    directions and vertices that nothing uses.
 
     Raises UserError for an avatar that does not fold.
     """
@@ -70,28 +73,34 @@ def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
             f"an avatar of model={trained.config.model.name} cannot be exported for browsers, which do not know {unknown}; "
             "train one with model=hypergaussians"
         )
-    model, assets = cast(FlashAvatar, trained.avatar), trained.avatar.mesh.assets
+    model = cast(FlashAvatar, faded(trained).avatar)
+    assets = model.mesh.assets
     moved = (trained.recording.tracks["expression"] != 0).any(dim=0).nonzero().flatten()
-    used, corners = torch.unique(model.embedding.corners, return_inverse=True)
+    seen = (torch.sigmoid(model.opacity_logits) >= LEAST_ALPHA).nonzero().flatten()
+    used, corners = torch.unique(model.embedding.corners[seen], return_inverse=True)
+    grid, empty = model.grid, torch.zeros(0)
+    network = _network_arrays(model, moved, assets.num_expressions)
+    if grid is None:
+        network["of_code"] = network["of_code"][seen]
+    folded = None if model.hyper is None else model.hyper.fold()
     arrays: dict[str, Tensor] = {
         **_head_arrays(model, assets, used, moved),
-        "barycentric": model.embedding.barycentric,
-        **_network_arrays(model, moved, assets.num_expressions),
-        "quats": model.quats,
-        "log_scales": model.log_scales,
-        "opacity_logits": model.opacity_logits,
-        "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1),
-        "rigidity": torch.zeros(0) if model.skull_logits is None else torch.sigmoid(model.skull_logits),
+        "barycentric": model.embedding.barycentric[seen],
+        **network,
+        "grid_weights": empty if grid is None else grid.weights[seen],
+        "head_matrix": empty if folded is None else folded.matrix[seen],
+        "head_bias": empty if folded is None else folded.bias[seen],
+        "quats": model.quats[seen],
+        "log_scales": model.log_scales[seen],
+        "opacity_logits": model.opacity_logits[seen],
+        "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1)[seen],
+        "rigidity": empty if model.skull_logits is None else torch.sigmoid(model.skull_logits[seen]),
     }
-    grid, empty = model.grid, torch.zeros(0)
-    arrays["grid_weights"] = empty if grid is None else grid.weights
-    folded = None if model.hyper is None else model.hyper.fold()
-    arrays["head_matrix"], arrays["head_bias"] = (empty, empty) if folded is None else (folded.matrix, folded.bias)
     sizes = {
         "vertices": len(used),
         "expressions": len(moved),
-        "gaussians": len(model),
-        "nodes": len(model.code),
+        "gaussians": len(seen),
+        "nodes": len(network["of_code"]),
         "latent": model.deformation.output.out_features,
         "width": model.config.mlp_width,
         "layers": model.config.mlp_layers,
@@ -105,7 +114,7 @@ def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
         sizes,
         {name: np.ascontiguousarray(arrays[name].float().numpy()) for name in ARRAYS},
         corners.numpy().astype(np.int32),
-        np.zeros((0, 4), np.int32) if grid is None else grid.cells.numpy().astype(np.int32),
+        np.zeros((0, 4), np.int32) if grid is None else grid.cells[seen].numpy().astype(np.int32),
         assets.parents,
         tuple(moved.tolist()),
     )

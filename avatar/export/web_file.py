@@ -22,6 +22,7 @@ import torch
 from avatar.errors import UserError
 from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
+from avatar.export.stage import front_camera
 from avatar.export.web_arrays import ARRAYS, WebArrays, reduce_avatar
 from avatar.gaussians.head_rotation import LIMIT
 from avatar.motion.controls import expression_controls, joint_ranges
@@ -31,22 +32,23 @@ from avatar.runs.trained import TrainedAvatar
 FORMAT = "AVW3"
 Precision = Literal["float", "small"]
 TYPES = {"f4": np.float32, "i2": np.int16, "i1": np.int8, "u4": np.uint32, "u2": np.uint16}
-# Columns that have a scale of their own, and bits, with precision "small". What is not named stays float32.
-SMALL: dict[str, tuple[str, str]] = {  # array -> type, what a column is
-    "expression_dirs": ("i2", "row"),
-    "pose_dirs": ("i1", "row"),
-    "eyelid_dirs": ("i2", "row"),
-    "barycentric": ("i2", "all"),
-    "of_code": ("i2", "column"),
-    "hidden_weights": ("i2", "all"),
-    "grid_weights": ("i2", "all"),
-    "head_matrix": ("i1", "last two"),
-    "head_bias": ("i2", "column"),
-    "quats": ("i2", "column"),
-    "log_scales": ("i2", "column"),
-    "opacity_logits": ("i2", "all"),
-    "sh": ("i1", "last two"),
-    "rigidity": ("i2", "all"),
+# With precision "small": the type, what a column with a scale of its own is, and the largest integer, which is smaller than
+# the type's where the picture does not mind, for gzip. What is not named stays float32.
+SMALL: dict[str, tuple[str, str, int]] = {
+    "expression_dirs": ("i2", "row", 32767),
+    "pose_dirs": ("i1", "row", 127),
+    "eyelid_dirs": ("i2", "row", 32767),
+    "barycentric": ("i2", "all", 4095),
+    "of_code": ("i2", "column", 32767),
+    "hidden_weights": ("i2", "all", 32767),
+    "grid_weights": ("i2", "all", 32767),
+    "head_matrix": ("i1", "last two", 31),
+    "head_bias": ("i2", "column", 2047),
+    "quats": ("i2", "column", 2047),
+    "log_scales": ("i2", "column", 2047),
+    "opacity_logits": ("i2", "all", 1023),
+    "sh": ("i1", "last two", 63),
+    "rigidity": ("i2", "all", 1023),
 }
 MAX_MOTION = 1500  # frames: a minute at 25 a second
 
@@ -96,9 +98,8 @@ def encode_avatar(trained: TrainedAvatar, precision: Precision = "small") -> Web
     return WebFile(gzip.compress(raw, 9, mtime=0), drawing)
 
 
-def quantised(values: np.ndarray, kind: str, column: str) -> tuple[np.ndarray, np.ndarray]:
+def quantised(values: np.ndarray, kind: str, column: str, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Integers and the scales of the columns, which run fastest; "row" keeps a scale for each first index."""
-    limit = np.iinfo(TYPES[kind]).max
     shaped = {
         "all": lambda: values.reshape(-1, 1),
         "column": lambda: values.reshape(-1, values.shape[-1]),
@@ -127,7 +128,7 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
     recording, kept = trained.recording, list(drawing.kept)
     train = list(recording.split.train)
     expressions = recording.tracks["expression"][recording.times(train)]
-    rest, camera = trained.rest_params(), trained.rest_camera()
+    rest, camera = trained.rest_params(), front_camera(trained)
     names, turning = trained.assets.names.names, trained.avatar.turning
     controls = expression_controls(expressions, rest.expression, trained.avatar.head)
     return {

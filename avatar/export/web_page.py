@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import html
 import json
 import re
@@ -19,7 +20,7 @@ WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
 PAGE_MODULES = (
     *("core.js", "motion.js", "canvas.js", "webgl_renderer.js", "drive.js", "settings.js", "view.js", "steer.js"),
-    *("landmarker.js", "camera.js", "controls.js", "panel.js", "page.js"),
+    *("landmarker.js", "camera.js", "controls.js", "gaze.js", "stage.js", "panel.js", "page.js"),
 )
 WORKER_MODULES = ("core.js", "worker.js")
 WATCHER_MODULES = ("watcher.js",)
@@ -47,7 +48,7 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
         "script": f"(() => {{\n{bundle(PAGE_MODULES)}\n}})();",
         "worker": script_text(json.dumps(bundle(WORKER_MODULES), allow_nan=False)),
         "watcher": script_text(json.dumps(bundle(WATCHER_MODULES), allow_nan=False)),
-        "module": base64.b64encode((WEB / "avatar.wasm").read_bytes()).decode(),
+        "module": base64.b64encode(gzip.compress((WEB / "avatar.wasm").read_bytes(), 9, mtime=0)).decode(),
         "data": base64.b64encode(encoded.data).decode(),
     }
     page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], read("page.html"))

@@ -1,4 +1,4 @@
-"""Videos of side-by-side pictures: H.264 in MP4, written as the pictures come and there whole or not at all."""
+"""Videos, written as the pictures come and there whole or not at all: H.264; VP9 in WebM; ProRes where a MOV has alpha."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import imageio_ffmpeg
@@ -18,17 +19,25 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.files.atomic import temporary_name
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
+ALPHA_SUFFIXES = (".mov", ".webm")
 CAPTION_SHARE = 0.08  # of the height of the pictures
 MIN_CAPTION = 16  # pixels
 INK, PAPER = (40, 40, 40), 245
 
 
+class Sound(NamedTuple):
+    source: Path  # a file; one without sound is let pass
+    start: float  # seconds into it, of what is taken
+    length: float
+
+
 @contextmanager
 def video_writer(
-    path: Path, fps: float, preset: str = "medium"
-) -> Iterator[Callable[[UInt8[np.ndarray, "H W 3"]], None]]:
-    """A function that adds one RGB frame to `path` (.mp4: H.264, yuv420p, plays everywhere).
+    path: Path, fps: float, preset: str = "medium", sound: Sound | None = None
+) -> Iterator[Callable[[UInt8[np.ndarray, "H W C"]], None]]:
+    """A function that adds one frame to `path`: RGB (.mp4: H.264, yuv420p, plays everywhere), or RGBA with straight alpha
+    (.mov: ProRes 4444, .webm: VP9).
 
     `preset` is the encoder's: "veryfast" takes two fifths of the usual one's time, for pictures that are only looked at.
     An odd size gets one more row or column, a copy of the last. The file appears under its name when the block ends
@@ -38,10 +47,12 @@ def video_writer(
     shape: tuple[int, ...] | None = None
     encoder: subprocess.Popen[bytes] | None = None
 
-    def add(frame: UInt8[np.ndarray, "H W 3"]) -> None:
+    def add(frame: UInt8[np.ndarray, "H W C"]) -> None:
         nonlocal shape, encoder
-        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-            raise ValueError(f"a video frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] not in (3, 4):
+            raise ValueError(
+                f"a video frame must be uint8 [H, W, 3] or [H, W, 4], got {frame.dtype} {list(frame.shape)}"
+            )
         if shape is not None and frame.shape != shape:
             was, now = (f"{s[1]}x{s[0]}" for s in (shape, frame.shape))
             raise UserError(f"{path} cannot hold a frame of {now} pixels after frames of {was}")
@@ -49,7 +60,7 @@ def video_writer(
         even = np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
         with _failing_as_user_error(path):
             if encoder is None:
-                encoder = _start_encoder(partial, even.shape[1], even.shape[0], fps, preset)
+                encoder = _start_encoder(partial, even.shape, fps, preset, sound)
             assert encoder.stdin is not None
             try:
                 encoder.stdin.write(even.tobytes())
@@ -75,17 +86,50 @@ def video_writer(
             partial.unlink()
 
 
-def _start_encoder(path: Path, width: int, height: int, fps: float, preset: str) -> subprocess.Popen[bytes]:
-    """ffmpeg, which takes RGB bytes from its standard input. It is run here because imageio does not ask how it ended."""
-    taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
-    made = ["-an", "-c:v", "libx264", "-preset", preset, "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+def _start_encoder(
+    path: Path, shape: tuple[int, ...], fps: float, preset: str, sound: Sound | None
+) -> subprocess.Popen[bytes]:
+    """ffmpeg, which takes RGB or RGBA bytes from its standard input. It is run here because imageio does not ask how it
+    ended."""
+    height, width, channels = shape
+    layout = {3: "rgb24", 4: "rgba"}[channels]
+    taken = ["-f", "rawvideo", "-pix_fmt", layout, "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    made = _codec(path.suffix.lower(), channels == 4, preset)
+    if sound is None:
+        heard = ["-an"]
+    else:
+        taken += ["-ss", f"{sound.start:.6f}", "-t", f"{sound.length:.6f}", "-i", str(sound.source)]
+        codec = "libopus" if path.suffix.lower() == ".webm" else "aac"
+        heard = ["-map", "0:v", "-map", "1:a?", "-c:a", codec]
     # -xerror: it ends with its first error, so that what it says fits into the pipe
     options = ["-y", "-loglevel", "error", "-xerror"]
     return subprocess.Popen(
-        [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, str(path)],
+        [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, *heard, str(path)],
         stdin=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def _codec(suffix: str, has_alpha: bool, preset: str) -> list[str]:
+    if suffix == ".webm":
+        layout = "yuva420p" if has_alpha else "yuv420p"
+        return [
+            "-c:v",
+            "libvpx-vp9",
+            "-crf",
+            "20",
+            "-b:v",
+            "0",
+            "-cpu-used",
+            "4",
+            "-auto-alt-ref",
+            "0",
+            "-pix_fmt",
+            layout,
+        ]
+    if has_alpha:
+        return ["-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le", "-alpha_bits", "8"]
+    return ["-c:v", "libx264", "-preset", preset, "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 
 
 def _finish(encoder: subprocess.Popen[bytes]) -> None:
@@ -106,9 +150,11 @@ def _failing_as_user_error(path: Path) -> Iterator[None]:
         raise UserError(f"the video {path} cannot be written ({getattr(error, 'strerror', None) or error})") from error
 
 
-def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: float) -> None:
+def write_video(
+    path: Path, frames: Iterable[UInt8[np.ndarray, "H W C"]], fps: float, sound: Sound | None = None
+) -> None:
     """Encode `frames`, taken one at a time, as `video_writer` does."""
-    with video_writer(path, fps) as add:
+    with video_writer(path, fps, sound=sound) as add:
         for frame in frames:
             add(frame)
 

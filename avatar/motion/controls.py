@@ -12,12 +12,15 @@ from jaxtyping import Float
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
+from avatar.errors import UserError
+from avatar.head.expression_names import plain
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.component_names import name_components
 from avatar.types import HeadParams
 
 COMPONENTS = 12  # of head models whose coefficients have no names
 EDGE = 1.0  # percent of the training frames beyond either end of a range
+JOINTS = ("jaw", "look_down", "look_left", "left_lid", "right_lid", "nod", "turn")
 LEAST_RANGE = 0.02  # radians, or share of a closed lid: what has moved less, training has not shown
 JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "lean": "neck", "turn": "neck"}  # else eyes
 PARTS = (
@@ -106,6 +109,18 @@ def posed(
         eyelids=lids,
         neck=turned(joints.get("lean", 0.0), joints.get("turn", 0.0)),
     )
+
+
+def posed_by_name(values: Mapping[str, float], controls: Sequence[ExpressionControl], rest: HeadParams) -> HeadParams:
+    """`posed` by names in any style of writing. Raises UserError for another one, with those that there are."""
+    known = {plain(c.name): c for c in reversed(controls)} | {plain(f"{c.part} {c.name}"): c for c in controls}
+    joints = {name: value for name, value in values.items() if name in JOINTS}
+    expressions = {name: value for name, value in values.items() if name not in JOINTS}
+    for name in expressions:
+        if plain(name) not in known:
+            names = [*JOINTS, *(re.sub(r"\W+", "_", f"{c.part} {c.name}".lower()).strip("_") for c in controls)]
+            raise UserError(f"this avatar has no {name}; it has {', '.join(names)}")
+    return posed(rest, {known[plain(name)]: value for name, value in expressions.items()}, joints)
 
 
 def turned(about_x: float, about_y: float) -> Float[Tensor, 6]:

@@ -1,7 +1,8 @@
 """Driving one person's avatar with another person's motion.
 
 NAME.mp4               the driver's picture, where there is one, beside the render; under them each frame's distance from
-                       the training expressions
+                       the training expressions; with a backdrop the render alone
+NAME-00000.png ...     in place of the video, for NAME.png
 NAME.distances.csv     those distances
 NAME.choices.json      every choice that made the video
 """
@@ -9,12 +10,13 @@ NAME.choices.json      every choice that made the video
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -25,18 +27,20 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
-from avatar.files.video import side_by_side, write_video
+from avatar.files.video import Sound, side_by_side, write_video
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
 from avatar.motion.rest import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
 from avatar.motion.training_distance import DistanceStrip, distances_csv
 from avatar.motion.transfer import NEUTRAL_MODES, Transfer, transfer_motion
+from avatar.pipeline.backdrop import Backdrop
 from avatar.runs.run import versions
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera
 
 FOCAL_TOLERANCE = 0.1  # relative difference of the field of view from which a warning is worth its line
 SIDECAR_FORMAT = 1
+PICTURES = ".png"  # of the name of pictures that are numbered
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,12 @@ def reenact(
     out: Path,
     choices: Choices = DEFAULT_CHOICES,
     *,
+    backdrop: Backdrop | None = None,
+    sound: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> Path:
-    """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture.
+    """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture, or
+    alone over a backdrop. `sound` is the driver's video, whose sound goes along.
 
     Returns the video's path. Raises UserError for choices out of range and for a driver tracked with another head model.
     """
@@ -94,19 +101,44 @@ def reenact(
     cameras = choose_cameras(drive, own, choices.camera, choices.intrinsics)
     if choices.camera == "driver" and choices.intrinsics == "driver":
         warn_of_other_intrinsics(cameras[0], own, say)
-    renders = (rendering.image for rendering in trained.stream(zip(moved, cameras, strict=True)))
-    loader = FrameLoader(driver, data.size) if isinstance(driver, Subject) else None
+    renderings = trained.stream(zip(moved, cameras, strict=True))
+    loader = FrameLoader(driver, data.size) if backdrop is None and isinstance(driver, Subject) else None
     with loader or nullcontext():
         pictures = (frame.image for frame in loader.frames(all_moments(loader.subject))) if loader else None
-        frames = panels(renders, pictures, trained.name, distances.tolist())
-        write_video(out, tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True), drive.fps)
+        if backdrop is None:
+            frames = panels((each.image for each in renderings), pictures, trained.name, distances.tolist())
+        else:
+            frames = (backdrop.pixels(each, trained.background) for each in renderings)
+        shown = tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True)
+        if out.suffix.lower() == PICTURES:
+            write_pictures(out, shown)
+        else:
+            write_video(out, shown, drive.fps, None if sound is None else drive_sound(sound, drive))
     table, record = sidecars(out)
     content = distances_csv(drive.names, distances.tolist())
     write_atomically(table, content.encode(errors="backslashreplace"))
     described = describe(trained, drive, choices, neutral, cameras, own, distances)
+    described |= {
+        "background": None if backdrop is None else backdrop.name,
+        "sound": None if sound is None else str(sound),
+    }
     write_atomically(record, json.dumps(described, indent=2, allow_nan=False).encode())
     say(f"{len(drive)} frames written to {out}; its choices in {record.name}, each frame's distance in {table.name}")
     return out
+
+
+def drive_sound(video: Path, drive: Drive) -> Sound:
+    """That of the frames of a tracked video, which are numbered in units of 1 / fps."""
+    name = drive.names[0]
+    first = int(name) if name.isascii() and name.isdigit() else 0
+    return Sound(video, first / drive.fps, len(drive) / drive.fps)
+
+
+def write_pictures(out: Path, frames: Iterable[UInt8[np.ndarray, "H W C"]]) -> None:
+    for number, frame in enumerate(frames):
+        order = cv2.COLOR_RGBA2BGRA if frame.shape[2] == 4 else cv2.COLOR_RGB2BGR
+        _, data = cv2.imencode(PICTURES, cv2.cvtColor(frame, order))
+        write_atomically(out.with_name(f"{shortened(out.stem)}-{number:05d}{PICTURES}"), data.tobytes())
 
 
 def sidecars(video: Path) -> tuple[Path, Path]:

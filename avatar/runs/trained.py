@@ -18,6 +18,8 @@ from avatar.files.places import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets, load_head_assets
+from avatar.motion.controls import expression_controls, posed_by_name
+from avatar.motion.orbit import orbited
 from avatar.motion.rest import RestPose
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
@@ -98,6 +100,25 @@ class TrainedAvatar:
             return self.renderer.render(
                 self._params(params), self.rest_camera() if camera is None else checked_camera(camera)
             )
+
+    def pose(
+        self, *, yaw: float = 0.0, pitch: float = 0.0, zoom: float = 1.0, size: int | None = None, **values: float
+    ) -> Rendering:
+        """A picture of the neutral face with some values set: expressions by name, as far as training moved them, from the
+        neutral one (smile_left=1; without names mouth_smile and the like, as in the viewer), jaw, look_down, look_left and,
+        of the torso, lean and turn in radians, left_lid and right_lid from 0 to 1. The head is
+        turned by `yaw` and `pitch` degrees.
+
+        Raises UserError, with the names that there are, for another name, and as `render`.
+        """
+        train = self.recording.times(self.recording.split.train)
+        rest = self.rest_params()
+        expressions = self.recording.tracks["expression"][train]
+        params = posed_by_name(values, expression_controls(expressions, rest.expression, self.avatar.head), rest)
+        return self.render(params, orbited(self.rest_camera(size), yaw, pitch, zoom))
+
+    def _repr_png_(self) -> bytes:
+        return self.render(self.rest_params()).png()
 
     def stream(self, motion: Iterable[HeadParams | tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
         """Pictures in order, several drawn at a time; `motion` may be endless.

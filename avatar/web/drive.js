@@ -1,5 +1,5 @@
 // A face in front of a camera as the avatar's: ARKit's blendshape scores and a head's pose become parameters and a camera.
-import { multiply, places, rotation, sixD } from "./motion.js";
+import { multiply, places, rotation, sixD, whole } from "./motion.js";
 
 const LIDS = ["eyeBlinkLeft", "eyeBlinkRight"];
 const CALM_SHARE = 0.25;
@@ -154,8 +154,3 @@ function placed({ camera, orbit }, [roll, pitch, yaw, x, y, far]) {
 
 const clamp = (value, [low, high]) => Math.min(Math.max(value, low), high);
 const transposed = (m) => [m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]];
-
-/** A rotation of its first two rows. */
-function whole([a, b, c, d, e, f]) {
-  return [a, b, c, d, e, f, b * f - c * e, c * d - a * f, a * e - b * d];
-}

@@ -8,7 +8,7 @@ export interface Header {
   expressions: string[]; // names of the coefficients
   controls: { group: string; name: string; values: number[]; range: Range }[]; // directions among them
   joints: Partial<Record<"jaw" | "look_down" | "look_left" | "left_lid" | "right_lid" | "lean" | "turn", Range>>;
-  orbit: { yaw: Range; pitch: Range }; // what the training video shows
+  orbit: { yaw: Range; pitch: Range }; // what the training video shows, from the front
   drive: { // what a face moves: places are expression, jaw 3, eyes 6 and eyelids 2, as departures from the neutral face
     blendshapes: Record<string, [place: number, weight: number][]>; // by ARKit's names: mouthSmileLeft
     low: number[]; // of each place, as far as training showed
@@ -16,12 +16,12 @@ export interface Header {
   };
   rest: number[]; // the neutral face: expression, jaw 6, eyes 12, eyelids 2, neck 6
 }
-export interface Pose {
-  jaw?: [number, number, number];
-  gaze?: [number, number, number];
-  neck?: [number, number, number];
-  lids?: [left: number, right: number]; // 0 open, 1 closed
-  head?: [yaw: number, pitch: number];
+export interface Pose { // null lets go
+  jaw?: [number, number, number] | null;
+  gaze?: [number, number, number] | null;
+  neck?: [number, number, number] | null;
+  lids?: [left: number, right: number] | null; // 0 open, 1 closed
+  head?: [yaw: number, pitch: number] | null;
 }
 export type Motion = "idle" | "recorded" | "rest";
 /** As MediaPipe's face landmarker gives them: scores by ARKit's names; the head's pose, 4x4 by columns, OpenGL's axes. */
@@ -49,6 +49,8 @@ export class AvatarView extends EventTarget {
   readonly frameCount: number;
   readonly limits: { yaw: Range; pitch: Range };
   readonly view: { yaw: number; pitch: number; zoom: number };
+  readonly parameters?: Float32Array; // what is shown, in the order of header.rest
+  background: [red: number, green: number, blue: number] | null; // from 0 to 1; null: that of training
   readonly statistics: { milliseconds: number; framesPerSecond: number };
   /** Coefficients by name or number, or controls as "Group: name"; unknown names are returned. */
   setExpression(values: Record<string, number>): string[];

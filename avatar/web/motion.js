@@ -22,14 +22,22 @@ export function multiply(a, b) {
 /** The first two rows, flattened: how parameters hold a rotation. */
 export const sixD = (m) => m.slice(0, 6);
 
+/** A rotation of its first two rows. */
+export function whole([a, b, c, d, e, f]) {
+  return [a, b, c, d, e, f, b * f - c * e, c * d - a * f, a * e - b * d];
+}
+
+/** How a head turns by yaw and pitch in degrees, in its own axes. */
+const headTurn = ([yaw, pitch]) =>
+  multiply(rotation([(pitch * Math.PI) / 180, 0, 0]), rotation([0, (yaw * Math.PI) / 180, 0]));
+
 /**
  * The camera after turning the head before it: `yaw` and `pitch` in degrees, `zoom` a factor; `orbited` of
  * avatar/motion/orbit.py. `base` as in the avatar's header, `size` the width in pixels.
  */
 export function orbit(base, { yaw = 0, pitch = 0, zoom = 1 }, size) {
-  const turn = multiply(rotation([(pitch * Math.PI) / 180, 0, 0]), rotation([0, (yaw * Math.PI) / 180, 0]));
   return {
-    rotation: multiply(base.rotation, turn),
+    rotation: multiply(base.rotation, headTurn([yaw, pitch])),
     translation: base.translation,
     fx: base.fx * size * zoom,
     fy: base.fy * size * zoom,
@@ -72,6 +80,9 @@ export function idle(header, seconds, still = false) {
   parameters.set(eye, at.eyes);
   parameters.set(eye, at.eyes + 6);
   const turn = [3 * Math.sin(0.7 * seconds) + 1.5 * Math.sin(1.9 * seconds), 1.2 * Math.sin(0.9 * seconds + 1)];
+  // Where training has seen the torso turn against the head, it stays when the head sways.
+  const neck = multiply(whole(header.rest.slice(at.neck, at.neck + 6)), headTurn(turn));
+  if (header.joints.turn || header.joints.lean) parameters.set(sixD(neck), at.neck);
   return { parameters, turn };
 }
 
@@ -81,7 +92,16 @@ const noise = (n) => {
   return x - Math.floor(x);
 };
 
-/** Blend of two parameter arrays; rotations stay rotations to first order, and the module makes them orthonormal. */
-export function mix(from, to, share) {
-  return Float32Array.from(from, (value, i) => value + share * (to[i] - value));
+/** Between two poses with cameras. What parameters hold of rotations stays one to first order; the module makes it exact. */
+export function blended(from, to, share) {
+  const mix = (name) => Float32Array.from(from[name], (value, i) => value + share * (to[name][i] - value));
+  const [translation, rotation, turn] = ["translation", "rotation", "turn"].map((name) => Array.from(mix(name)));
+  return { parameters: mix("parameters"), translation, rotation: orthonormal(rotation), turn };
+}
+
+/** The rotation whose first rows are nearest to a matrix's. */
+function orthonormal(m) {
+  const unit = (v) => v.map((x) => x / Math.hypot(...v)), a = unit(m.slice(0, 3));
+  const along = a.reduce((sum, x, i) => sum + x * m[3 + i], 0), b = unit(m.slice(3, 6).map((x, i) => x - along * a[i]));
+  return [...a, ...b, a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }

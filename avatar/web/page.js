@@ -1,6 +1,8 @@
-// The page around a view: sliders, the recorded motion, pictures. Works from a file, without a network.
-import { makeSliders } from "./controls.js";
+// The page around a view: sliders, the recorded motion, pictures. Works from a file, without a network. The address may ask for
+// ?noui (the picture alone), ?autoplay, ?background=%23rrggbb, ?renderer=wasm or webgl, and ?width= in pixels.
+import { makeControls } from "./controls.js";
 import { connectCamera } from "./panel.js";
+import { connectStage } from "./stage.js";
 import { steer } from "./steer.js";
 import { AvatarView } from "./view.js";
 
@@ -13,17 +15,20 @@ const wantsStillness = () => matchMedia("(prefers-reduced-motion: reduce)").matc
 
 async function start() {
   const asked = new URLSearchParams(location.search), options = { still: wantsStillness(), renderer: asked.get("renderer") ?? "auto" };
+  document.body.classList.toggle("noui", asked.has("noui"));
   const parts = { worker: makeWorker("worker"), wasm: decoded("module"), file: decoded("data") };
   const view = new AvatarView(find("canvas"), parts, options);
   window.avatar = view; // for the curious, and for tests
   view.addEventListener("failed", ({ detail }) => say(detail));
   const header = await view.ready;
-  document.documentElement.style.setProperty("--stage", `rgb(${header.background.map((c) => 255 * c).join(" ")})`);
   steer(view, find("canvas"));
-  const putBack = makeSliders(view, header, find("controls"));
+  const [presets, first, more] = ["presets", "first", "more"].map(find);
+  const { putBack, isGazeHeld } = makeControls(view, header, { presets, first, more });
+  const putStageBack = connectStage(view, header, isGazeHeld, () => find("play").click());
   view.addEventListener("drawn", () => say(""), { once: true });
   view.addEventListener("view", () => (find("guess").hidden = view.isSupported));
-  connectBar(view, header, putBack);
+  connectBar(view, header, putBack, putStageBack);
+  if (asked.has("autoplay") && !options.still) view.play("recorded");
   if ("webcam" in document.body.dataset) connectCamera(view, () => makeWorker("watcher"), putBack);
   const width = Number(asked.get("width"));
   if (width > 0) view.resize(width);
@@ -38,7 +43,8 @@ function makeWorker(id) {
 
 /** Bytes of an element's base64 text, which is let go of. */
 function decoded(id) {
-  const element = find(id), bytes = Uint8Array.from(atob(element.textContent.trim()), (letter) => letter.charCodeAt(0));
+  const element = find(id), text = atob(element.textContent.trim()), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < bytes.length; ++i) bytes[i] = text.charCodeAt(i);
   element.remove();
   return bytes.buffer;
 }
@@ -47,24 +53,31 @@ function say(sentence) {
   Object.assign(find("message"), { textContent: sentence, hidden: sentence === "" });
 }
 
-function connectBar(view, header, putBack) {
+const clock = (seconds) => `${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
+
+function connectBar(view, header, putBack, putStageBack) {
   const [play, scrub, time] = ["play", "scrub", "time"].map(find);
   const seconds = view.frameCount / header.fps;
   scrub.max = String(Math.max(seconds - 1 / header.fps, 0));
   scrub.disabled = play.disabled = view.frameCount === 0;
-  play.addEventListener("click", () => (view.isPlaying ? view.pause() : view.play("recorded")));
+  play.addEventListener("click", () => {
+    if (view.isPlaying) return view.pause();
+    putBack();
+    view.play("recorded");
+  });
   scrub.addEventListener("input", () => view.seek(Number(scrub.value)));
   view.addEventListener("motion", () => (play.textContent = view.isPlaying ? "Pause" : "Play"));
   view.addEventListener("drawn", () => {
-    if (view.isPlaying) scrub.value = String(view.time);
-    time.textContent = `${Math.floor(view.time / 60)}:${String(Math.floor(view.time % 60)).padStart(2, "0")}`;
+    if (view.isPlaying || document.activeElement !== scrub) scrub.value = String(view.time);
+    scrub.style.setProperty("--at", scrub.value / (scrub.max || 1));
+    time.textContent = `${clock(view.time)} / ${clock(seconds)}`;
     scrub.setAttribute("aria-valuetext", `${view.time.toFixed(1)} seconds of ${seconds.toFixed(1)}`);
     const { milliseconds } = view.statistics, where = view.renderer === "webgl" ? "GPU" : "processor";
     find("speed").textContent = `${view.canvas.width} × ${view.canvas.height} pixels, ${milliseconds.toFixed(0)} ms a picture, ${where}`;
   });
   find("reset").addEventListener("click", () => {
-    view.release();
     putBack();
+    putStageBack();
     view.look({ yaw: 0, pitch: 0, zoom: 1 });
     scrub.value = "0";
     view.play(wantsStillness() ? "rest" : "idle");

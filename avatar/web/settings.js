@@ -26,14 +26,16 @@ export class Settings {
     return unknown;
   }
 
+  /** What is null is let go of. */
   setPose({ jaw, gaze, neck, lids, head } = {}) {
     const at = places(this.#header.sizes.expressions);
-    const pin = (start, values) => values.forEach((v, i) => this.#pinned.set(start + i, v));
-    if (jaw) pin(at.jaw, sixD(rotation(jaw)));
-    if (neck) pin(at.neck, sixD(rotation(neck)));
-    if (gaze) [at.eyes, at.eyes + 6].forEach((start) => pin(start, sixD(rotation(gaze))));
-    if (lids) pin(at.eyelids, lids);
-    if (head) this.turned = head;
+    const pin = (start, values) => values.forEach((v, i) => (v === null ? this.#pinned.delete(start + i) : this.#pinned.set(start + i, v)));
+    const turn = (start, vector) => pin(start, vector ? sixD(rotation(vector)) : Array(6).fill(null));
+    if (jaw !== undefined) turn(at.jaw, jaw);
+    if (neck !== undefined) turn(at.neck, neck);
+    if (gaze !== undefined) [at.eyes, at.eyes + 6].forEach((start) => turn(start, gaze));
+    if (lids !== undefined) pin(at.eyelids, lids ?? [null, null]);
+    if (head !== undefined) this.turned = head ?? [0, 0];
   }
 
   /** Throws AvatarError for another number of parameters. */

@@ -3,7 +3,7 @@
 import { paint, png } from "./canvas.js";
 import { AvatarError } from "./core.js";
 import { FaceDriver } from "./drive.js";
-import { idle, mix, multiply, orbit, recorded, rotation } from "./motion.js";
+import { blended, idle, multiply, orbit, recorded, rotation } from "./motion.js";
 import { Settings } from "./settings.js";
 import { WebglRenderer, hasRealGpu } from "./webgl_renderer.js";
 
@@ -16,7 +16,7 @@ const LEAST_SIDE = 32, MOST_SIDE = 4096; // pixels
 export class AvatarView extends EventTarget {
   /**
    * @param canvas  where to draw
-   * @param parts   { worker: Worker, wasm: ArrayBuffer, file: ArrayBuffer }
+   * @param parts   { worker: Worker, wasm: ArrayBuffer, perhaps gzip's, file: ArrayBuffer }
    * @param options { renderer: "auto" | "wasm" | "webgl", still: boolean }
    */
   constructor(canvas, parts, options = {}) {
@@ -24,15 +24,16 @@ export class AvatarView extends EventTarget {
     this.canvas = canvas;
     this.options = { renderer: "auto", still: false, ...options };
     this.view = { yaw: 0, pitch: 0, zoom: 1 };
+    this.background = null; // red, green and blue from 0 to 1; null for those of training
     this.statistics = { milliseconds: 0, framesPerSecond: 0 };
     this.#worker = parts.worker;
     this.#worker.onmessage = ({ data }) => this.#receive(data);
     this.#worker.onerror = () => this.#fail("The drawing worker could not be started in this browser.");
-    const kind = this.options.renderer;
-    this.#wantsGpu = kind === "webgl" || (kind === "auto" && hasRealGpu());
     /** Resolves with the avatar's header when it can be drawn. */
     this.ready = new Promise((resolve, reject) => (this.#settle = { resolve, reject }));
     this.#worker.postMessage({ type: "load", wasm: parts.wasm, file: parts.file });
+    const kind = this.options.renderer; // while the worker loads
+    this.#wantsGpu = kind === "webgl" || (kind === "auto" && hasRealGpu());
   }
 
   #worker;
@@ -76,13 +77,16 @@ export class AvatarView extends EventTarget {
     return this.#source.kind === "recorded" && !this.#source.paused;
   }
 
-  /** Whether a picture is being drawn. */
   get isBusy() {
-    return this.#inFlight;
+    return this.#inFlight; // a picture is being drawn
   }
 
   get frameCount() {
     return this.#core ? this.#core.poses.length / 12 : 0;
+  }
+
+  get parameters() {
+    return this.#pose?.parameters; // what is shown, in the order of `header.rest`
   }
 
   /** Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); returns unknown names. */
@@ -90,7 +94,7 @@ export class AvatarView extends EventTarget {
     return this.#settings.setExpression(values);
   }
 
-  /** Jaw, gaze and neck as rotation vectors in radians, lids from 0 (open) to 1; `head`: [yaw, pitch] in degrees. */
+  /** Jaw, gaze and neck as rotation vectors in radians, lids from 0 (open) to 1; `head`: [yaw, pitch] in degrees; null lets go. */
   setPose(pose) {
     this.#settings.setPose(pose);
   }
@@ -209,12 +213,10 @@ export class AvatarView extends EventTarget {
       return resolve(png(canvas));
     }
     this.#inFlight = false;
-    const { camera, width, height } = this.#shown;
+    const { camera, width, height, background } = this.#shown;
     if (data.type === "gaussians") {
-      this.#gpu.draw(data.values, camera, width, height, this.header.background, this.header.blur);
-    } else {
-      paint(this.canvas, this.#context, data.values, width, height);
-    }
+      this.#gpu.draw(data.values, camera, width, height, background, this.header.blur);
+    } else paint(this.canvas, this.#context, data.values, width, height);
     this.#count(data.milliseconds);
     this.dispatchEvent(new CustomEvent("drawn", { detail: { taken: this.#shown.taken } }));
   }
@@ -243,11 +245,10 @@ export class AvatarView extends EventTarget {
   }
 
   #request(now) {
-    const { header } = this, pose = this.#current(now), base = { ...header.camera };
-    if (pose.rotation) Object.assign(base, { rotation: pose.rotation, translation: pose.translation });
-    const [yaw, pitch] = [0, 1].map((i) => (pose.turn?.[i] ?? 0) + this.#settings.turned[i]);
+    const { header } = this, pose = this.#current(now), base = { ...header.camera, rotation: pose.rotation, translation: pose.translation };
+    const [yaw, pitch] = [0, 1].map((i) => pose.turn[i] + this.#settings.turned[i]);
     base.rotation = multiply(base.rotation, rotation([(pitch * Math.PI) / 180, (yaw * Math.PI) / 180, 0]));
-    const { parameters } = pose, { view } = this, key = JSON.stringify([Array.from(parameters), base, view]);
+    const { parameters } = pose, { view, background } = this, key = JSON.stringify([Array.from(parameters), base, view, background]);
     if (key !== this.#shown?.key) this.#changed = now;
     const width = now - this.#changed < STILL_AFTER ? this.#width.moving : this.#width.still;
     if (key === this.#shown?.key && width === this.#shown.width) return; // nothing has changed
@@ -259,7 +260,7 @@ export class AvatarView extends EventTarget {
 
   /** What the worker draws. */
   #frame({ parameters, base, view }, width) {
-    const height = Math.max(1, Math.round(width / base.aspect)), { background } = this.header;
+    const height = Math.max(1, Math.round(width / base.aspect)), background = this.background ?? this.header.background;
     return { type: "frame", parameters, camera: orbit(base, view, width), width, height, background };
   }
 
@@ -275,11 +276,10 @@ export class AvatarView extends EventTarget {
       pose = idle(header, seconds, source.kind === "rest" || source.paused);
     }
     const since = this.#previous ? (now - this.#previous.since) / 1000 : Infinity;
-    let parameters = Float32Array.from(pose.parameters);
-    if (since < BLEND_SECONDS) parameters = mix(this.#previous.pose.parameters, parameters, Math.max(since, 0) / BLEND_SECONDS);
-    this.#settings.apply(parameters);
-    this.#pose = { ...pose, parameters };
-    return this.#pose;
+    pose = { ...header.camera, turn: [0, 0], ...pose, parameters: Float32Array.from(pose.parameters) };
+    if (since < BLEND_SECONDS) Object.assign(pose, blended(this.#previous.pose, pose, Math.max(since, 0) / BLEND_SECONDS));
+    this.#settings.apply(pose.parameters);
+    return (this.#pose = pose);
   }
 
   #count(milliseconds) {

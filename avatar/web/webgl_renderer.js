@@ -56,7 +56,7 @@ void main() {
 
 /** Whether a real GPU draws for WebGL2 here: a processor that pretends is slower than our own module. */
 export function hasRealGpu(canvas = document.createElement("canvas")) {
-  const gl = canvas.getContext("webgl2");
+  const gl = canvas.getContext("webgl2", { failIfMajorPerformanceCaveat: true });
   if (!gl) return false;
   const info = gl.getExtension("WEBGL_debug_renderer_info");
   const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);

@@ -6,7 +6,8 @@ let core;
 self.onmessage = async ({ data }) => {
   try {
     if (data.type === "load") {
-      core = await AvatarCore.load(data.wasm, await unpack(data.file));
+      const isPacked = new Uint8Array(data.wasm)[0] === 0x1f; // gzip's first byte
+      core = await AvatarCore.load(...(await Promise.all([isPacked ? unpack(data.wasm) : data.wasm, unpack(data.file)])));
       const { header, motion, poses } = core;
       self.postMessage({ type: "ready", header, motion, poses });
     } else {

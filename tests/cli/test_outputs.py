@@ -52,7 +52,7 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
     ],
     "drive-file {data} --tracking {tracking}": [("{tracking}/motion.npz", IN_INPUT)],
     "reenact {run} --driver {motion}": [
-        ("{motion}", "a video is written as .mp4 or .mov or .mkv, not as {motion}"),
+        ("{motion}", "a video is written as .mp4 or .mov or .mkv or .webm or .png, not as {motion}"),
         ("{tmp}/smile.mp4", "{tmp}/smile.distances.csv " + IS_INPUT),
         ("{tmp}/linked.mp4", "{tmp}/linked.distances.csv " + IS_INPUT),
         ("{run}/avatar.safetensors", "a video is written as"),
@@ -125,7 +125,7 @@ REFUSED_PLACES = {
     ],
 }
 # These write only under names of their own in the run that they are given, or nothing.
-WITHOUT_A_CHOICE = {"eval", "report", "doctor", "models", "view", "send"}
+WITHOUT_A_CHOICE = {"eval", "report", "doctor", "models", "view", "send", "completion"}
 CASES = [
     *((f"{words} --out {out}", sentence) for words, outputs in REFUSED.items() for out, sentence in outputs),
     *((f"{words} {out}", sentence) for words, outputs in REFUSED_PLACES.items() for out, sentence in outputs),

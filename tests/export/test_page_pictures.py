@@ -16,6 +16,7 @@ from browsers import WEB, chromium
 from lively import lively_avatar, psnr
 from pages import until
 
+from avatar.export.stage import faded, front_camera
 from avatar.export.web_page import write_page
 from avatar.runs.trained import TrainedAvatar
 
@@ -47,6 +48,7 @@ def opened(browser: Any, address: str, density: float = 1.0) -> Any:
     )
     page.goto(address)
     page.locator("#message").wait_for(state="hidden", timeout=20000)
+    page.evaluate("avatar.background = null")  # that of training
     return page
 
 
@@ -62,7 +64,7 @@ def test_a_saved_picture_is_drawn_anew_with_1024_pixels(
     download.value.save_as(tmp_path / "someone.png")
     saved = iio.imread(tmp_path / "someone.png")
     assert saved.shape[:2] == (1024, 1024) and page.evaluate("avatar.canvas.width") == 64
-    expected = trained.render(trained.rest_params(), trained.rest_camera(1024)).image.clamp(0, 1)
+    expected = faded(trained).render(trained.rest_params(), front_camera(trained, 1024)).image.clamp(0, 1)
     assert psnr(torch.from_numpy(saved[..., :3].astype(np.float32) / 255), expected) > 40
     page.close()
 

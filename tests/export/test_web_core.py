@@ -16,6 +16,7 @@ from browsers import WEB, node
 from lively import lively_avatar, psnr
 
 from avatar.errors import UserError
+from avatar.export.stage import faded
 from avatar.export.web_page import write_web_avatar
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
@@ -81,7 +82,8 @@ def pictures_of_node(trained: TrainedAvatar, folder: Path) -> torch.Tensor:
 
 
 def drawn_here(trained: TrainedAvatar) -> torch.Tensor:
-    images = torch.stack([trained.render(*frame).image for frame in chosen_frames(trained)])
+    exported = faded(trained)
+    images = torch.stack([exported.render(*frame).image for frame in chosen_frames(trained)])
     return (images.clamp(0, 1) * 255).round() / 255
 
 

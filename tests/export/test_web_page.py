@@ -15,6 +15,7 @@ from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
 from pages import shown, until
 
+from avatar.export.stage import faded, front_camera
 from avatar.export.web_page import bundle, script_text, write_page, write_web_avatar
 from avatar.motion.controls import expression_controls, joint_ranges, posed
 from avatar.motion.orbit import orbited
@@ -45,6 +46,11 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 
 @pytest.fixture(scope="module")
+def drawn(trained: TrainedAvatar) -> TrainedAvatar:
+    return faded(trained)
+
+
+@pytest.fixture(scope="module")
 def page_file(trained: TrainedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_page(trained, tmp_path_factory.mktemp("page") / "someone.html", "float").path
 
@@ -61,7 +67,9 @@ def opened(browser: Any, page_file: Path) -> Iterator[Any]:
     page.on("request", lambda request: None if request.url.startswith(local) else wrong.append(request.url))
     page.goto(f"{page_file.as_uri()}?width=64")
     page.locator("#message").wait_for(state="hidden", timeout=20000)
+    page.evaluate("avatar.background = null")  # that of training
     until(page, "avatar.canvas.width === 64")
+    page.evaluate(NEW_PICTURE)
     yield page
     assert not [words for words in wrong if "GPU stall" not in words]  # a note of the software renderer
     context.close()
@@ -74,18 +82,18 @@ def after(page: Any, script: str) -> torch.Tensor:
 
 
 @pytest.mark.chromium
-def test_the_page_shows_what_the_program_draws(opened: Any, trained: TrainedAvatar) -> None:
-    rest, camera = trained.rest_params(), trained.rest_camera(64)
-    assert psnr(shown(opened), trained.render(rest, camera).image.clamp(0, 1)) > 45
+def test_the_page_shows_what_the_program_draws(opened: Any, trained: TrainedAvatar, drawn: TrainedAvatar) -> None:
+    rest, camera = trained.rest_params(), front_camera(trained, 64)
+    assert psnr(shown(opened), drawn.render(rest, camera).image.clamp(0, 1)) > 45
     low, high = opened.evaluate("[avatar.limits.yaw[0], avatar.limits.pitch[1]]")
     turned = after(opened, "avatar.look({ yaw: -999, pitch: 999, zoom: 1.5 })")
-    expected = trained.render(rest, orbited(camera, low, high, 1.5)).image.clamp(0, 1)
+    expected = drawn.render(rest, orbited(camera, low, high, 1.5)).image.clamp(0, 1)
     assert psnr(turned, expected) > 45 and psnr(turned, shown(opened)) > 60
     assert opened.locator("#guess").is_visible(), "so far round the avatar guesses, and the page says so"
 
 
 @pytest.mark.chromium
-def test_a_slider_moves_the_face_as_in_the_program(opened: Any, trained: TrainedAvatar) -> None:
+def test_a_slider_moves_the_face_as_in_the_program(opened: Any, trained: TrainedAvatar, drawn: TrainedAvatar) -> None:
     before = shown(opened)
     control = expression_controls(
         trained.recording.tracks["expression"][list(trained.recording.split.train)],
@@ -97,18 +105,19 @@ def test_a_slider_moves_the_face_as_in_the_program(opened: Any, trained: Trained
     slider.fill(str(control.high))
     opened.evaluate(NEW_PICTURE)
     value = float(slider.input_value())
-    expected = trained.render(posed(trained.rest_params(), {control: value}, {}), trained.rest_camera(64)).image.clamp(
+    expected = drawn.render(posed(trained.rest_params(), {control: value}, {}), front_camera(trained, 64)).image.clamp(
         0, 1
     )
     moved = shown(opened)
     assert psnr(moved, before) < 40 and psnr(moved, expected) > 45
     opened.get_by_role("button", name="Reset").click()
+    opened.evaluate("avatar.background = null")
     opened.evaluate(NEW_PICTURE)
     assert psnr(shown(opened), before) > 60 and float(slider.input_value()) == 0.0
 
 
 @pytest.mark.chromium
-def test_joints_move_as_in_the_program(opened: Any, trained: TrainedAvatar) -> None:
+def test_joints_move_as_in_the_program(opened: Any, trained: TrainedAvatar, drawn: TrainedAvatar) -> None:
     ranges = joint_ranges([trained.recording.params(i) for i in trained.recording.split.train])
     assert {"jaw", "left_lid", "look_left"} <= set(ranges)
     opened.evaluate("document.querySelectorAll('details').forEach(box => (box.open = true))")
@@ -116,18 +125,18 @@ def test_joints_move_as_in_the_program(opened: Any, trained: TrainedAvatar) -> N
         opened.locator(f'input[name="{label}"]').fill(str(ranges[name][1]))
     opened.evaluate(NEW_PICTURE)
     joints = {name: ranges[name][1] for name in ("jaw", "left_lid", "look_left")}
-    expected = trained.render(posed(trained.rest_params(), None, joints), trained.rest_camera(64)).image.clamp(0, 1)
+    expected = drawn.render(posed(trained.rest_params(), None, joints), front_camera(trained, 64)).image.clamp(0, 1)
     assert psnr(shown(opened), expected) > 45
 
 
 @pytest.mark.chromium
-def test_the_recorded_motion_plays_and_is_scrubbed(opened: Any, trained: TrainedAvatar) -> None:
+def test_the_recorded_motion_plays_and_is_scrubbed(opened: Any, trained: TrainedAvatar, drawn: TrainedAvatar) -> None:
     recording = trained.recording
     last = recording.split.test[-1]
     scrub = opened.locator("#scrub")
     scrub.fill(scrub.get_attribute("max"))
     opened.evaluate(NEW_PICTURE)
-    expected = trained.render(recording.params(last), recording.camera(last, 64)).image.clamp(0, 1)
+    expected = drawn.render(recording.params(last), recording.camera(last, 64)).image.clamp(0, 1)
     assert psnr(shown(opened), expected) > 45
     button = opened.locator("#play")
     assert button.inner_text() == "Play"
@@ -158,21 +167,24 @@ def test_keys_mouse_and_wheel_turn_the_head(opened: Any) -> None:
     yaw, pitch, zoom = opened.evaluate(view)
     assert yaw == pytest.approx(70 * 40 / box["width"], rel=0.05) and abs(pitch) < 0.2 and zoom > 1.2
     assert canvas.get_attribute("role") == "img" and "arrow keys" in canvas.get_attribute("aria-label")
-    name = "(e.ariaLabel || e.labels?.[0]?.innerText || e.innerText)"
+    name = "(e.ariaLabel || e.labels?.[0]?.innerText || e.textContent)"
     unnamed = f"Array.from(document.querySelectorAll('input,button')).filter(e => !{name})"
     assert opened.evaluate(f"{unnamed}.length") == 0
 
 
 @pytest.mark.chromium
-def test_webgl_draws_the_same_pictures(browser: Any, page_file: Path, trained: TrainedAvatar) -> None:
+def test_webgl_draws_the_same_pictures(
+    browser: Any, page_file: Path, trained: TrainedAvatar, drawn: TrainedAvatar
+) -> None:
     page = browser.new_page(reduced_motion="reduce")
     page.goto(f"{page_file.as_uri()}?width=64&renderer=webgl")
     page.locator("#message").wait_for(state="hidden", timeout=20000)
     assert page.evaluate("avatar.renderer") == "webgl"
+    page.evaluate("avatar.background = null")
     recording, test = trained.recording, trained.recording.split.test
     for k, i in enumerate(list(test)[:20]):
         picture = after(page, f"avatar.seek({k} / avatar.header.fps)")
-        expected = trained.render(recording.params(i), recording.camera(i, 64)).image.clamp(0, 1)
+        expected = drawn.render(recording.params(i), recording.camera(i, 64)).image.clamp(0, 1)
         assert psnr(picture, expected) > 40, f"frame {i}"
     page.close()
 
@@ -219,7 +231,9 @@ def test_a_damaged_page_says_a_sentence(browser: Any, page_file: Path, tmp_path:
 
 
 @pytest.mark.chromium
-def test_the_element_in_a_page_of_ones_own(browser: Any, trained: TrainedAvatar, tmp_path: Path) -> None:
+def test_the_element_in_a_page_of_ones_own(
+    browser: Any, trained: TrainedAvatar, drawn: TrainedAvatar, tmp_path: Path
+) -> None:
     shutil.copytree(WEB, tmp_path / "avatar-view")
     write_web_avatar(trained, tmp_path / "someone.avatar", "float")
     (tmp_path / "broken.avatar").write_bytes(b"not an avatar")
@@ -234,7 +248,7 @@ def test_the_element_in_a_page_of_ones_own(browser: Any, trained: TrainedAvatar,
         page.evaluate("window.avatar = document.querySelector('avatar-view').view")
         page.evaluate("avatar.resize(64), avatar.release(), avatar.play('rest')")
         page.wait_for_timeout(600)
-        expected = trained.render(trained.rest_params(), trained.rest_camera(64)).image.clamp(0, 1)
+        expected = drawn.render(trained.rest_params(), front_camera(trained, 64)).image.clamp(0, 1)
         assert psnr(shown(page), expected) > 45
         assert page.evaluate("avatar.setExpression({ nobody: 1, 0: 0.5 })") == ["nobody"]
         said = page.evaluate(

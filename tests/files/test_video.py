@@ -57,7 +57,7 @@ def test_refusals(tmp_path: Path) -> None:
         write_video(path, iter(()), fps=25)
     with pytest.raises(UserError, match=r"clip\.mp4 cannot hold a frame of 40x32 pixels after frames of 32x32"):
         write_video(path, [*gradients(1, 32, 32), *gradients(1, 32, 40)], fps=25)
-    with pytest.raises(ValueError, match=r"must be uint8 \[H, W, 3\], got float64 \[32, 32, 3\]"):
+    with pytest.raises(ValueError, match=r"must be uint8 \[H, W, 3\] or \[H, W, 4\], got float64 \[32, 32, 3\]"):
         write_video(path, [np.zeros((32, 32, 3))], fps=25)
     assert list(tmp_path.iterdir()) == []
 

@@ -1,0 +1,85 @@
+"""How a page shows an avatar at first: from the front, in the middle, its neck faded into the background."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avatar.head.assets import JOINT_NAMES
+from avatar.model import FlashAvatar
+from avatar.motion.orbit import EDGE, orbited, seen_from
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import Camera
+
+DEPTH = 8.0
+LEAST_OPACITY = 1e-6
+LEAST = 0.01  # metres over which it fades
+PIXELS = 128  # width of the picture in which the neck's end is looked for
+
+
+@torch.no_grad()
+def faded(trained: TrainedAvatar) -> TrainedAvatar:
+    """The avatar with a neck that fades."""
+    avatar = copy.deepcopy(trained.avatar)
+    kept = torch.sigmoid(avatar.opacity_logits) * neck_fade(trained)
+    avatar.opacity_logits.copy_(torch.logit(kept, LEAST_OPACITY))
+    return replace(trained, avatar=avatar)
+
+
+@torch.no_grad()
+def neck_fade(trained: TrainedAvatar) -> Float[Tensor, " G"]:
+    """The share of its opacity that each Gaussian keeps: 1 from the chin upwards, 0 where the neck ends.
+
+    -ln(1 - s (1 - e^-D)) / D, so that the share of the light that DEPTH = D layers of Gaussians stop is s = 3t^2 - 2t^3 of
+    the height t in the neutral head, 0 where the neck ends and 1 at the chin.
+    """
+    model = cast(FlashAvatar, trained.avatar)
+    embedding = model.embedding
+    heights = (model.mesh.neutral_vertices()[embedding.corners, 1] * embedding.barycentric).sum(dim=1)
+    end, chin = neck(trained)
+    t = ((heights - end) / max(chin - end, 1e-6)).clamp(0, 1)
+    s = t * t * (3 - 2 * t)
+    return -torch.log1p(-s * (1 - math.exp(-DEPTH))) / DEPTH
+
+
+def front_camera(trained: TrainedAvatar, size: int | None = None) -> Camera:
+    """The lens and distance of `rest_camera`, from the front, as far as training shows it; the head is upright, and in the
+    middle together with half of its neck."""
+    top = float(trained.avatar.head.neutral_vertices()[:, 1].max())
+    return _from_the_front(trained, (top + sum(neck(trained)) / 2) / 2, size)
+
+
+@torch.no_grad()
+def neck(trained: TrainedAvatar) -> tuple[float, float]:
+    """Heights in the neutral head, metres: where the neck is seen to end, perhaps above the mesh's edge, and the chin."""
+    heights = trained.avatar.head.neutral_vertices()[:, 1]
+    moved = heights[trained.assets.weights[:, JOINT_NAMES.index("jaw")] > 0.5]
+    low = float(heights.min())
+    chin = float(moved.min()) if len(moved) else low
+    camera = _from_the_front(trained, chin, PIXELS)
+    middle = trained.render(trained.rest_params(), camera).alpha[
+        :, round(camera.width * 0.45) : round(camera.width * 0.55)
+    ]
+    rows = middle.mean(dim=1)
+    lowest = float((rows >= rows.max() / 2).nonzero().max()) + 1
+    end = chin - (lowest - camera.height / 2) / camera.fy * float(camera.t_cam_world[2])
+    return max(min(end, chin - LEAST), low), chin
+
+
+def _from_the_front(trained: TrainedAvatar, height: float, size: int | None) -> Camera:
+    """A camera with a height of the head, metres, in the middle of the picture."""
+    camera, recording = trained.rest_camera(size), trained.recording
+    frames = [seen_from(recording.camera(i)) for i in recording.split.train]
+    low, high = np.percentile(np.array(frames), [EDGE, 100 - EDGE], axis=0)
+    yaw, elevation = np.clip(0.0, low, high).tolist()
+    turned = orbited(replace(camera, R_cam_world=torch.diag(torch.tensor([1.0, -1.0, -1.0]))), -yaw, elevation)
+    shift_x, shift_y = (camera.width / 2 - camera.cx) / camera.fx, (camera.height / 2 - camera.cy) / camera.fy
+    before = torch.tensor([shift_x, shift_y, 1.0]) * float(camera.t_cam_world[2])
+    return replace(turned, t_cam_world=before - turned.R_cam_world @ torch.tensor([0.0, height, 0.0]))

@@ -1,0 +1,63 @@
+"""What lies behind an avatar in a reenactment: a colour, a picture, or nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avatar.data.background import COLOURS, parse_colour
+from avatar.data.images import read_image
+from avatar.errors import UserError
+from avatar.types import Rendering
+
+TRANSPARENT = "transparent"
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    name: str  # as it was asked for
+    behind: Float[Tensor, "*size 3"] | None  # a colour [3] or a picture [H, W, 3] in [0, 1]; None: transparent
+
+    def pixels(self, rendering: Rendering, trained: Float[Tensor, 3]) -> UInt8[np.ndarray, "H W C"]:
+        """The rendering in place of over the colour `trained`: image + (1 - alpha) (behind - trained). RGB, or RGBA with
+        straight alpha where nothing lies behind."""
+        image, alpha = rendering.image.detach().cpu(), rendering.alpha.detach().cpu()[..., None]
+        if self.behind is None:
+            head = (image - (1 - alpha) * trained) / alpha.clamp(min=1e-3)
+            return _bytes(torch.cat((head, alpha), dim=-1))
+        behind = self.behind if self.behind.ndim == 1 else _covering(self.behind, image.shape[0], image.shape[1])
+        return _bytes(image + (1 - alpha) * (behind - trained))
+
+
+def parse_backdrop(word: str) -> Backdrop:
+    """What --background names. Raises UserError for what is neither a colour nor a picture."""
+    if word == TRANSPARENT:
+        return Backdrop(word, None)
+    try:
+        return Backdrop(word, torch.tensor(parse_colour(word)))
+    except ValueError:
+        path = Path(word)
+    if not path.is_file():
+        raise UserError(f"--background is {TRANSPARENT}, {', '.join(COLOURS)}, #rrggbb or a picture, not {word}")
+    return Backdrop(word, torch.from_numpy(read_image(path)) / 255.0)
+
+
+def _covering(picture: Float[Tensor, "H W 3"], height: int, width: int) -> Float[Tensor, "height width 3"]:
+    """The middle of a picture that is scaled to cover a frame."""
+    scale = max(height / picture.shape[0], width / picture.shape[1])
+    size = max(round(picture.shape[1] * scale), width), max(round(picture.shape[0] * scale), height)
+    scaled = torch.from_numpy(
+        cv2.resize(picture.numpy(), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    )
+    top, left = (size[1] - height) // 2, (size[0] - width) // 2
+    return scaled[top : top + height, left : left + width]
+
+
+def _bytes(values: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
+    return (values.clamp(0.0, 1.0) * 255.0).round().byte().numpy()

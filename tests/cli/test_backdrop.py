@@ -1,0 +1,107 @@
+"""`avatar reenact --background`, and the driver's sound."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from command_line import avatar
+from lively import lively_run
+
+from avatar.files.video import Sound, write_video
+from avatar.pipeline.backdrop import parse_backdrop
+from avatar.runs.trained import load_avatar
+
+FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
+
+
+@pytest.fixture(scope="module")
+def run(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lively_run(tracked_folder, tmp_path_factory.mktemp("runs") / "run", "model.uv_size=16")
+
+
+@pytest.fixture(scope="module")
+def drive(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("drive") / "drive.npz"
+    avatar("drive-file", tracked_folder, "--out", file)
+    return file
+
+
+def decoded(video: Path, layout: str, *options: str) -> np.ndarray:
+    """The first frame's bytes."""
+    words = [
+        FFMPEG,
+        "-loglevel",
+        "error",
+        *options,
+        "-i",
+        str(video),
+        "-frames:v",
+        "1",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        layout,
+        "-",
+    ]
+    done = subprocess.run(words, capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, len(layout))
+
+
+def test_what_lies_behind(run: Path, tracked_folder: Path, tmp_path: Path) -> None:
+    trained = load_avatar(run, tracked_folder / "head_model")
+    rendering = trained.render(trained.rest_params())
+    alpha = rendering.alpha[..., None]
+    red = torch.from_numpy(parse_backdrop("red").pixels(rendering, trained.background)) / 255
+    expected = rendering.image + (1 - alpha) * (torch.tensor([1.0, 0.0, 0.0]) - trained.background)
+    assert (red - expected.clamp(0, 1)).abs().max() < 0.003
+    straight = torch.from_numpy(parse_backdrop("transparent").pixels(rendering, trained.background)) / 255
+    back = straight[..., :3] * straight[..., 3:] + (1 - straight[..., 3:]) * trained.background
+    assert (back - rendering.image.clamp(0, 1)).abs().max() < 0.02
+    picture = np.zeros((40, 400, 3), np.uint8)
+    picture[:, 150:250] = (10, 200, 30)  # blue, green, red
+    cv2.imwrite(str(tmp_path / "wide.png"), picture)
+    over = parse_backdrop(str(tmp_path / "wide.png")).pixels(rendering, trained.background)
+    assert over.shape == (*rendering.alpha.shape, 3)
+    corner, middle = over[0, 0].astype(int), over[0, over.shape[1] // 2].astype(int)
+    assert abs(middle - [30, 200, 10]).max() < 4 or abs(corner - [30, 200, 10]).max() < 4, "the middle covers the frame"
+
+
+@pytest.mark.parametrize(("suffix", "options"), [(".mov", ()), (".webm", ("-c:v", "libvpx-vp9"))])
+def test_a_transparent_video_has_alpha(
+    suffix: str, options: tuple[str, ...], run: Path, drive: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / f"a{suffix}"
+    avatar("reenact", run, drive, "--background", "transparent", "--out", out)
+    alpha = decoded(out, "rgba", *options)[:, 3]
+    assert alpha.min() < 10 and alpha.max() > 100
+
+
+def test_pictures_and_refusals(run: Path, drive: Path, tmp_path: Path) -> None:
+    avatar("reenact", run, drive, "--background", "transparent", "--out", tmp_path / "a.png")
+    pictures = sorted(tmp_path.glob("a-*.png"))
+    assert pictures[0].name == "a-00000.png" and len(pictures) > 1
+    assert cv2.imread(str(pictures[0]), cv2.IMREAD_UNCHANGED).shape[2] == 4
+    refused = avatar("reenact", run, drive, "--background", "transparent", "--out", tmp_path / "a.mp4", status=1)
+    assert "a transparent video is written as .mov or .webm or .png" in refused
+    assert "not nothing.jpg" in avatar("reenact", run, drive, "--background", "nothing.jpg", status=1)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_sound_goes_along_and_changes_no_length(suffix: str, tmp_path: Path) -> None:
+    beep, frames = tmp_path / "beep.wav", [np.full((32, 32, 3), 20 * k, np.uint8) for k in range(10)]
+    words = [FFMPEG, "-loglevel", "error", "-f", "lavfi", "-i", "sine=frequency=440:duration=0.5", str(beep)]
+    subprocess.run(words, check=True)
+    for source in (beep, beep_free := tmp_path / "silent.mp4"):
+        if source == beep_free:
+            write_video(beep_free, frames, 10.0)
+        out = tmp_path / f"{source.stem}-out{suffix}"
+        write_video(out, frames, 10.0, Sound(source, 0.2, 1.0))
+        count, _ = imageio_ffmpeg.count_frames_and_secs(str(out))
+        said = subprocess.run([FFMPEG, "-hide_banner", "-i", str(out)], capture_output=True, text=True).stderr
+        assert count == 10 and ("Audio:" in said) == (source == beep)

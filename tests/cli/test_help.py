@@ -1,0 +1,74 @@
+"""What the program says before it does anything: groups of commands, completions, a plan and a configuration."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from command_line import avatar
+
+from avatar.commands.groups import GROUPS
+from avatar.commands.parser import build_parser
+from avatar.config import load_config
+
+
+def test_every_command_is_in_one_group_with_an_example() -> None:
+    _, commands = build_parser()
+    named = [name for group in GROUPS.values() for name in group]
+    assert sorted(named) == sorted(set(commands) - {"sweep-job"})
+    overview = avatar("--help")
+    for group in GROUPS.values():
+        for name, (meaning, example) in group.items():
+            assert meaning in overview and f"avatar {name} {example}".rstrip() in overview
+            said = " ".join(avatar(name, "--help").split())
+            assert f"example: avatar {name} {example}".rstrip() in said
+
+
+COMPLETE = """source {script}
+COMP_WORDS=({words}); COMP_CWORD=$(({count} - 1)); _avatar; echo "${{COMPREPLY[@]}}" """
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("avatar", "reen"), "reenact"),
+        (("avatar", "train", "--dry"), "--dry-run"),
+        (("avatar", "export", "--format", "web"), "web web-avatar"),
+        (("avatar", "train", "trainer.iter"), "trainer.iterations="),
+        (("avatar", "completion", "f"), "fish"),
+    ],
+)
+def test_bash_completes(words: tuple[str, ...], expected: str, tmp_path: Path) -> None:
+    script = tmp_path / "avatar.bash"
+    script.write_text(avatar("completion", "bash"))
+    typed = COMPLETE.format(script=script, words=" ".join(words), count=len(words))
+    done = subprocess.run(["bash", "-c", typed], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == expected and not done.stderr
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_get_theirs(shell: str, tmp_path: Path) -> None:
+    said = avatar("completion", shell)
+    assert {"zsh": "bashcompinit", "fish": "complete -c avatar"}[shell] in said and "dry-run" in said
+    if (found := shutil.which(shell)) is not None:
+        (tmp_path / "script").write_text(said)
+        subprocess.run([found, "-n", str(tmp_path / "script")], check=True)
+
+
+def test_a_dry_run_says_what_it_takes_and_writes_nothing(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = avatar("train", tracked_folder, "--dry-run", "trainer.iterations=20", "model.uv_size=16")
+    for fact in ("frames to train on", "about", "20 steps", "Memory", "Disk", "model.uv_size=16"):
+        assert fact in said
+    assert list(tmp_path.iterdir()) == []
+    assert "is a video" in avatar("train", (film := tmp_path / "a.mp4").touch() or film, "--dry-run", status=1)
+
+
+def test_the_printed_configuration_is_one_to_type() -> None:
+    asked = ["experiment=paper", "trainer.seed=3", "data.background=[0,0.5,1]"]
+    lines = avatar("train", "--print-config", *asked).splitlines()
+    assert "trainer.seed=3" in lines and load_config(lines) == load_config(asked)

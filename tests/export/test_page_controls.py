@@ -1,0 +1,239 @@
+"""What an exported page offers around the picture, in headless Chromium: each control does what it says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from browsers import chromium
+from lively import lively_avatar
+from pages import shown, until
+
+from avatar.export import stage
+from avatar.export.stage import front_camera, neck, neck_fade
+from avatar.export.web_page import write_page
+from avatar.runs.trained import TrainedAvatar
+
+CHANGED = "(name) => Math.abs(document.querySelector(`input[name='${name}']`).value - 0)"
+CONTRAST = """() => {
+  const luminance = (colour) => colour.match(/[\\d.]+/g).slice(0, 3).map(Number)
+    .map((c) => (c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+  const behind = (e) => {
+    for (; e; e = e.parentElement) {
+      const colour = getComputedStyle(e).backgroundColor;
+      if (!/, 0\\)$/.test(colour)) return colour;
+    }
+  };
+  const texts = Array.from(document.querySelectorAll("h1, p, label span, button, summary, output, kbd, legend"));
+  return texts.filter((e) => e.checkVisibility() && e.textContent.trim()).map((e) => {
+    const [a, b] = [getComputedStyle(e).color, behind(e)].map(luminance).sort((x, y) => y - x);
+    return [(a + 0.05) / (b + 0.05), e.textContent];
+  });
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
+    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run", "model.uv_size=20")
+
+
+@pytest.fixture(scope="module")
+def page_file(trained: TrainedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_page(trained, tmp_path_factory.mktemp("page") / "someone.html").path
+
+
+@pytest.fixture
+def visit(browser: Any, page_file: Path) -> Iterator[Any]:
+    """Opens the page with a query and with options of the browser's context."""
+    contexts, wrong = [], []
+
+    def visited(query: str = "", **options: Any) -> Any:
+        context = browser.new_context(offline=True, **{"viewport": {"width": 1100, "height": 760}, **options})
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.goto(f"{page_file.as_uri()}?width=64{query}")
+        page.locator("#message").wait_for(state="hidden", timeout=20000)
+        return page
+
+    yield visited
+    for context in contexts:
+        context.close()
+    assert not wrong
+
+
+@pytest.mark.chromium
+def test_it_opens_idle_from_the_front_on_a_stage_of_the_theme(visit: Any, trained: TrainedAvatar) -> None:
+    corners = {}
+    for scheme in ("light", "dark"):
+        page = visit(color_scheme=scheme)
+        assert page.evaluate("avatar.motion") == "idle"
+        assert page.evaluate("document.querySelector('.bar button').id") == "play", "Play is the first button"
+        until(page, "avatar.canvas.width === 64 && !avatar.isBusy")
+        corners[scheme] = float(shown(page)[0, 0].mean())
+    assert corners["light"] > 0.9 and corners["dark"] < 0.3
+    turn = page.evaluate("avatar.header.camera.rotation")
+    assert turn == pytest.approx(front_camera(trained).R_cam_world.flatten().tolist())
+    page.emulate_media(color_scheme="light")
+    until(page, "avatar.background[0] > 0.9")
+
+
+def test_the_head_is_upright_in_the_middle(trained: TrainedAvatar) -> None:
+    camera = front_camera(trained, 128)
+    assert camera.R_cam_world[0, 1].abs() < 1e-6, "no roll"
+    points = camera.project(trained.avatar.head.neutral_vertices())
+    x, y = points[:, 0], points[:, 1]
+    end, chin = neck(trained)
+    middle_of_neck = camera.project(torch.tensor([[0.0, (end + chin) / 2, 0.0]]))[0, 1]
+    assert float(x.mean()) == pytest.approx(64, abs=3)
+    assert float(y.min() + middle_of_neck) / 2 == pytest.approx(64, abs=3)
+
+
+def test_the_neck_fades_from_the_chin_to_its_end(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = neck(trained)
+    assert found[0] <= found[1], "this head's mesh ends at its chin"
+    embedding = trained.avatar.embedding
+    heights = (trained.avatar.head.neutral_vertices()[embedding.corners, 1] * embedding.barycentric).sum(dim=1)
+    end, chin = heights.quantile(torch.tensor([0.1, 0.6])).tolist()
+    monkeypatch.setattr(stage, "neck", lambda trained: (end, chin))
+    fade = neck_fade(trained)
+    assert (fade[heights <= end] == 0).all() and (fade[heights >= chin] > 0.999).all()
+    assert (fade[heights.argsort()].diff() >= 0).all()
+    half = fade[(heights - (end + chin) / 2).abs().argmin()]
+    assert 1 - (1 - float(half)) ** 8 == pytest.approx(0.5, abs=0.1), (
+        "eight layers stop half of the light in the middle"
+    )
+
+
+@pytest.mark.chromium
+@pytest.mark.parametrize("motion", ["reduce", "no-preference"])
+def test_presets_move_the_face_and_go_again(visit: Any, motion: str) -> None:
+    page = visit(reduced_motion=motion)
+    buttons = page.locator("#presets button")
+    assert set(buttons.all_inner_texts()) >= {"Smile", "Surprise", "Wink", "Talk"}
+    page.locator("summary", has_text="More").click()
+    page.get_by_role("button", name="Surprise").click()
+    until(page, f"({CHANGED})('Open mouth') > 0.01")
+    assert page.get_by_role("button", name="Surprise").get_attribute("aria-pressed") == "true"
+    page.get_by_role("button", name="Wink").click()
+    until(page, f"({CHANGED})('Eyes: left lid') > 0.3")
+    assert page.locator("#presets [aria-pressed=true]").all_inner_texts() == ["Wink"], "one at a time"
+    page.get_by_role("button", name="Wink").click()
+    until(page, "document.querySelectorAll('#presets [aria-pressed=true]').length === 0")
+    page.get_by_role("button", name="Talk").click()
+    until(page, f"({CHANGED})('Open mouth') > 0.01")
+    first = page.evaluate(f"({CHANGED})('Open mouth')")
+    until(page, f"Math.abs(({CHANGED})('Open mouth') - {first}) > 0.005")
+    page.locator("#play").click()
+    assert page.locator("#presets [aria-pressed=true]").count() == 0, "a motion takes over"
+
+
+@pytest.mark.chromium
+def test_a_first_slider_moves_both_sides_and_a_double_click_undoes_it(visit: Any) -> None:
+    page = visit(reduced_motion="reduce")
+    slider = page.locator("input[name='Close eyes']")
+    slider.fill(slider.get_attribute("max"))
+    page.locator("summary", has_text="More").click()
+    sides = [f"({CHANGED})('Eyes: {side} lid')" for side in ("left", "right")]
+    until(page, " && ".join(f"{side} > 0.3" for side in sides))
+    assert slider.evaluate("e => getComputedStyle(e).backgroundImage") != "none", "neutral is marked"
+    slider.dispatch_event("dblclick")
+    until(page, " && ".join(f"{side} < 0.01" for side in sides))
+    cut = "Array.from(document.querySelectorAll('.row span')).filter(e => e.scrollWidth > e.clientWidth)"
+    assert page.evaluate(f"{cut}.length") == 0, "labels are whole"
+
+
+@pytest.mark.chromium
+def test_sliders_and_time_follow_the_motion(visit: Any) -> None:
+    page = visit("&autoplay")
+    assert page.evaluate("avatar.isPlaying")
+    assert re.fullmatch(r"\d+:\d\d / \d+:\d\d", page.locator("#time").inner_text())
+    values = "Array.from(document.querySelectorAll('#first input'), e => Number(e.value)).join()"
+    before = page.evaluate(values)
+    until(page, f"{values} !== '{before}'")
+    slider = page.locator("input[name='Open mouth']")
+    page.evaluate("avatar.pause()")
+    page.wait_for_timeout(600)
+    p = page.evaluate(
+        "(() => { const j = avatar.header.sizes.expressions; return Array.from(avatar.parameters).slice(j, j + 6); })()"
+    )
+    jaw = float(torch.atan2(torch.tensor(-p[5]), torch.tensor(p[4])))
+    extent = float(slider.get_attribute("max")) - float(slider.get_attribute("min"))
+    assert float(slider.input_value()) == pytest.approx(jaw, abs=0.01 * extent)
+    still = visit("&autoplay", reduced_motion="reduce")
+    assert not still.evaluate("avatar.isPlaying"), "who wants stillness has it"
+
+
+@pytest.mark.chromium
+def test_eyes_follow_the_pointer_until_a_key_is_pressed(visit: Any) -> None:
+    page = visit()
+    gaze = "avatar.parameters[avatar.header.sizes.expressions + 6 + 2]"  # the sine of the angle to its left
+    box = page.locator("#canvas").bounding_box()
+    found = []
+    for share in (0.02, 0.98):
+        page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+        page.wait_for_timeout(1000)
+        found.append(page.evaluate(gaze))
+    assert found[1] - found[0] > 0.02
+    page.keyboard.press("e")
+    assert not page.locator("#gaze").is_checked()
+    page.mouse.move(box["x"] + 0.02 * box["width"], box["y"])
+    page.wait_for_timeout(300)
+    low = page.evaluate("avatar.header.joints.look_left[0]")
+    assert page.evaluate(gaze) > 0.9 * low or low > -0.06, "the pointer is let go of"
+    assert visit(reduced_motion="reduce").locator("#gaze").is_checked() is False
+
+
+@pytest.mark.chromium
+def test_background_full_screen_and_the_picture_alone(visit: Any) -> None:
+    page = visit(reduced_motion="reduce")
+    page.locator("#background").evaluate("e => { e.value = '#336699'; e.dispatchEvent(new Event('input')); }")
+    until(page, "!avatar.isBusy && avatar.background[0] === 0.2")
+    page.wait_for_timeout(200)
+    assert torch.allclose(shown(page)[0, 0], torch.tensor([0.2, 0.4, 0.6]), atol=0.01)
+    line = page.locator("#embed").input_value()
+    assert line.startswith('<iframe src="someone.html?noui&autoplay&background=%23336699"')
+    page.locator("#full").click()
+    until(page, "document.fullscreenElement?.id === 'stage'")
+    page.keyboard.press("Escape")
+    page.locator("#reset").click()
+    until(page, "avatar.background[0] > 0.9")
+    alone = visit("&noui&background=%23336699")
+    assert alone.evaluate("avatar.background") == [0.2, 0.4, 0.6]
+    assert not alone.locator("aside").is_visible() and not alone.locator("#play").is_visible()
+    assert alone.get_by_text("Synthetic", exact=True).is_visible()
+    assert alone.locator("#canvas").bounding_box()["height"] == 760
+
+
+@pytest.mark.chromium
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_have_contrast_and_controls_have_a_focus_ring(visit: Any, scheme: str) -> None:
+    page = visit(color_scheme=scheme, reduced_motion="reduce")
+    page.evaluate("document.querySelectorAll('details').forEach(box => (box.open = true))")
+    faint = [(round(ratio, 2), text) for ratio, text in page.evaluate(CONTRAST) if ratio < 4.5]
+    assert faint == []
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        width = page.evaluate("parseFloat(getComputedStyle(document.activeElement).outlineWidth)")
+        assert width >= 2, page.evaluate("document.activeElement.outerHTML")
+
+
+@pytest.mark.chromium
+def test_the_space_key_plays(visit: Any) -> None:
+    page = visit(reduced_motion="reduce")
+    page.locator("#canvas").focus()
+    page.keyboard.press(" ")
+    until(page, "avatar.isPlaying")
+    page.keyboard.press(" ")
+    assert not page.evaluate("avatar.isPlaying")

@@ -1,0 +1,53 @@
+"""Pictures by the names of what moves, and as files."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from lively import lively_avatar
+
+from avatar.errors import UserError
+from avatar.motion.controls import expression_controls, posed
+from avatar.motion.orbit import orbited
+from avatar.runs.trained import TrainedAvatar
+from avatar.types import Rendering
+
+
+@pytest.fixture(scope="module")
+def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
+    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run", "model.uv_size=16")
+
+
+def test_a_pose_is_named(trained: TrainedAvatar) -> None:
+    rest = trained.rest_params()
+    train = trained.recording.times(trained.recording.split.train)
+    control = expression_controls(trained.recording.tracks["expression"][train], rest.expression, trained.avatar.head)[
+        0
+    ]
+    name = control.name.replace(" ", "_")
+    picture = trained.pose(**{name: 0.5}, jaw=0.2, left_lid=1, yaw=8, pitch=-3, zoom=1.2, size=32)
+    expected = posed(rest, {control: 0.5}, {"jaw": 0.2, "left_lid": 1.0})
+    truth = trained.render(expected, orbited(trained.rest_camera(32), 8, -3, 1.2))
+    assert torch.equal(picture.image, truth.image) and picture.image.shape == (32, 32, 3)
+    both = f"{control.part}_{control.name}".replace(" ", "_")
+    assert torch.equal(trained.pose(**{both: 0.5}).image, trained.pose(**{name: 0.5}).image)
+    assert torch.equal(trained.pose().image, trained.render(rest).image)
+    with pytest.raises(UserError, match=f"this avatar has no ears; it has jaw, look_down.*{name}"):
+        trained.pose(ears=1)
+
+
+def test_pictures_as_bytes_and_files(trained: TrainedAvatar, tmp_path: Path) -> None:
+    rendering = trained.render(trained.rest_params())
+    values = rendering.numpy()
+    assert values.dtype == np.uint8
+    assert np.abs(values / 255 - rendering.image.clamp(0, 1).detach().numpy()).max() < 0.003
+    data = rendering.png(tmp_path / "a.png")
+    assert data == (tmp_path / "a.png").read_bytes() == rendering._repr_png_() == trained._repr_png_()
+    assert np.array_equal(iio.imread(io.BytesIO(data)), values)
+    with pytest.raises(ValueError, match="5 features are no picture"):
+        Rendering(torch.zeros(4, 4, 5), torch.zeros(4, 4)).png()
