@@ -42,7 +42,6 @@ from avatar.types import Camera, FeatureGaussians, Frame, HeadParams, Rendering
 FEATURES = 128  # of a point, which networks for colour and shape take
 NEAR, FAR = math.sqrt(0.1), math.sqrt(0.25)  # to the nearest landmark, half head lengths: what follows the expression
 SHIFT, CHANGE = 0.3, 0.2  # factors of the deformation, and of the changes of scale, rotation and opacity
-FAINTEST = 0.01  # alpha below which nothing of the person is drawn
 BEYOND = 2  # one Gaussian beyond the mesh for so many on it
 STEPS = 600_000  # published; with fewer steps all rates are higher, by the root of the ratio
 MOST_BOOST = 10.0
@@ -183,7 +182,7 @@ class GaussianHeadAvatar(Avatar):
         height, width, factor = camera.height, camera.width, self.config.upsampling
         alphas = small.alpha[None, None]
         alpha = interpolate(alphas, scale_factor=factor, mode="bilinear")[0, 0, :height, :width]
-        reached = max_pool2d((alphas > FAINTEST).float(), 3, stride=1, padding=1)  # the others show the background
+        reached = max_pool2d((alphas > 0).float(), 3, stride=1, padding=1)  # the others show the background
         reached = interpolate(reached, scale_factor=factor)[0, 0, :height, :width, None] > 0
         image = torch.where(reached, self.upsampler(small.image)[:height, :width], 1.0)
         return over(Rendering(image, alpha), background)
