@@ -16,7 +16,6 @@ Names       Raw and activated parameters differ in name: `log_scales` / `scales`
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -153,16 +152,13 @@ class Rendering(NamedTuple):
         """The image in 8 bits, 255 for 1 and above."""
         return (self.image.detach().cpu().clamp(0.0, 1.0) * 255.0).round().byte().numpy()
 
-    def png(self, path: Path | str | None = None) -> bytes:
-        """The image as a PNG file, which is also written to `path`, if any. Raises ValueError for features."""
+    def png(self) -> bytes:
+        """The image as a PNG file. Raises ValueError for features."""
         import cv2
 
         if self.image.shape[-1] != 3:
             raise ValueError(f"{self.image.shape[-1]} features are no picture")
-        data = cv2.imencode(".png", cv2.cvtColor(self.numpy(), cv2.COLOR_RGB2BGR))[1].tobytes()
-        if path is not None:
-            Path(path).write_bytes(data)
-        return data
+        return cv2.imencode(".png", cv2.cvtColor(self.numpy(), cv2.COLOR_RGB2BGR))[1].tobytes()
 
     def _repr_png_(self) -> bytes:
         return self.png()

@@ -41,7 +41,7 @@ AVATAR_MUTATIONS = [
         "right * tl.load(eyelid_directions",
         "left * tl.load(eyelid_directions",
     ),
-    Mutation("pose", "the neck does not carry the jaw", "x + t0 - u", "x - u"),
+    Mutation("pose", "the jaw does not follow the expression's shift of the neck", "x + t0 - u", "x - u"),
     Mutation(
         "pose",
         "coefficients that are not given hold what was there",

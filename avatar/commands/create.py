@@ -33,7 +33,6 @@ from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.dry_run import STEP
 from avatar.pipeline.refine_plan import plan_file, round_steps
 from avatar.pipeline.track import bar, head_for_video, tracking_lacks
 from avatar.pipeline.train_refined import is_begun
@@ -49,8 +48,9 @@ from data_prep.track.track import track
 
 ROUNDS = 1  # of refinement, by default
 STAGES = 4
-# Seconds on two cores, and bytes: docs/track.md and docs/refine.md (158 s of one thread for 1,000 frames).
+# Seconds on two cores, and bytes: docs/track.md, docs/train.md and docs/refine.md (158 s of one thread for 1,000 frames).
 TRACKING_FRAME, REFINED_FRAME, TRACKING_BYTES = 119 / 600, 0.158 / 2, 1.19e9
+STEP = {"cpu": 99 / 4000, "cuda": 16 / 4000}  # docs/gpu.md
 FRAME_SIDE = 512  # pixels, at most, of what is tracked
 
 

@@ -13,10 +13,11 @@ from avatar.pipeline import OK
 from avatar.pipeline.backdrop import parse_backdrop
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_driver
-from avatar.pipeline.reenact import PICTURES, Choices, reenact, sidecars
+from avatar.pipeline.reenact import PICTURES, Choices, first_picture, reenact, sidecars
 from avatar.pipeline.track import is_video, tracked_once
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained import TrainedAvatar
+from data_prep.formats.avatar_track import read_info
 
 
 def run_reenact(arguments: Namespace) -> int:
@@ -24,22 +25,25 @@ def run_reenact(arguments: Namespace) -> int:
     trained.avatar.to(choose_device(arguments.device or "auto", print))
     choices = Choices(**{field.name: getattr(arguments, field.name) for field in fields(Choices)})
     driver: Path = arguments.driver
-    out = arguments.out or default_video(arguments.run, driver, choices)
     backdrop = None if arguments.background is None else parse_backdrop(arguments.background)
     has_alpha = backdrop is not None and backdrop.behind is None
+    out = arguments.out or default_video(arguments.run, driver, choices, ".webm" if has_alpha else ".mp4")
     check_file(
         out,
         [*(ALPHA_SUFFIXES if has_alpha else VIDEO_SUFFIXES), PICTURES],
         "a transparent video" if has_alpha else "a video",
     )
-    inputs = [driver, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
-    check_outputs([out, *sidecars(out)], inputs)
+    behind = None if arguments.background is None else Path(arguments.background)
+    written = out if out.suffix.lower() != PICTURES else first_picture(out)
+    inputs = [driver, behind, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
+    check_outputs([written, *sidecars(out)], inputs)
     if driver.suffix.lower() in DRIVE_SUFFIXES:
         reenact(trained, open_drive_file(driver, trained), out, choices, backdrop=backdrop)
     else:
-        sound = driver if driver.is_file() else None
+        sound = None
         if is_video(driver):
-            driver = tracked_once(driver, head_of(arguments, trained), trained.assets)
+            video, driver = driver, tracked_once(driver, head_of(arguments, trained), trained.assets)
+            sound = (video, read_info(driver).source["begins"]) if video.is_file() else None
         reenact(trained, open_driver(driver, trained, arguments), out, choices, backdrop=backdrop, sound=sound)
     return OK
 
@@ -52,7 +56,7 @@ def head_of(arguments: Namespace, trained: TrainedAvatar) -> Path:
     return recorded if recorded is not None and recorded.exists() else trained.source
 
 
-def default_video(avatar: Path, driver: Path, choices: Choices) -> Path:
-    """RUN/reenact/DRIVER-TRANSFER.mp4; reenact/... in the current folder for an avatar that is a file alone."""
+def default_video(avatar: Path, driver: Path, choices: Choices, suffix: str) -> Path:
+    """RUN/reenact/DRIVER-TRANSFER.mp4, or so; reenact/... in the current folder for an avatar that is a file alone."""
     folder = avatar if (avatar / RUN_FILE).is_file() else Path()
-    return folder / "reenact" / f"{safe_name(driver.resolve().stem)}-{choices.transfer}.mp4"
+    return folder / "reenact" / f"{safe_name(driver.resolve().stem)}-{choices.transfer}{suffix}"

@@ -15,7 +15,7 @@ from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.files.names import safe_name
 from avatar.pipeline import OK
-from avatar.pipeline.dry_run import foretell
+from avatar.pipeline.dry_run import estimate_training
 from avatar.pipeline.open import at_new_place, source_of
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, plan_file
 from avatar.pipeline.track import head_for_video, is_video, tracked_once
@@ -33,7 +33,7 @@ def run_train(arguments: Namespace) -> int:
         return OK
     settle_paths(arguments)
     if arguments.dry_run:
-        return foretell_run(arguments)
+        return dry_run(arguments)
     run = arguments.out or default_run(arguments.folder)
     status = train_as_asked(run, arguments)
     print(f"Next         avatar eval {run}" if status == OK else "Add --resume to the same command to go on.")
@@ -75,18 +75,23 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
 def print_config(overrides: list[str]) -> None:
     """The configuration as overrides of itself."""
     for key, value in flatten(load_config(overrides).to_dict()).items():
-        print(f"{key}={shown(list(value) if isinstance(value, tuple) else value).replace(' ', '')}")
+        text = shown(list(value) if isinstance(value, tuple) else value)
+        print(f"{key}={text.replace(', ', ',') if isinstance(value, tuple) else text}")
 
 
-def foretell_run(arguments: Namespace) -> int:
+def dry_run(arguments: Namespace) -> int:
     """What a new run would take, and its configuration."""
     overrides = config_overrides(arguments)
     if arguments.resume:
         raise UserError("--dry-run is for a new run: leave --resume out")
     if is_video(arguments.folder):
         raise UserError(f"{arguments.folder} is a video: give the folder that avatar track writes of it to --dry-run")
+    if arguments.minutes is not None:
+        raise UserError("--minutes sets the time that --dry-run estimates: leave one of them out")
+    if arguments.refine is not None:
+        check_plan(arguments.refine, None)
     check_folder(arguments.folder)
-    status = foretell(source_of(arguments), overrides, arguments.refine or 0, arguments.device)
+    status = estimate_training(source_of(arguments), overrides, arguments.refine or 0, arguments.device)
     print_config(overrides)
     return status
 
@@ -108,14 +113,19 @@ def settle_paths(arguments: Namespace) -> None:
 
 def check_rounds(run: Path, rounds: int, minutes: float | None, overrides: list[str]) -> None:
     """Before a video is tracked. Raises UserError for a mistake, and where the folder holds a run, or rounds, already."""
-    if not 1 <= rounds <= MAX_ROUNDS:
-        raise UserError(f"--refine must be from 1 to {MAX_ROUNDS}, not {rounds}")
-    if minutes is not None and not 0.0 < minutes < float("inf"):
-        raise UserError(f"--minutes must be a positive number, not {minutes:g}")
+    check_plan(rounds, minutes)
     load_config(overrides)  # a mistake in it before one in the folder
     refuse_trained(run)
     if plan_file(run).exists():
         raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")
+
+
+def check_plan(rounds: int, minutes: float | None) -> None:
+    """Raises UserError for numbers out of range."""
+    if not 1 <= rounds <= MAX_ROUNDS:
+        raise UserError(f"--refine must be from 1 to {MAX_ROUNDS}, not {rounds}")
+    if minutes is not None and not 0.0 < minutes < float("inf"):
+        raise UserError(f"--minutes must be a positive number, not {minutes:g}")
 
 
 def refuse_changed_plan(run: Path, plan: Plan, arguments: Namespace, overrides: list[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -41,13 +42,15 @@ def path_camera(rest: Camera, limits: OrbitLimits, path: CameraPath, seconds: fl
 def along_path(
     trained: TrainedAvatar, clip: Clip, path: CameraPath, size: int | None = None
 ) -> Iterator[tuple[HeadParams, Camera]]:
-    """The clip's frames with the cameras of the path; "recorded" keeps the head's pose of each frame."""
+    """The clip's frames with the cameras of the path; "recorded" keeps the head's pose of each frame. On others,
+    which do not show it, the torso is at rest too."""
     if path == "recorded":
         yield from clip.frames
         return
     rest, limits = trained.rest_camera(size), limits_of(trained)
+    neck = trained.rest_params().neck
     for number, (params, _) in enumerate(clip.frames):
-        yield params, path_camera(rest, limits, path, number / clip.fps)
+        yield replace(params, neck=neck), path_camera(rest, limits, path, number / clip.fps)
 
 
 def write_movie(trained: TrainedAvatar, clip: Clip, out: Path, path: CameraPath, size: int | None = None) -> None:

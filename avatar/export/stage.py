@@ -18,8 +18,8 @@ from avatar.motion.orbit import EDGE, orbited, seen_from
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera
 
-DEPTH = 8.0
-LEAST_OPACITY = 1e-6
+DEPTH = 8.0  # layers of Gaussians that stop the light
+LEAST_OPACITY = 1e-6  # of a Gaussian, so that its logit is finite
 LEAST = 0.01  # metres over which it fades
 PIXELS = 128  # width of the picture in which the neck's end is looked for
 
@@ -43,7 +43,7 @@ def neck_fade(trained: TrainedAvatar) -> Float[Tensor, " G"]:
     model = cast(FlashAvatar, trained.avatar)
     embedding = model.embedding
     heights = (model.mesh.neutral_vertices()[embedding.corners, 1] * embedding.barycentric).sum(dim=1)
-    end, chin = neck(trained)
+    end, chin = neck_heights(trained)
     t = ((heights - end) / max(chin - end, 1e-6)).clamp(0, 1)
     s = t * t * (3 - 2 * t)
     return -torch.log1p(-s * (1 - math.exp(-DEPTH))) / DEPTH
@@ -53,11 +53,11 @@ def front_camera(trained: TrainedAvatar, size: int | None = None) -> Camera:
     """The lens and distance of `rest_camera`, from the front, as far as training shows it; the head is upright, and in the
     middle together with half of its neck."""
     top = float(trained.avatar.head.neutral_vertices()[:, 1].max())
-    return _from_the_front(trained, (top + sum(neck(trained)) / 2) / 2, size)
+    return _from_the_front(trained, (top + sum(neck_heights(trained)) / 2) / 2, size)
 
 
 @torch.no_grad()
-def neck(trained: TrainedAvatar) -> tuple[float, float]:
+def neck_heights(trained: TrainedAvatar) -> tuple[float, float]:
     """Heights in the neutral head, metres: where the neck is seen to end, perhaps above the mesh's edge, and the chin."""
     heights = trained.avatar.head.neutral_vertices()[:, 1]
     moved = heights[trained.assets.weights[:, JOINT_NAMES.index("jaw")] > 0.5]

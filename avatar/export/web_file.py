@@ -1,6 +1,6 @@
 """The avatar as browsers read it: a gzip file of a JSON header and arrays, quantised where the picture does not mind.
 
-    bytes 0-3    "AVW3"
+    bytes 0-3    "AVW4"
     bytes 4-7    length of the header, uint32, little-endian like everything
     header       JSON: sizes, arrays (type, offset, length, columns, scales), motion, camera, names
     arrays       each at a multiple of 4 bytes
@@ -29,7 +29,7 @@ from avatar.motion.controls import expression_controls, joint_ranges
 from avatar.motion.orbit import orbit_limits
 from avatar.runs.trained import TrainedAvatar
 
-FORMAT = "AVW3"
+FORMAT = "AVW4"
 Precision = Literal["float", "small"]
 TYPES = {"f4": np.float32, "i2": np.int16, "i1": np.int8, "u4": np.uint32, "u2": np.uint16}
 # With precision "small": the type, what a column with a scale of its own is, and the largest integer, which is smaller than

@@ -98,11 +98,12 @@ def _start_encoder(
     if sound is None:
         heard = ["-an"]
     else:
-        taken += ["-ss", f"{sound.start:.6f}", "-t", f"{sound.length:.6f}", "-i", str(sound.source)]
+        taken += ["-ss", f"{sound.start:.6f}", "-t", f"{sound.length:.6f}"]
+        taken += ["-protocol_whitelist", "file", "-i", f"file:{sound.source}"]
         codec = "libopus" if path.suffix.lower() == ".webm" else "aac"
         heard = ["-map", "0:v", "-map", "1:a?", "-c:a", codec]
-    # -xerror: it ends with its first error, so that what it says fits into the pipe
-    options = ["-y", "-loglevel", "error", "-xerror"]
+    # -xerror: it ends with its first error, so that what it says fits into the pipe. Damaged sound is no such error.
+    options = ["-y", "-loglevel", "error", "-xerror"] if sound is None else ["-y", "-loglevel", "fatal"]
     return subprocess.Popen(
         [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, *heard, str(path)],
         stdin=subprocess.PIPE,
@@ -113,20 +114,8 @@ def _start_encoder(
 def _codec(suffix: str, has_alpha: bool, preset: str) -> list[str]:
     if suffix == ".webm":
         layout = "yuva420p" if has_alpha else "yuv420p"
-        return [
-            "-c:v",
-            "libvpx-vp9",
-            "-crf",
-            "20",
-            "-b:v",
-            "0",
-            "-cpu-used",
-            "4",
-            "-auto-alt-ref",
-            "0",
-            "-pix_fmt",
-            layout,
-        ]
+        vp9 = "-c:v libvpx-vp9 -crf 20 -b:v 0 -cpu-used 4 -auto-alt-ref 0 -pix_fmt"
+        return [*vp9.split(), layout]
     if has_alpha:
         return ["-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le", "-alpha_bits", "8"]
     return ["-c:v", "libx264", "-preset", preset, "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]

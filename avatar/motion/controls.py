@@ -20,7 +20,7 @@ from avatar.types import HeadParams
 
 COMPONENTS = 12  # of head models whose coefficients have no names
 EDGE = 1.0  # percent of the training frames beyond either end of a range
-JOINTS = ("jaw", "look_down", "look_left", "left_lid", "right_lid", "nod", "turn")
+JOINTS = ("jaw", "look_down", "look_left", "left_lid", "right_lid", "lean", "turn")
 LEAST_RANGE = 0.02  # radians, or share of a closed lid: what has moved less, training has not shown
 JOINT_FIELD = {"jaw": "jaw", "left_lid": "eyelids", "right_lid": "eyelids", "lean": "neck", "turn": "neck"}  # else eyes
 PARTS = (
@@ -72,7 +72,7 @@ def principal_directions(values: Float[Tensor, "T E"]) -> Float[Tensor, "K E"]:
 
 
 def joint_ranges(training: Sequence[HeadParams]) -> dict[str, tuple[float, float]]:
-    """How far jaw, gaze, lids and neck have moved in training; what has not moved is left out.
+    """How far jaw, gaze, lids and torso have moved in training; what has not moved is left out.
 
     Radians about the x axis (jaw: opens; look_down; lean: the torso backwards) and the y axis (look_left: to the person's
     own left; turn: the torso to the right); lids from 0 (open) to about 1.
@@ -112,7 +112,10 @@ def posed(
 
 
 def posed_by_name(values: Mapping[str, float], controls: Sequence[ExpressionControl], rest: HeadParams) -> HeadParams:
-    """`posed` by names in any style of writing. Raises UserError for another one, with those that there are."""
+    """`posed` by the names of expressions, in any style of writing, and of joints.
+
+    Raises UserError for another name, with those that there are.
+    """
     known = {plain(c.name): c for c in reversed(controls)} | {plain(f"{c.part} {c.name}"): c for c in controls}
     joints = {name: value for name, value in values.items() if name in JOINTS}
     expressions = {name: value for name, value in values.items() if name not in JOINTS}

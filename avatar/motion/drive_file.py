@@ -6,6 +6,7 @@ An .npz holds, for T frames (only `expression` is required; what is missing is a
     jaw             [T, 3] or [T, 6]          rotation vector in radians, or the matrix' first two rows
     eyes            [T, 6] or [T, 12]         left then right, each as the jaw
     eyelids         [T, 2]                    left, right; 1 is closed
+    neck            [T, 3] or [T, 6]          the head against the torso, as the jaw; R and t are the head's, neck included
     fps             []                        frames a second; DEFAULT_FPS
     R, t, K, size   [T,3,3] [T,3] [3,3] [2]   camera: world to camera (OpenCV axes), metres; pixels; width, height
     shape           [at most 300]             identity coefficients of the driver, for finding the neutral face
@@ -37,7 +38,7 @@ from avatar.types import IDENTITY_6D, Camera, HeadParams
 
 MAX_FRAMES = 1_000_000
 CAMERA_KEYS = ("R", "t", "K", "size")
-KEYS = ("expression", "jaw", "eyes", "eyelids", "fps", *CAMERA_KEYS, "shape", "names", "head")
+KEYS = ("expression", "jaw", "eyes", "eyelids", "neck", "fps", *CAMERA_KEYS, "shape", "names", "head")
 
 
 def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[str], None] = print) -> Drive:
@@ -74,6 +75,7 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     padded[:, :kept] = expression[:, :kept]
     jaw = _rotations(path, arrays, "jaw", T, 1)
     eyes = _rotations(path, arrays, "eyes", T, 2)
+    neck = _rotations(path, arrays, "neck", T, 1)
     eyelids = _numbers(path, arrays, "eyelids", (T, 2)) if "eyelids" in arrays else torch.zeros(T, 2)
     fps = float(_numbers(path, arrays, "fps", ())) if "fps" in arrays else DEFAULT_FPS
     if not BOUNDS[0] <= fps <= BOUNDS[1]:
@@ -81,12 +83,11 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     shape = _numbers(path, arrays, "shape", (None,)) if "shape" in arrays else torch.zeros(0)
     if len(shape) > assets.shape_dirs.shape[2]:
         raise UserError(f"{path}: shape has {len(shape)} values, the head model {assets.shape_dirs.shape[2]}")
-    rest = torch.tensor(IDENTITY_6D)
     return Drive(
         path.stem,
         fps,
         _frame_names(path, arrays, T),
-        [HeadParams(padded[i], jaw[i], eyes[i], eyelids[i], rest) for i in range(T)],
+        [HeadParams(padded[i], jaw[i], eyes[i], eyelids[i], neck[i]) for i in range(T)],
         _cameras(path, arrays, T, width),
         shape,
     )
@@ -96,7 +97,7 @@ def write_drive(path: Path, drive: Drive, fingerprint: str) -> None:
     """Write an .npz that `read_drive` gives back. Raises UserError when the disk refuses."""
     arrays: dict[str, np.ndarray] = {
         name: torch.stack([getattr(params, name) for params in drive.params]).numpy()
-        for name in ("expression", "jaw", "eyes", "eyelids")
+        for name in ("expression", "jaw", "eyes", "eyelids", "neck")
     }
     arrays |= {"fps": np.array(drive.fps), "names": np.array(drive.names), "head": np.array(fingerprint)}
     arrays["shape"] = drive.identity.numpy()

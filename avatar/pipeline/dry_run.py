@@ -20,12 +20,11 @@ from avatar.train.cost_estimate import measure_cost
 from avatar.train.objective import choose_perceptual
 from data_prep.prepare.open import open_subject
 
-STEP = {"cpu": 99 / 4000, "cuda": 16 / 4000}  # seconds, on two cores and on a GPU: docs/train.md, docs/gpu.md
 DISK_COPIES = 1 + 3 * (KEPT + 1)  # of the parameters: the avatar; the checkpoints, with one more while it is written
 
 
-def foretell(source: Source, overrides: list[str], rounds: int, device: str | None) -> int:
-    """Print it. A few steps are made on one frame, and thrown away; nothing is written.
+def estimate_training(source: Source, overrides: list[str], rounds: int, device: str | None) -> int:
+    """Print it. A few steps are made on one frame, and thrown away. The subject stays prepared in the cache.
 
     Raises UserError as training does, before its first step.
     """
@@ -37,20 +36,21 @@ def foretell(source: Source, overrides: list[str], rounds: int, device: str | No
     frames = len(subject.split.train)
     perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
     needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual.name)
-    check_memory("training", needs, free_bytes(chosen))
+    free = free_bytes(chosen)
+    check_memory("training", needs, free)
     frame = subject.frame(subject.split.train[0], config.data.size)
     cost = measure_cost(frame, assets, subject.identity, frames, config)
-    step = cost.step_seconds if chosen.type == "cpu" else STEP["cuda"]
-    seconds = step * (cost.iterations + rounds * round_steps(cost.iterations, frames))
+    seconds = cost.step_seconds * (cost.iterations + rounds * round_steps(cost.iterations, frames))
     if rounds:
         subject.refuse_several_cameras("--refine")
         avatar = new_avatar(assets, subject, config, perceptual.name, CPU)
         background = torch.tensor(config.data.background)
         seconds += rounds * estimated_seconds(avatar, subject, config.data.size, background)
-    of = "measured on a few steps" if chosen.type == "cpu" else "as on an H100"
+    minutes = f"about {seconds / 60:.1f} minutes: " if chosen.type == "cpu" else "not estimated on a GPU: "
+    step = f" of {cost.step_seconds:.3f} s, measured on a few" if chosen.type == "cpu" else ""
     print(f"Subject      {subject.name}: {frames:,} frames to train on, {len(subject.split.test):,} held out")
     print(f"Avatar       {cost.gaussians:,} Gaussians ({config.model.name}), {size[0]}x{size[1]} pixels")
-    print(f"Time         about {seconds / 60:.1f} minutes: {cost.iterations:,} steps of {step:.3f} s, {of}")
-    print(f"Memory       about {in_words(sum(need.size for need in needs))} of {in_words(available_bytes())}")
+    print(f"Time         {minutes}{cost.iterations:,} steps{step}")
+    print(f"Memory       about {in_words(sum(need.size for need in needs))} of {in_words(free or available_bytes())}")
     print(f"Disk         about {in_words(4.0 * DISK_COPIES * cost.parameters * (1 + rounds))}")
     return OK

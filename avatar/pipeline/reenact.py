@@ -66,11 +66,12 @@ def reenact(
     choices: Choices = DEFAULT_CHOICES,
     *,
     backdrop: Backdrop | None = None,
-    sound: Path | None = None,
+    sound: tuple[Path, float] | None = None,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture, or
-    alone over a backdrop. `sound` is the driver's video, whose sound goes along.
+    alone over a backdrop. `sound` is the driver's video, whose sound goes along, and
+    the second at which the driver's frames begin in it.
 
     Returns the video's path. Raises UserError for choices out of range and for a driver tracked with another head model.
     """
@@ -99,8 +100,12 @@ def reenact(
     say_distances(distances, say)
     own = trained.rest_camera()
     cameras = choose_cameras(drive, own, choices.camera, choices.intrinsics)
+    if choices.camera == "target" or drive.cameras is None:  # the torso turns against a head that does not
+        neck = trained.rest_params().neck
+        moved = [replace(params, neck=neck) for params in moved]
     if choices.camera == "driver" and choices.intrinsics == "driver":
         warn_of_other_intrinsics(cameras[0], own, say)
+    heard = None if sound is None or out.suffix.lower() == PICTURES else drive_sound(*sound, drive, say)
     renderings = trained.stream(zip(moved, cameras, strict=True))
     loader = FrameLoader(driver, data.size) if backdrop is None and isinstance(driver, Subject) else None
     with loader or nullcontext():
@@ -113,32 +118,43 @@ def reenact(
         if out.suffix.lower() == PICTURES:
             write_pictures(out, shown)
         else:
-            write_video(out, shown, drive.fps, None if sound is None else drive_sound(sound, drive))
+            write_video(out, shown, drive.fps, heard)
     table, record = sidecars(out)
     content = distances_csv(drive.names, distances.tolist())
     write_atomically(table, content.encode(errors="backslashreplace"))
     described = describe(trained, drive, choices, neutral, cameras, own, distances)
     described |= {
         "background": None if backdrop is None else backdrop.name,
-        "sound": None if sound is None else str(sound),
+        "sound": None if heard is None else str(heard.source),
     }
     write_atomically(record, json.dumps(described, indent=2, allow_nan=False).encode())
-    say(f"{len(drive)} frames written to {out}; its choices in {record.name}, each frame's distance in {table.name}")
+    shown_out = first_picture(out) if out.suffix.lower() == PICTURES else out
+    say(
+        f"{len(drive)} frames written to {shown_out}; its choices in {record.name}, each frame's distance in {table.name}"
+    )
     return out
 
 
-def drive_sound(video: Path, drive: Drive) -> Sound:
-    """That of the frames of a tracked video, which are numbered in units of 1 / fps."""
-    name = drive.names[0]
-    first = int(name) if name.isascii() and name.isdigit() else 0
-    return Sound(video, first / drive.fps, len(drive) / drive.fps)
+def drive_sound(video: Path, begins: float, drive: Drive, say: Callable[[str], None]) -> Sound | None:
+    """That of the frames of a tracked video, which are numbered in units of 1 / fps from `begins`, seconds, on; None where
+    frames are missing between them."""
+    first, last = int(drive.names[0]), int(drive.names[-1])
+    if last - first + 1 != len(drive):
+        say(f"Note: {drive.name} lacks {last - first + 1 - len(drive)} frames, so the sound is left out")
+        return None
+    return Sound(video, begins + first / drive.fps, len(drive) / drive.fps)
 
 
 def write_pictures(out: Path, frames: Iterable[UInt8[np.ndarray, "H W C"]]) -> None:
     for number, frame in enumerate(frames):
         order = cv2.COLOR_RGBA2BGRA if frame.shape[2] == 4 else cv2.COLOR_RGB2BGR
         _, data = cv2.imencode(PICTURES, cv2.cvtColor(frame, order))
-        write_atomically(out.with_name(f"{shortened(out.stem)}-{number:05d}{PICTURES}"), data.tobytes())
+        write_atomically(first_picture(out, number), data.tobytes())
+
+
+def first_picture(out: Path, number: int = 0) -> Path:
+    """Where the picture of a frame is written, for an `out` that ends in .png."""
+    return out.with_name(f"{shortened(out.stem)}-{number:05d}{PICTURES}")
 
 
 def sidecars(video: Path) -> tuple[Path, Path]:

@@ -87,7 +87,7 @@ def find_parameterization(tracks: Tracks, train: Sequence[int], centre: Float[Te
     trained_on = set(train)  # a difference over neighbours that are held out would tell of them
     inner = [i for i in train if {i - 1, i + 1} <= trained_on]
     typical = motion[inner].square().mean(dim=0).sqrt() if inner else motion.new_zeros(motion.shape[1])
-    # The head turns with its neck, so that one's accelerations are plausible for the other.
+    # The torso turns against the head, so that one's accelerations are plausible for the other.
     typical[NECK] = typical[NECK].maximum(typical[TURN])
 
     unit = torch.where(spread > STILL, SPREAD_SHARE * spread, 0.0)

@@ -40,7 +40,7 @@ COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
-PROGRESS_FORMAT = 3  # grows with every change of what refinement finds
+PROGRESS_FORMAT = 4  # grows with every change of what refinement finds
 
 
 @dataclass(frozen=True)

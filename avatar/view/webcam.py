@@ -16,6 +16,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.head.model import HeadModel, matrix_from_6d
+from avatar.motion.controls import joint_ranges
 from avatar.motion.rest import RestPose, find_neutral
 from avatar.motion.transfer import departed
 from avatar.runs.trained import TrainedAvatar
@@ -81,6 +82,8 @@ class Webcam:
         self._trained, self._tracker, self._say = trained, tracker, say
         self._goal = RestPose(trained.neutral.expression, trained.neutral.jaw, None)
         self._own = trained.rest_camera()
+        recording = trained.recording
+        self._has_torso = not {"lean", "turn"}.isdisjoint(joint_ranges(recording.motion(recording.split.train)))
         self._lock = threading.Lock()
         self._newest: Live | None = None
         self._face: Face | None = None
@@ -153,8 +156,11 @@ class Webcam:
             self._face, rest, rest_face = face, self._rest, self._rest_face
         assert rest is not None and rest_face is not None
         params = departed([face.params], rest, self._goal, 1.0)[0]
+        camera = moved_camera(self._own, rest_face, face)
+        if self._has_torso:
+            params = replace(params, neck=still_torso(self._trained.rest_params().neck, self._own, camera))
         number = 0 if self._newest is None else self._newest.number + 1
-        self._newest = Live(number, params, moved_camera(self._own, rest_face, face), face.taken)
+        self._newest = Live(number, params, camera, face.taken)
         self._on_frame()
 
 
@@ -164,3 +170,9 @@ def moved_camera(own: Camera, rest: Face, face: Face) -> Camera:
     scale = own.t_cam_world[2] / rest.t_cam_head[2]
     shift = scale * (face.t_cam_head - rest.t_cam_head)
     return replace(own, R_cam_world=turn @ own.R_cam_world, t_cam_world=own.t_cam_world + shift)
+
+
+def still_torso(neck: Float[Tensor, 6], own: Camera, moved: Camera) -> Float[Tensor, 6]:
+    """The neck with which the torso stays as with `neck` before `own` while the head moves."""
+    turn = own.R_cam_world.T @ moved.R_cam_world
+    return (matrix_from_6d(neck) @ turn.to(neck))[:2].reshape(6)

@@ -119,7 +119,8 @@ function row(view, text, members) {
   input.addEventListener("input", set);
   input.addEventListener("dblclick", () => {
     input.value = rest;
-    set();
+    for (const { set } of members) set(null);
+    fill();
   });
   label.append(Object.assign(document.createElement("span"), { textContent: text }), input);
   fill();

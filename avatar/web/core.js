@@ -1,6 +1,6 @@
 // An avatar in memory and the WebAssembly module that draws it. Runs in a page, a worker and node; no DOM.
 
-export const MAGIC = "AVW3";
+export const MAGIC = "AVW4";
 // The arrays that the module takes, in its order (avatar/csrc/web/portrait.h).
 const ARRAYS = [
   "shape", "expression_dirs", "pose_dirs", "weights", "eyelid_dirs", "joints_at_rest", "expression_joints", "barycentric",

@@ -1,5 +1,5 @@
 // A face in front of a camera as the avatar's: ARKit's blendshape scores and a head's pose become parameters and a camera.
-import { multiply, places, rotation, sixD, whole } from "./motion.js";
+import { keepTorso, multiply, places, rotation, sixD, whole } from "./motion.js";
 
 const LIDS = ["eyeBlinkLeft", "eyeBlinkRight"];
 const CALM_SHARE = 0.25;
@@ -90,7 +90,9 @@ export class FaceDriver {
     if (!face.matrix) return { parameters: this.#parameters(scores), rotation: R, translation: t };
     this.#neutral.matrix ??= face.matrix; // the first place is the neutral one
     const head = this.#pose.next(headPose(R, this.#neutral.matrix, face.matrix), seconds);
-    return { parameters: this.#parameters(scores), ...placed(this.#header, head) };
+    const parameters = this.#parameters(scores), { turn, ...camera } = placed(this.#header, head);
+    keepTorso(this.#header, parameters, turn);
+    return { parameters, ...camera };
   }
 
   /** `departed` of avatar/motion/transfer.py, no farther than training has shown. */
@@ -133,7 +135,7 @@ function headPose(R, neutral, matrix) {
   return [...angles, ...shift, matrix[14] / (neutral[14] || 1)];
 }
 
-/** The avatar's camera with its head turned, no farther than training has shown, and moved, inside of the picture. */
+/** The avatar's camera with its head turned, and that turn, no farther than training has shown, and moved, inside of the picture. */
 function placed({ camera, orbit }, [roll, pitch, yaw, x, y, far]) {
   const degrees = Math.PI / 180, within = ([low, high]) => [(low - BEYOND) * degrees, (high + BEYOND) * degrees];
   const turn = multiply(
@@ -147,6 +149,7 @@ function placed({ camera, orbit }, [roll, pitch, yaw, x, y, far]) {
   };
   const { fx, fy, cx, cy, aspect } = camera;
   return {
+    turn,
     rotation: multiply(camera.rotation, turn),
     translation: [inside(tx, x, fx, cx, 1), inside(ty, y, fy, cy, 1 / aspect), depth],
   };

@@ -3,7 +3,7 @@
 /** Returns a function that switches it on and off; it rests while a motion plays, a face drives, or `isHeld` says so. */
 export function followPointer(view, header, isHeld) {
   const { look_left: across = [0, 0], look_down: down = [0, 0] } = header.joints;
-  let isOn = false, target = [0, 0], now = [0, 0], isSet = false;
+  let isOn = false, target = null, now = [0, 0], isSet = false; // no target before the pointer moves
   const part = (share, [low, high]) => (share > 0 ? high : -low) * Math.max(-1, Math.min(share, 1));
   const move = (e) => {
     const box = view.canvas.getBoundingClientRect();
@@ -17,7 +17,7 @@ export function followPointer(view, header, isHeld) {
   const step = () => {
     if (!isOn) return letGo();
     requestAnimationFrame(step);
-    if (isHeld() || !["idle", "rest"].includes(view.motion)) return letGo();
+    if (!target || isHeld() || !["idle", "rest"].includes(view.motion)) return letGo();
     if (now.every((v, i) => Math.abs(v - target[i]) < 1e-4) && isSet) return;
     now = now.map((v, i) => v + 0.25 * (target[i] - v));
     view.setPose({ gaze: [...now, 0] });

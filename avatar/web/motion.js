@@ -28,7 +28,7 @@ export function whole([a, b, c, d, e, f]) {
 }
 
 /** How a head turns by yaw and pitch in degrees, in its own axes. */
-const headTurn = ([yaw, pitch]) =>
+export const headTurn = ([yaw, pitch]) =>
   multiply(rotation([(pitch * Math.PI) / 180, 0, 0]), rotation([0, (yaw * Math.PI) / 180, 0]));
 
 /**
@@ -80,10 +80,14 @@ export function idle(header, seconds, still = false) {
   parameters.set(eye, at.eyes);
   parameters.set(eye, at.eyes + 6);
   const turn = [3 * Math.sin(0.7 * seconds) + 1.5 * Math.sin(1.9 * seconds), 1.2 * Math.sin(0.9 * seconds + 1)];
-  // Where training has seen the torso turn against the head, it stays when the head sways.
-  const neck = multiply(whole(header.rest.slice(at.neck, at.neck + 6)), headTurn(turn));
-  if (header.joints.turn || header.joints.lean) parameters.set(sixD(neck), at.neck);
+  keepTorso(header, parameters, headTurn(turn));
   return { parameters, turn };
+}
+
+/** Where training has seen the torso turn against the head, let it stay when the head turns. */
+export function keepTorso({ joints, rest, sizes }, parameters, turn) {
+  const at = places(sizes.expressions).neck;
+  if (joints.turn || joints.lean) parameters.set(sixD(multiply(whole(rest.slice(at, at + 6)), turn)), at);
 }
 
 const ease = (x) => x * x * (3 - 2 * x);

@@ -3,7 +3,7 @@
 import { paint, png } from "./canvas.js";
 import { AvatarError } from "./core.js";
 import { FaceDriver } from "./drive.js";
-import { blended, idle, multiply, orbit, recorded, rotation } from "./motion.js";
+import { blended, headTurn, idle, multiply, orbit, recorded } from "./motion.js";
 import { Settings } from "./settings.js";
 import { WebglRenderer, hasRealGpu } from "./webgl_renderer.js";
 
@@ -247,7 +247,7 @@ export class AvatarView extends EventTarget {
   #request(now) {
     const { header } = this, pose = this.#current(now), base = { ...header.camera, rotation: pose.rotation, translation: pose.translation };
     const [yaw, pitch] = [0, 1].map((i) => pose.turn[i] + this.#settings.turned[i]);
-    base.rotation = multiply(base.rotation, rotation([(pitch * Math.PI) / 180, (yaw * Math.PI) / 180, 0]));
+    base.rotation = multiply(base.rotation, headTurn([yaw, pitch]));
     const { parameters } = pose, { view, background } = this, key = JSON.stringify([Array.from(parameters), base, view, background]);
     if (key !== this.#shown?.key) this.#changed = now;
     const width = now - this.#changed < STILL_AFTER ? this.#width.moving : this.#width.still;

@@ -36,7 +36,7 @@ from data_prep.formats.transforms import read_json
 
 REFINEMENT_FILE, GIVEN_FILE = "refinement.json", "given.npz"
 HEAD_MODEL = "head_model"
-VERSION = 1
+VERSION = 2
 
 
 def open_folder(folder: Path) -> TrackedFolder:

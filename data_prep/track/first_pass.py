@@ -35,6 +35,7 @@ class Look:
     read: int  # how many pictures were read
     is_whole: bool  # whether these were all between --start and --end
     notes: list[str]
+    begins: float = 0.0  # seconds into the video, of frame 0
 
 
 def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
@@ -125,7 +126,8 @@ def _on_grid(
             f"{MIN_PICTURES} at least are needed: it must be seen from the front, lit, and be no speck"
         )
     size = footage.width, footage.height
-    return Look(Landmarks(points, scores, detected, size, timing.fps), pictures, len(times), is_whole, notes)
+    landmarks = Landmarks(points, scores, detected, size, timing.fps)
+    return Look(landmarks, pictures, len(times), is_whole, notes, float(own[0]))
 
 
 def _too_long(footage: Footage, first: float, last: float) -> str:
@@ -142,9 +144,15 @@ def _because(notes: list[str]) -> str:
 
 def to_json(look: Look) -> dict[str, Any]:
     """All but the landmarks."""
-    return {"pictures": look.pictures.tolist(), "read": look.read, "is_whole": look.is_whole, "notes": look.notes}
+    return {
+        "pictures": look.pictures.tolist(),
+        "read": look.read,
+        "is_whole": look.is_whole,
+        "notes": look.notes,
+        "begins": look.begins,
+    }
 
 
 def from_json(raw: dict[str, Any], landmarks: Landmarks) -> Look:
     pictures = np.array(raw["pictures"], np.int64)
-    return Look(landmarks, pictures, raw["read"], raw["is_whole"], list(raw["notes"]))
+    return Look(landmarks, pictures, raw["read"], raw["is_whole"], list(raw["notes"]), raw["begins"])

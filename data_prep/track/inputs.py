@@ -12,7 +12,7 @@ from data_prep.track.faces.rendered_embedding import RECIPE
 from data_prep.track.footage.source import Footage
 from data_prep.track.stage_folder import hash_of
 
-STAGES_VERSION = 12  # raised when what a stage makes changes
+STAGES_VERSION = 13  # raised when what a stage makes changes
 
 
 def tracking_key(footage: Footage, choices: dict[str, Any], head_path: Path, head: HeadAssets) -> str:

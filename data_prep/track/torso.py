@@ -143,8 +143,9 @@ def with_torso(
     known = {row: shift for row, shift in enumerate(shifts) if shift is not None}
     if not known:
         return tracks
+    numbers = np.array(list(tracks))
     columns = np.stack(list(known.values()), axis=1)
-    every = np.stack([np.interp(np.arange(len(tracks)), list(known), column) for column in columns], axis=1)
+    every = np.stack([np.interp(numbers, numbers[list(known)], column) for column in columns], axis=1)
     every = median_filter(every, size=(_MEDIAN, 1), mode="nearest")
     found = {}
     for (number, track), shift in zip(tracks.items(), every, strict=True):

@@ -132,6 +132,7 @@ def track(
                 "key": key,
                 "turned": turn,
                 "box": list(view.box),
+                "begins": look.begins,
             }
             | options,
             left_out=_left_out(look),

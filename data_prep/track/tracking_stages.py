@@ -205,7 +205,8 @@ class TrackingStages:
             known = sum(shift is not None for shift in shifts)
             is_followed = known >= LEAST_FOLLOWED * len(fit.tracks)
             tracks = with_torso(fit.tracks, tracker, shifts) if is_followed else fit.tracks
-            figures = fit.figures | {"torso": known / len(fit.tracks) if tracker.has_clothes else None}
+            share = known / len(fit.tracks) if is_followed else 0.0
+            figures = fit.figures | {"torso": share if tracker.has_clothes else None}
             Fit(tracks, figures).save(folder / TRACKS_FILE)
             return figures
 

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import torch
 from command_line import avatar
+from heads import rest_params
 from lively import lively_run
 
 from avatar.files.video import Sound, write_video
+from avatar.motion.drive import Drive
 from avatar.pipeline.backdrop import parse_backdrop
+from avatar.pipeline.reenact import drive_sound
 from avatar.runs.trained import load_avatar
 
 FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
@@ -105,3 +108,23 @@ def test_sound_goes_along_and_changes_no_length(suffix: str, tmp_path: Path) -> 
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(out))
         said = subprocess.run([FFMPEG, "-hide_banner", "-i", str(out)], capture_output=True, text=True).stderr
         assert count == 10 and ("Audio:" in said) == (source == beep)
+
+
+def test_a_damaged_sound_costs_no_picture(tmp_path: Path) -> None:
+    sound = tmp_path / "a:b.aac"
+    words = [FFMPEG, "-loglevel", "error", "-f", "lavfi", "-i", "sine=frequency=440:duration=1", f"file:{sound}"]
+    subprocess.run(words, check=True)
+    data = bytearray(sound.read_bytes())
+    data[len(data) // 3 : len(data) // 2] = bytes(len(data) // 2 - len(data) // 3)
+    sound.write_bytes(data)
+    out = tmp_path / "out.mp4"
+    write_video(out, [np.full((32, 32, 3), 20 * k, np.uint8) for k in range(10)], 10.0, Sound(sound, 0.0, 1.0))
+    assert imageio_ffmpeg.count_frames_and_secs(str(out))[0] == 10
+
+
+def test_sound_begins_with_the_shot_and_is_left_out_where_frames_are_missing() -> None:
+    params, said = [rest_params()] * 3, []
+    drive = Drive("a", 10.0, ("00005", "00006", "00007"), params, None, torch.zeros(0))
+    assert drive_sound(Path("a.mp4"), 2.0, drive, said.append) == Sound(Path("a.mp4"), 2.5, 0.3) and not said
+    gap = Drive("a", 10.0, ("00000", "00001", "00009"), params, None, torch.zeros(0))
+    assert drive_sound(Path("a.mp4"), 2.0, gap, said.append) is None and "lacks 7 frames" in said[0]

@@ -14,7 +14,7 @@ from lively import lively_avatar
 from pages import shown, until
 
 from avatar.export import stage
-from avatar.export.stage import front_camera, neck, neck_fade
+from avatar.export.stage import front_camera, neck_fade, neck_heights
 from avatar.export.web_page import write_page
 from avatar.runs.trained import TrainedAvatar
 
@@ -94,14 +94,14 @@ def test_the_head_is_upright_in_the_middle(trained: TrainedAvatar) -> None:
     assert camera.R_cam_world[0, 1].abs() < 1e-6, "no roll"
     points = camera.project(trained.avatar.head.neutral_vertices())
     x, y = points[:, 0], points[:, 1]
-    end, chin = neck(trained)
+    end, chin = neck_heights(trained)
     middle_of_neck = camera.project(torch.tensor([[0.0, (end + chin) / 2, 0.0]]))[0, 1]
     assert float(x.mean()) == pytest.approx(64, abs=3)
     assert float(y.min() + middle_of_neck) / 2 == pytest.approx(64, abs=3)
 
 
 def test_the_neck_fades_from_the_chin_to_its_end(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = neck(trained)
+    found = neck_heights(trained)
     assert found[0] <= found[1], "this head's mesh ends at its chin"
     embedding = trained.avatar.embedding
     heights = (trained.avatar.head.neutral_vertices()[embedding.corners, 1] * embedding.barycentric).sum(dim=1)

@@ -36,6 +36,9 @@ def test_a_pose_is_named(trained: TrainedAvatar) -> None:
     assert torch.equal(picture.image, truth.image) and picture.image.shape == (32, 32, 3)
     both = f"{control.part}_{control.name}".replace(" ", "_")
     assert torch.equal(trained.pose(**{both: 0.5}).image, trained.pose(**{name: 0.5}).image)
+    turned = trained.render(posed(rest, None, {"lean": 0.2, "turn": -0.3}))
+    assert torch.equal(trained.pose(lean=0.2, turn=-0.3).image, turned.image)
+    assert not torch.equal(turned.image, trained.render(rest).image)
     assert torch.equal(trained.pose().image, trained.render(rest).image)
     with pytest.raises(UserError, match=f"this avatar has no ears; it has jaw, look_down.*{name}"):
         trained.pose(ears=1)
