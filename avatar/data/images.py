@@ -20,6 +20,7 @@ _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 _PALETTE = 3  # the colour type of a PNG that holds indices into a palette
+EVERY_LABEL = 0  # as a label: every value but 0 is the person
 MAX_PIXELS = 2**26  # 8192x8192; a decoder allocates what the header says before it looks how much there is
 MAX_BYTES = 2**28  # of a file
 _STARTS = {  # of pictures that are not read: where, what, the format
@@ -55,12 +56,13 @@ def decode_image(data: bytes, path: Path) -> np.ndarray:
 def decode_mask(data: bytes, path: Path, label: int | None = None) -> np.ndarray:
     """uint8 [H, W], 0 to 255: the values of a mask file that was read already; `path` is for the message.
 
-    With a `label`, the file is a label image that holds 0 and this value, which becomes 255. Raises UserError for others.
+    With a `label`, the file is a label image that holds 0 and this value, which becomes 255, as others do with EVERY_LABEL;
+    else it raises UserError for these.
     """
     values = decode_values(data, path)
     if label is None:
         return values
-    is_person = values == label
+    is_person = values != 0 if label == EVERY_LABEL else values == label
     strange = values[~is_person & (values != 0)]
     if len(strange):
         raise UserError(f"{path} holds the value {strange[0]} beside 0 and {label}; make all masks alike")

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+from avatar.data.images import EVERY_LABEL
 from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
 from avatar.data.refinement import Refinement
 from avatar.data.rig import Rig, parse_rig
@@ -133,7 +134,7 @@ def _parse(raw: dict[str, Any]) -> Manifest:
 
 def _labels(raw: dict[str, Any]) -> dict[str, int]:
     for kind in raw:
-        if kind not in MASKS or not 0 < _of(raw, kind, int) < 255:
+        if kind not in MASKS or not EVERY_LABEL <= _of(raw, kind, int) < 255:
             raise ValueError(f"the label of {kind} is {raw[kind]}")
     return raw
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, refined, vhap
+from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, nha, refined, vhap
 from data_prep.formats.division import ALL, FRONT
 from data_prep.formats.frame_files import find_frame_files
 from data_prep.formats.metrical_tracker import read_tracking
@@ -15,7 +15,7 @@ from data_prep.formats.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
 _LISTED = {module.NAME: module for module in (vhap, insta, imavatar)}
-_BY_FILES = {module.NAME: module for module in (blendshapes, nersemble)}  # have no listing of frames
+_BY_FILES = {module.NAME: module for module in (blendshapes, nersemble, nha)}  # have no listing of frames
 FORMATS = (METRICAL_TRACKER, *_LISTED, *_BY_FILES, avatar_track.NAME)
 
 
@@ -66,8 +66,8 @@ def open_tracked_folder(
         return vhap.open_folder(folder, frames, cameras or ALL)
     if name == nersemble.NAME:
         return nersemble.open_folder(folder, cameras or ALL)
-    if name == blendshapes.NAME:
-        return blendshapes.open_folder(folder)
+    if name in _BY_FILES:
+        return _BY_FILES[name].open_folder(folder)
     return _LISTED[name].open_folder(folder, frames)
 
 

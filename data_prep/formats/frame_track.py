@@ -148,6 +148,15 @@ def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
     return values
 
 
+def rows_of(values: np.ndarray, name: str, count: int, width: int | None) -> np.ndarray:
+    """The values [count, width], a row for each frame, of whatever further axes. Raises BadFrame for another number; None:
+    any width."""
+    if values.ndim < 2 or len(values) != count or not values.size or width not in (None, values[0].size):
+        expected = "some" if width is None else width
+        raise BadFrame(f"{name} has the shape {list(values.shape)}, not {expected} values for each of {count} frames")
+    return values.reshape(count, -1)
+
+
 def rigid_motion(matrix: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The rotation [3, 3] and translation [3] of a matrix [4, 4]. Raises BadFrame where it is none."""
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:

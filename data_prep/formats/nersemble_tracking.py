@@ -14,7 +14,7 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
-from data_prep.formats.frame_track import BadFrame, FrameTrack, nearest_rotation, vector
+from data_prep.formats.frame_track import BadFrame, FrameTrack, nearest_rotation, rows_of, vector
 from data_prep.formats.nersemble_cameras import CalibratedCamera
 from data_prep.formats.root_pose import Joint, rotation_matrix, six_d, turned_with_neck
 
@@ -86,18 +86,10 @@ def read_tracking(path: Path) -> SequenceTracking:
             raise BadFrame(f"scale is {scale:g}, not above 0")
         if not len(frames) or (frames % 1).any() or (np.diff(frames, prepend=-1) <= 0).any() or frames[-1] >= 2**31:
             raise BadFrame("frames are not increasing whole numbers from 0 on")
-        rows = {name: _rows(raw[name], name, len(frames), width) for name, width in widths.items()}
+        rows = {name: rows_of(raw[name], name, len(frames), width) for name, width in widths.items()}
     except BadFrame as error:
         raise UserError(f"{path}: {error}; download it again") from None
     return SequenceTracking(path, shape, scale, frames.astype(np.int64), rows)
-
-
-def _rows(values: np.ndarray, name: str, count: int, width: int | None) -> np.ndarray:
-    """[count, width]"""
-    if values.ndim < 2 or len(values) != count or not values.size or width not in (None, values[0].size):
-        expected = "some" if width is None else width
-        raise BadFrame(f"{name} has the shape {list(values.shape)}, not {expected} values for each of {count} frames")
-    return values.reshape(count, -1)
 
 
 def _turn(row: dict[str, np.ndarray]) -> np.ndarray:

@@ -29,11 +29,11 @@ WHAT = {ALPHA: "mattes", HEAD: "head masks", MOUTH: "mouth masks"}
 
 
 def with_labels(files: FrameFiles) -> tuple[FrameFiles, list[str]]:
-    """The files with the labels that stand for 255 in each kind of mask, and a sentence about each."""
-    labels, notes = {}, []
+    """The files with the labels that stand for 255 in each kind of mask, and a sentence about each that the layout does not
+    tell."""
+    labels, notes = dict(files.labels), []
     for kind, paths in mask_kinds(files).items():
-        values = _values_of_some(paths)
-        label = only_label(values)
+        label = None if kind in labels else only_label(_values_of_some(paths))
         if label is not None:
             labels[kind] = label
             notes.append(f"the {WHAT[kind]} in {place_of(paths)} are label images: {label} is read as 255")

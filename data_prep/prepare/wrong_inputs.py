@@ -10,7 +10,7 @@ from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE
 from avatar.errors import UserError
 from avatar.head.find import candidates
-from data_prep.formats import avatar_track, nersemble
+from data_prep.formats import avatar_track, nersemble, nha
 from data_prep.formats.transforms import read_json
 
 _PARTS = ("imgs", "images", "image", "frames", "alpha", "parsing", "checkpoint", "flame_param")  # of tracked folders
@@ -58,7 +58,7 @@ def check_folder(folder: Path) -> None:
 
 def _looks_tracked(folder: Path) -> bool:
     has_part = any((folder / name).is_dir() for name in _PARTS)
-    has_layout = avatar_track.recognise(folder) or nersemble.recognise(folder)
+    has_layout = any(layout.recognise(folder) for layout in (avatar_track, nersemble, nha))
     return has_part or has_layout or any(next(folder.glob(name), None) for name in _LISTINGS)
 
 

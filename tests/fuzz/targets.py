@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from exports import write_imavatar, write_insta, write_vhap
 from nersemble_folder import HEIGHT, TRAINED, WIDTH, write_person
+from nha_folder import write_nha
 from own_targets import make_own_targets
 from scipy import sparse
 from small_runs import run_info
@@ -29,16 +30,18 @@ from avatar.evaluation.protocol import read_protocol
 from avatar.files.pickles import load_npz, load_pickle, load_torch_pickle
 from avatar.head.assets import load_head_assets
 from avatar.head.expression_names import ExpressionNames
+from avatar.head.model import NECK
 from avatar.head.uv_obj import read_uv_obj
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import read_drive, write_drive
 from avatar.runs.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info, write_run_info
-from data_prep.formats import nersemble_tracking
+from data_prep.formats import nersemble_tracking, nha
 from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.frame_track import BadFrame
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras
+from data_prep.formats.root_pose import Joint
 from data_prep.prepare.prepare import prepare
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
@@ -128,11 +131,16 @@ def make_targets(place: Path) -> dict[str, Target]:
     tracked_sequence = next(person.glob("sequences/*/tracking/*.npz"))
     rotations = tracked_sequence.read_bytes()
 
+    neck = Joint(head, NECK)
+
     def sequence(path: Path) -> None:
         tracking = nersemble_tracking.read_tracking(path)
         for row in range(len(tracking.pictures(6))):
             with contextlib.suppress(BadFrame):
-                tracking.frame(row, tracking.shape, cameras[TRAINED])
+                tracking.frame(row, tracking.shape, neck, cameras[TRAINED])
+
+    of_nha = write_nha(place / "nha", 6)
+    nha_tracking, nha_split = next(of_nha.glob(nha.TRACKED)), of_nha / nha.SPLIT
 
     own = place / "own"
     own.mkdir()
@@ -161,6 +169,8 @@ def make_targets(place: Path) -> dict[str, Target]:
             1,
             lambda d: with_member(rotations, "frames.npy" if len(d) < 300 else "rotation_matrices.npy", d),
         ),
+        "NHA tracking": Target([nha_tracking.read_bytes()], of_copy(place, nha_tracking, of_nha, listed), 0.5),
+        "NHA split": Target([nha_split.read_bytes()], of_copy(place, nha_split, of_nha, listed), 0.5),
         "manifest": Target([manifest.read_bytes()], of_copy(place, manifest, prepared, first_frame), 2),
         "tracks": Target([tracks.read_bytes()], of_copy(place, tracks, prepared, first_frame)),
         "checkpoint": Target([checkpoint.read_bytes()], on_disk(place / "x.safetensors", load_checkpoint)),
