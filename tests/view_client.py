@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import signal
 import subprocess
@@ -165,7 +166,10 @@ class Started:
 
     def listening(self) -> set[int]:
         """Every port at which the process listens over TCP."""
-        owned = {str(link.readlink()) for link in Path(f"/proc/{self.process.pid}/fd").iterdir()}
+        owned = set()
+        for link in Path(f"/proc/{self.process.pid}/fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # it was closed meanwhile
+                owned.add(str(link.readlink()))
         ports = set()
         for table in ("tcp", "tcp6"):
             for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from avatar.files.pickles import load_npz
+
 MESH_FILE = Path(__file__).with_name("head_mesh.npz")
 EYE_CENTRE = np.array([31.5, 21.0, 64.0])  # left eye; the right one is its mirror image
 EYE_RADIUS = 13.2
@@ -34,8 +36,7 @@ class HeadMesh(NamedTuple):
 
 def load_head_mesh() -> HeadMesh:
     """The mesh, the same bits on every machine."""
-    with np.load(MESH_FILE, allow_pickle=False) as arrays:
-        return HeadMesh(**arrays)
+    return HeadMesh(**load_npz(MESH_FILE))
 
 
 def lip_line(x: np.ndarray) -> np.ndarray:
