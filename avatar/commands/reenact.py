@@ -56,7 +56,7 @@ def head_of(arguments: Namespace, trained: TrainedAvatar) -> Path:
     return recorded if recorded is not None and recorded.exists() else trained.source
 
 
-def default_video(avatar: Path, driver: Path, choices: Choices, suffix: str) -> Path:
+def default_video(avatar: Path, driver: Path, choices: Choices, suffix: str = ".mp4") -> Path:
     """RUN/reenact/DRIVER-TRANSFER.mp4, or so; reenact/... in the current folder for an avatar that is a file alone."""
     folder = avatar if (avatar / RUN_FILE).is_file() else Path()
     return folder / "reenact" / f"{safe_name(driver.resolve().stem)}-{choices.transfer}{suffix}"

@@ -106,7 +106,7 @@ def test_the_neck_fades_from_the_chin_to_its_end(trained: TrainedAvatar, monkeyp
     embedding = trained.avatar.embedding
     heights = (trained.avatar.head.neutral_vertices()[embedding.corners, 1] * embedding.barycentric).sum(dim=1)
     end, chin = heights.quantile(torch.tensor([0.1, 0.6])).tolist()
-    monkeypatch.setattr(stage, "neck", lambda trained: (end, chin))
+    monkeypatch.setattr(stage, "neck_heights", lambda trained: (end, chin))
     fade = neck_fade(trained)
     assert (fade[heights <= end] == 0).all() and (fade[heights >= chin] > 0.999).all()
     assert (fade[heights.argsort()].diff() >= 0).all()
