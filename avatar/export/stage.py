@@ -21,6 +21,9 @@ from avatar.types import Camera
 DEPTH = 8.0  # layers of Gaussians that stop the light
 LEAST_OPACITY = 1e-6  # of a Gaussian, so that its logit is finite
 LEAST = 0.01  # metres over which it fades
+HAIR = 0.1  # of the head's height, above the mesh
+FILLED = 0.85  # of a picture's height
+SEEN = 0.1  # difference from the background
 PIXELS = 128  # width of the picture in which the neck's end is looked for
 
 
@@ -51,9 +54,19 @@ def neck_fade(trained: TrainedAvatar) -> Float[Tensor, " G"]:
 
 def front_camera(trained: TrainedAvatar, size: int | None = None) -> Camera:
     """The lens and distance of `rest_camera`, from the front, as far as training shows it; the head is upright, and in the
-    middle together with half of its neck."""
-    top = float(trained.avatar.head.neutral_vertices()[:, 1].max())
-    return _from_the_front(trained, (top + sum(neck_heights(trained)) / 2) / 2, size)
+    middle together with half of its neck. Where they would fill more than FILLED of the height, it zooms out."""
+    end, chin = neck_heights(trained)
+    low, high = (end + chin) / 2, float(trained.avatar.head.neutral_vertices()[:, 1].max())
+    camera = _from_the_front(trained, (low + high) / 2, size)
+    shown = high - low + 2 * HAIR * (high - chin)  # metres, as much below as above
+    zoom = min(1.0, FILLED * camera.height * float(camera.t_cam_world[2]) / (camera.fy * shown))
+    return replace(
+        camera,
+        fx=camera.fx * zoom,
+        fy=camera.fy * zoom,
+        cx=camera.width / 2 + (camera.cx - camera.width / 2) * zoom,
+        cy=camera.height / 2 + (camera.cy - camera.height / 2) * zoom,
+    )
 
 
 @torch.no_grad()
@@ -64,9 +77,10 @@ def neck_heights(trained: TrainedAvatar) -> tuple[float, float]:
     low = float(heights.min())
     chin = float(moved.min()) if len(moved) else low
     camera = _from_the_front(trained, chin, PIXELS)
-    middle = trained.render(trained.rest_params(), camera).alpha[
-        :, round(camera.width * 0.45) : round(camera.width * 0.55)
-    ]
+    image = trained.render(trained.rest_params(), camera).image
+    # Gaussians in the colour of the training's background may lie below: they are not seen.
+    seen = ((image - trained.background.to(image)).abs().amax(dim=-1) > SEEN).float()
+    middle = seen[:, round(camera.width * 0.45) : round(camera.width * 0.55)]
     rows = middle.mean(dim=1)
     lowest = float((rows >= rows.max() / 2).nonzero().max()) + 1
     end = chin - (lowest - camera.height / 2) / camera.fy * float(camera.t_cam_world[2])
