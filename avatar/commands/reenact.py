@@ -13,7 +13,7 @@ from avatar.pipeline import OK
 from avatar.pipeline.backdrop import parse_backdrop
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_driver
-from avatar.pipeline.reenact import PICTURES, Choices, first_picture, reenact, sidecars
+from avatar.pipeline.reenact import PICTURES, Choices, first_file, reenact, sidecars
 from avatar.pipeline.track import is_video, tracked_once
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained import TrainedAvatar
@@ -34,9 +34,8 @@ def run_reenact(arguments: Namespace) -> int:
         "a transparent video" if has_alpha else "a video",
     )
     behind = None if arguments.background is None else Path(arguments.background)
-    written = out if out.suffix.lower() != PICTURES else first_picture(out)
     inputs = [driver, behind, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
-    check_outputs([written, *sidecars(out)], inputs)
+    check_outputs([first_file(out), *sidecars(out)], inputs)
     if driver.suffix.lower() in DRIVE_SUFFIXES:
         reenact(trained, open_drive_file(driver, trained), out, choices, backdrop=backdrop)
     else:

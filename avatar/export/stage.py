@@ -60,13 +60,7 @@ def front_camera(trained: TrainedAvatar, size: int | None = None) -> Camera:
     camera = _from_the_front(trained, (low + high) / 2, size)
     shown = high - low + 2 * HAIR * (high - chin)  # metres, as much below as above
     zoom = min(1.0, FILLED * camera.height * float(camera.t_cam_world[2]) / (camera.fy * shown))
-    return replace(
-        camera,
-        fx=camera.fx * zoom,
-        fy=camera.fy * zoom,
-        cx=camera.width / 2 + (camera.cx - camera.width / 2) * zoom,
-        cy=camera.height / 2 + (camera.cy - camera.height / 2) * zoom,
-    )
+    return orbited(camera, zoom=zoom)
 
 
 @torch.no_grad()

@@ -70,8 +70,8 @@ def reenact(
     say: Callable[[str], None] = print,
 ) -> Path:
     """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture, or
-    alone over a backdrop. `sound` is the driver's video, whose sound goes along, and
-    the second at which the driver's frames begin in it.
+    alone over a backdrop. `sound` is the driver's video, whose sound goes along, and the second of it at which the driver's
+    frames begin.
 
     Returns the video's path. Raises UserError for choices out of range and for a driver tracked with another head model.
     """
@@ -105,7 +105,8 @@ def reenact(
         moved = [replace(params, neck=neck) for params in moved]
     if choices.camera == "driver" and choices.intrinsics == "driver":
         warn_of_other_intrinsics(cameras[0], own, say)
-    heard = None if sound is None or out.suffix.lower() == PICTURES else drive_sound(*sound, drive, say)
+    first = first_file(out)
+    heard = None if sound is None or first != out else drive_sound(*sound, drive, say)
     renderings = trained.stream(zip(moved, cameras, strict=True))
     loader = FrameLoader(driver, data.size) if backdrop is None and isinstance(driver, Subject) else None
     with loader or nullcontext():
@@ -115,7 +116,7 @@ def reenact(
         else:
             frames = (backdrop.pixels(each, trained.background) for each in renderings)
         shown = tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True)
-        if out.suffix.lower() == PICTURES:
+        if first != out:
             write_pictures(out, shown)
         else:
             write_video(out, shown, drive.fps, heard)
@@ -128,10 +129,7 @@ def reenact(
         "sound": None if heard is None else str(heard.source),
     }
     write_atomically(record, json.dumps(described, indent=2, allow_nan=False).encode())
-    shown_out = first_picture(out) if out.suffix.lower() == PICTURES else out
-    say(
-        f"{len(drive)} frames written to {shown_out}; its choices in {record.name}, each frame's distance in {table.name}"
-    )
+    say(f"{len(drive)} frames written to {first}; its choices in {record.name}, each frame's distance in {table.name}")
     return out
 
 
@@ -149,12 +147,17 @@ def write_pictures(out: Path, frames: Iterable[UInt8[np.ndarray, "H W C"]]) -> N
     for number, frame in enumerate(frames):
         order = cv2.COLOR_RGBA2BGRA if frame.shape[2] == 4 else cv2.COLOR_RGB2BGR
         _, data = cv2.imencode(PICTURES, cv2.cvtColor(frame, order))
-        write_atomically(first_picture(out, number), data.tobytes())
+        write_atomically(picture_file(out, number), data.tobytes())
 
 
-def first_picture(out: Path, number: int = 0) -> Path:
+def picture_file(out: Path, number: int) -> Path:
     """Where the picture of a frame is written, for an `out` that ends in .png."""
     return out.with_name(f"{shortened(out.stem)}-{number:05d}{PICTURES}")
+
+
+def first_file(out: Path) -> Path:
+    """What is written first: `out`, or the first picture for one that ends in .png."""
+    return picture_file(out, 0) if out.suffix.lower() == PICTURES else out
 
 
 def sidecars(video: Path) -> tuple[Path, Path]:

@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, Float32, UInt8
 from scipy.ndimage import median_filter
 
-from avatar.head.model import HeadModel
+from avatar.head.model import HeadModel, nearest_rotation
 from data_prep.formats.frame_track import FrameTrack
 
 SIDE = 256  # pixels of the longer side of the pictures that are aligned
@@ -60,7 +61,8 @@ def neck_of(model: HeadModel, ring: np.ndarray) -> Neck:
 
 
 class TorsoTracker:
-    """Aligns the clothes of the frames of one clip; `rotation` of the torso is then about the camera's axes."""
+    """Aligns the clothes of a clip's frames with those of its `reference`; `mean` is the head's mean orientation before the
+    camera, which the torso has where it does not turn."""
 
     def __init__(self, tracks: dict[int, FrameTrack], neck: Neck, picture: Callable[[int], Picture]) -> None:
         self._tracks, self._neck, self._picture = tracks, neck, picture
@@ -68,7 +70,7 @@ class TorsoTracker:
         self._scale = SIDE / max(first.size)
         width, height = first.size
         self.size = max(1, round(width * self._scale)), max(1, round(height * self._scale))
-        self.mean = _mean_rotation(np.stack([track.R for track in tracks.values()]))
+        self.mean = nearest_rotation(torch.from_numpy(np.mean([track.R for track in tracks.values()], axis=0))).numpy()
         self.reference = self._typical_frame()
         self._place = self._base(self.reference)
         clothes = self._clothes(self.reference)
@@ -152,11 +154,6 @@ def with_torso(
         neck = tracker.turn(number, shift).T @ track.R
         found[number] = replace(track, neck=neck[:2].ravel())
     return found
-
-
-def _mean_rotation(rotations: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "3 3"]:
-    U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
 def _between(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

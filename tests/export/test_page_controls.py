@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from browsers import chromium
 from lively import lively_avatar
 from pages import shown, until
 
@@ -35,12 +34,6 @@ CONTRAST = """() => {
     return [(a + 0.05) / (b + 0.05), e.textContent];
   });
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

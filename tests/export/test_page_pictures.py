@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from browsers import WEB, chromium
+from browsers import WEB
 from lively import lively_avatar, psnr
 from pages import until
 
@@ -24,12 +23,6 @@ WIDTHS = """() => {
   window.widths = [];
   avatar.addEventListener("drawn", () => widths.push(avatar.canvas.width));
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from browsers import WEB, chromium, served
+from browsers import WEB, served
 from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
 from pages import shown, until
@@ -32,12 +32,6 @@ NEW_PICTURE = """async () => {
   while (avatar.isBusy || performance.now() - drawn < 150) await frame();
   avatar.removeEventListener("drawn", note);
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

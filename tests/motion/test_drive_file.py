@@ -46,7 +46,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert said == "" and (found.name, found.fps, found.names) == ("d", 30.0, ("a", "b", "c"))
     assert torch.equal(found.identity, drive.identity)
     for a, b in zip(found.params, drive.params, strict=True):
-        for name in ("expression", "jaw", "eyes", "eyelids"):
+        for name in ("expression", "jaw", "eyes", "eyelids", "neck"):
             assert torch.equal(getattr(a, name), getattr(b, name)), name
     assert found.cameras is not None
     for a, b in zip(found.cameras, cameras, strict=True):
