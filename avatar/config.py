@@ -113,9 +113,9 @@ class TrainerConfig:
     )
     dssim_weight: Annotated[float, WEIGHT, "weight of D-SSIM in steps where it replaces LPIPS"] = 0.2
     dssim_early: Annotated[float, WEIGHT, "weight of D-SSIM before the perceptual loss begins"] = 0.1
-    prune_share: Annotated[
-        float, SHARE, "Gaussians whose rendered coverage lies less than this share on the head are pruned; 0: none"
-    ] = 0.05
+    opposite_background: Annotated[
+        int | None, STEPS, "every so many-th step is over black where the background is light, else white; null: none"
+    ] = 3
     pose_rate: Annotated[
         float, SHARE, "learning rate of the training frames' pose corrections, in half degrees and millimetres; 0: none"
     ] = 0.01

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple, cast
 
 import torch
@@ -80,6 +80,15 @@ class Objective:
     config: TrainerConfig
     background: Float[Tensor, 3]
     perceptual: PerceptualTerm
+
+    def background_of(self, step: int) -> Float[Tensor, 3]:
+        """Behind the head in step `step` (from 0): over one colour alone, Gaussians of that colour cost nothing."""
+        every = self.config.opposite_background
+        return self._opposite if every is not None and step % every == every - 1 else self.background
+
+    @cached_property
+    def _opposite(self) -> Float[Tensor, 3]:
+        return (self.background < 0.5).to(self.background)
 
     def term(self, step: int) -> Weighted | None:
         """The third term of step `step`."""

@@ -34,6 +34,7 @@ class StepInputs(NamedTuple):
 
     frame: Frame
     vertices: Float[Tensor, "V 3"]  # posed by the frame's parameters, metres
+    background: Float[Tensor, "3"]  # behind the rendered and the true head
     noise: Float[Tensor, " C"] | None = None  # added to the network's input
     row: Int[Tensor, "1"] | None = None  # of the frame among the pose corrections
     pose_jacobian: Float[Tensor, "5 12"] | None = None  # of the frame's camera in its correction
@@ -47,7 +48,8 @@ class StepInputs(NamedTuple):
         named |= {name: getattr(frame.params, name) for name in _PARAMS}
         named |= {} if camera.R_ref_cam is None else {"R_ref_cam": camera.R_ref_cam}
         optional = {name: getattr(self, name) for name in _OPTIONAL}
-        return named | {"vertices": self.vertices} | {n: value for n, value in optional.items() if value is not None}
+        required = {"vertices": self.vertices, "background": self.background}
+        return named | required | {n: value for n, value in optional.items() if value is not None}
 
     def with_tensors(self, named: Mapping[str, Tensor]) -> StepInputs:
         """The same with other `tensors`."""
@@ -56,7 +58,7 @@ class StepInputs(NamedTuple):
         )
         params = HeadParams(**{name: named[name] for name in _PARAMS})
         frame = replace(self.frame, camera=camera, params=params, **{name: named[name] for name in _IMAGES})
-        return StepInputs(frame, named["vertices"], **{name: named.get(name) for name in _OPTIONAL})
+        return StepInputs(frame, named["vertices"], named["background"], **{name: named.get(name) for name in _OPTIONAL})
 
 
 class StepOutputs(NamedTuple):
@@ -90,7 +92,7 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
     is not finite; with a `judge` the latter is for it to see to.
     """
     avatar, objective, frame = state.avatar, state.objective, inputs.frame
-    target = frame.composite(objective.background)
+    target = frame.composite(inputs.background)
     params, camera = frame.params, frame.camera
     if inputs.noise is not None:
         params = params.with_condition(params.condition() + inputs.noise)
@@ -98,7 +100,7 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
         camera = state.pose_corrections(camera, inputs.row, inputs.pose_jacobian)
     try:
         gaussians = avatar(params, inputs.vertices, camera.head_rotation.detach())
-        image, *smaller = avatar.training_images(gaussians, camera, objective.background, sh_degree(step))
+        image, *smaller = avatar.training_images(gaussians, camera, inputs.background, sh_degree(step))
     except CannotDraw as error:
         raise stopped(step + 1, frame, str(error)) from error
     crop = None

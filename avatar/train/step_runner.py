@@ -117,7 +117,8 @@ class StepRunner:
         if term is None or not term.crops:
             crop = [None, None]
         frame = replace(frame, camera=camera)
-        return StepInputs(frame, self.vertices(frame), self._noise_of(step), row, jacobian, *crop)
+        background = self._state.objective.background_of(step)
+        return StepInputs(frame, self.vertices(frame), background, self._noise_of(step), row, jacobian, *crop)
 
     def _constants_of(self, frame: Frame) -> FrameConstants:
         camera, corrections, device = frame.camera, self._state.pose_corrections, self._device

@@ -26,7 +26,6 @@ from avatar.train.objective import Objective, PerceptualTerm
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.pose_corrections import PREFIX, make_pose_corrections
-from avatar.train.prune import prune_background_gaussians, prune_step
 from avatar.train.step import TrainState, stopped
 from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor
 from avatar.train.step_runner import StepRunner
@@ -103,9 +102,6 @@ def train(
                 outcome = steps.make(step, frame, progress.judge)
                 step += 1
                 progress.note(step, outcome)
-                if avatar.has_colours and step == prune_step(trainer):
-                    progress.settle()
-                    prune_background_gaussians(avatar, loader, subject.split.train, trainer.prune_share, step)
                 saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
                 if saves or interrupted():
                     progress.settle()

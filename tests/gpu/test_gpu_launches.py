@@ -106,6 +106,6 @@ def test_the_rehearsal_would_notice_a_number_that_is_read_back(counting: ModuleT
 
 def test_the_rehearsal_would_notice_a_tensor_on_another_device(counting: ModuleType) -> None:
     rehearsal = counting.Rehearsal(grid_head(), 32, 64)
-    rehearsal.background = torch.ones(3)
+    rehearsal.frame = replace(rehearsal.frame, alpha=torch.ones(64, 64))
     with pytest.raises((RuntimeError, ValueError), match=r"meta|cpu"):
         rehearsal.step(STAND_IN, late=True)

@@ -33,7 +33,6 @@ from avatar.splat import CannotDraw, gpu_buffers
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import choose_perceptual
-from avatar.train.prune import coverage
 from avatar.train.trainer import train
 from avatar.types import Frame
 from avatar.view.view_renderer import Look, Setting, ViewRenderer
@@ -63,7 +62,6 @@ DRAWN: dict[str, Callable[[TrainedAvatar], object]] = {
     "a viewed frame": lambda trained: ViewRenderer(trained).draw(
         (trained.rest_params(), trained.rest_camera(32)), Setting(), 32
     ),
-    "a frame that prunes": lambda trained: coverage(trained.avatar, frame_of(trained), 7),
 }
 
 

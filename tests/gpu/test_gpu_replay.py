@@ -38,7 +38,6 @@ TINY = (
     "trainer.perceptual=dssim",
     "trainer.iterations=12",
     "trainer.checkpoint_every=5",
-    "trainer.prune_share=0",
 )
 
 

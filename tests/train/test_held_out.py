@@ -32,7 +32,7 @@ def trained(assets: HeadAssets, subject: Subject, run: Path, *overrides: str) ->
     return load_avatar(run / AVATAR_FILE, Path(subject.manifest.head_path))
 
 
-# The default recipe corrects poses and prunes Gaussians; it starts from the frames' colours and adds noise.
+# The default recipe corrects poses; it starts from the frames' colours and adds noise.
 @pytest.mark.parametrize("recipe", [(), PAPER], ids=["default", "paper"])
 def test_noise_in_held_out_frames_changes_no_bit_of_a_trained_avatar(
     tracked_folder: Path, tmp_path: Path, recipe: tuple[str, ...]
