@@ -130,6 +130,8 @@ def finish_training(
             f"Note: the decoded frames take {shown_size(decoded)}, of which {shown_size(CACHE_BYTES)} are kept in memory; "
             "the others are decoded again at each turn"
         )
+    if config.trainer.checkpoint_every < config.trainer.iterations:
+        print(f"Watch        avatar view {run} (from step {config.trainer.checkpoint_every} on)")
     begin = time.monotonic()
     done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
     first = checkpoint.step if checkpoint else 0

@@ -1,4 +1,4 @@
-"""What a run shows while it works: a progress bar, preview images and, where tensorboard is installed, its scalars."""
+"""What a run shows while it works: a progress bar, preview images and curves, with tensorboard where it is installed."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from avatar.errors import MissingPackage, check_installed
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
+from avatar.runs.curves import read_curves, write_curves
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -26,10 +26,12 @@ SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
 
 
 class TrainingLog:
-    """Writes RUN/tensorboard and RUN/previews; a context manager, so that an interruption still closes its files."""
+    """Writes RUN/curves.csv, RUN/previews and RUN/tensorboard; a context manager, so that an interruption still closes
+    its files."""
 
     def __init__(self, run: Path, start: int, stop: int) -> None:
-        self._previews = run / "previews"
+        self._run, self._previews = run, run / "previews"
+        self._rows = [tuple(row) for row in read_curves(run) if row[0] <= start]
         self._writer = _open_writer(run / "tensorboard", start)
         self._bar = tqdm(total=stop, initial=start, unit="step", desc="train", dynamic_ncols=True)
         self._loss = self._psnr = math.nan
@@ -62,6 +64,7 @@ class TrainingLog:
         self._bar.update(1)
         if self.shows(step):
             self._psnr = smoothed(self._psnr, quality, LOG_EVERY)
+            self._rows.append((step, total, quality))
             if self._writer is not None:
                 for name, term in terms.items():
                     self._writer.add_scalar(f"loss/{name}", term, step)
@@ -70,6 +73,10 @@ class TrainingLog:
         if not math.isnan(self._psnr):  # none is measured before the first step that is logged
             shown["psnr"] = f"{self._psnr:.2f}"
         self._bar.set_postfix(shown, refresh=False)
+
+    def save(self) -> None:
+        """Write the curves. Raises UserError when the disk refuses."""
+        write_curves(self._run, self._rows)
 
     def say(self, news: str) -> None:
         """Above the bar, and where it is."""
@@ -86,19 +93,13 @@ class TrainingLog:
 
 
 def _open_writer(folder: Path, start: int) -> SummaryWriter | None:
-    """None where no curves can be written, which it says."""
+    """None where tensorboard is not installed, cannot be imported, or cannot write into a folder of that name."""
     try:
-        check_installed("recording curves", "plots", "tensorboard")
         from torch.utils.tensorboard import SummaryWriter
 
         return SummaryWriter(str(folder), purge_step=start)
-    except MissingPackage as missing:
-        print(f"Note: {missing}")
-    except ImportError as error:  # a package that it needs is of another version
-        print(f"Note: curves are not recorded: tensorboard cannot be imported ({error})")
-    except UnicodeEncodeError:
-        print(f"Note: curves are not recorded: tensorboard cannot write to {folder}, whose name is not UTF-8")
-    return None
+    except (ImportError, UnicodeEncodeError):
+        return None
 
 
 def smoothed(mean: float, value: float, steps: int) -> float:

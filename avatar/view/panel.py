@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import Float64
+
 from avatar.view.messages import Value, one_of, pressed, switched, within
 from avatar.view.view_renderer import Setting
 
 if TYPE_CHECKING:
     from avatar.view.server import Viewer
 
+CURVE_POINTS = 100  # means of as many parts of a training
+PLOT_HEIGHT = 130  # pixels
+LINE = "#228be6"
 LABELS = {
     "jaw": "jaw open",
     "look_left": "look to its left",
@@ -31,6 +37,7 @@ class Panel:
         self._live = (
             None if live_name is None else gui.add_text(live_name.capitalize(), "", multiline=True, disabled=True)
         )
+        self._plots: list[Any] = []
         self._add_motion(calibrate)
         self._add_picture()
         self._add_face()
@@ -44,6 +51,28 @@ class Panel:
         self._play.label = "Pause" if player.is_playing else "Play"
         if player.is_playing:
             self._scrub.value = round(player.share, 3)
+
+    def draw_curves(self, curves: Float64[np.ndarray, "N 3"], is_open: bool) -> None:
+        """Loss and PSNR of the training, of `read_curves`; `is_open` unfolds them where they are new."""
+        if len(curves) == 0:
+            return
+        means = np.array([part.mean(axis=0) for part in np.array_split(curves, min(len(curves), CURVE_POINTS))])
+        steps, *values = np.ascontiguousarray(means.T)
+        if not self._plots:
+            with self._gui.add_folder("Training", order=self._status.order + 0.5, expand_by_default=is_open):
+                self._plots = [self._plot(title, steps) for title in ("Loss", "PSNR, dB")]
+        for plot, column in zip(self._plots, values, strict=True):
+            plot.data = (steps, column)
+
+    def _plot(self, title: str, steps: np.ndarray) -> Any:
+        return self._gui.add_uplot(
+            (steps, steps),
+            ({"label": "step"}, {"label": title, "stroke": LINE, "width": 1.5}),
+            title=title,
+            scales={"x": {"time": False}},
+            legend={"show": False},
+            height=PLOT_HEIGHT,
+        )
 
     def _safe(self, act: Callable[[Any], object]) -> Callable[[Any], None]:
         """An error belongs to who pressed the control."""

@@ -83,7 +83,7 @@ def test_pictures_keep_their_shape() -> None:
     picture = np.zeros((10, 20, 3), np.uint8)
     assert padded(picture, 4.0, (1.0, 1.0, 1.0)).shape == (10, 40, 3)
     tall = padded(picture, 0.5, (1.0, 0.5, 0.0))
-    assert tall.shape == (40, 20, 3) and (tall[15:25] == 0).all() and tall[0, 0].tolist() == [255, 128, 0]
+    assert tall.shape == (40, 20, 3) and (tall[:10] == 0).all() and tall[10, 0].tolist() == [255, 128, 0]
 
 
 @pytest.mark.parametrize("aspect", [1 / 16384, 10 / 900, 0.46, 1.0, 3000.0, 16384.0])
