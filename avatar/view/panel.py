@@ -50,7 +50,7 @@ class Panel:
         player = self._viewer.player
         self._play.label = "Pause" if player.is_playing else "Play"
         if player.is_playing:
-            self._scrub.value = round(player.share, 3)
+            self._scrub.value = round(player.seconds, 2)
 
     def draw_curves(self, curves: Float64[np.ndarray, "N 3"], is_open: bool) -> None:
         """Loss and PSNR of the training, of `read_curves`; `is_open` unfolds them where they are new."""
@@ -102,7 +102,13 @@ class Panel:
         def choose(_: Any) -> None:
             with viewer.lock:
                 player.choose(motion.value)
+            limit()
             viewer.touch()
+
+        def limit() -> None:
+            self._scrub.value, self._scrub.disabled = 0.0, player.clip is None
+            self._scrub.max = max(round(player.duration, 2), 0.01)
+            viewer.door.admit(self._scrub, within(0.0, self._scrub.max))
 
         def toggle(event: Any) -> None:
             if player.clip is None:
@@ -122,8 +128,9 @@ class Panel:
             motion = gui.add_dropdown("Motion", player.names, initial_value=player.name)
             self._input(motion, one_of(player.names), choose)
             self._play = self._button("Play", toggle)
-            scrub = gui.add_slider("Place", min=0.0, max=1.0, step=0.001, initial_value=0.0)
-            self._scrub = self._input(scrub, within(0.0, 1.0), seek)
+            scrub = gui.add_slider("Time, s", min=0.0, max=0.01, step=0.01, initial_value=0.0)
+            self._scrub = self._input(scrub, within(0.0, 0.0), seek)
+            limit()
             if calibrate is not None:
                 self._button("Take this face as neutral", lambda _: calibrate())
 
@@ -159,15 +166,15 @@ class Panel:
         self._button("Reset face", reset)
 
     def _slider(self, label: str, limits: tuple[float, float], part: str, key: int | str) -> Any:
-        low, high = (round(limit, 2) for limit in limits)
-        if low == high:
-            low, high = limits
-        slider = self._gui.add_slider(label, min=low, max=high, step=(high - low) / 200, initial_value=0.0)
+        """In percent of the farthest that training shows."""
+        farthest = max(-limits[0], limits[1])
+        low, high = (float(round(100 * limit / farthest)) for limit in limits)
+        slider = self._gui.add_slider(label, min=low, max=high, step=1.0, initial_value=0.0)
 
         def moved(_: Any) -> None:
             with self._viewer.lock:
                 values = getattr(self._viewer.setting, part)
-                self._viewer.change(**{part: {**values, key: float(slider.value)}})
+                self._viewer.change(**{part: {**values, key: float(slider.value) / 100 * farthest}})
 
         return self._input(slider, within(low, high), moved)
 

@@ -236,7 +236,8 @@ class Viewer:
 
 
 def padded(picture: np.ndarray, aspect: float, background: tuple[float, ...]) -> np.ndarray:
-    """The picture in the middle of one of another width over height, at the top of an upright one; smaller where that would be larger than LARGEST."""
+    """The picture in the middle of one of another width over height, or at the top of an upright one, where a phone has no
+    controls; smaller where that would be larger than LARGEST."""
     height, width = picture.shape[:2]
     factor = min(LARGEST / max(width, height * aspect), LARGEST / max(height, width / aspect), 1.0)
     if factor < 1.0:

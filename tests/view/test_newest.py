@@ -38,7 +38,7 @@ def train_on(shown: TrainedAvatar, steps: int) -> bytes:
     """Write what training would, `steps` later; the bytes of the file."""
     model = deepcopy(shown.avatar)
     with torch.no_grad():
-        model.sh_dc += 0.5
+        dict(model.named_parameters())["sh_dc"].add_(0.5)
     recording, neutral, step = shown.recording, shown.neutral, shown.step + steps
     write_avatar(shown.source, model, shown.config, recording, neutral, step, shown.perceptual)
     return shown.source.read_bytes()
