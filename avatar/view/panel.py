@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from avatar.view.server import Viewer
 
 CURVE_POINTS = 100  # means of as many parts of a training
-PLOT_HEIGHT = 130  # pixels
+PLOT_HEIGHT = 120  # pixels
+LINEAR, LOG = 1, 3  # "distr" of uPlot
 LINE = "#228be6"
 LABELS = {
     "jaw": "jaw open",
@@ -60,16 +61,18 @@ class Panel:
         steps, *values = np.ascontiguousarray(means.T)
         if not self._plots:
             with self._gui.add_folder("Training", order=self._status.order + 0.5, expand_by_default=is_open):
-                self._plots = [self._plot(title, steps) for title in ("Loss", "PSNR, dB")]
+                self._plots = [self._plot("Loss", LOG), self._plot("PSNR, dB", LINEAR)]
         for plot, column in zip(self._plots, values, strict=True):
             plot.data = (steps, column)
 
-    def _plot(self, title: str, steps: np.ndarray) -> Any:
+    def _plot(self, title: str, scale: int) -> Any:
         return self._gui.add_uplot(
-            (steps, steps),
+            (np.zeros(1), np.ones(1)),
             ({"label": "step"}, {"label": title, "stroke": LINE, "width": 1.5}),
             title=title,
-            scales={"x": {"time": False}},
+            scales={"x": {"time": False}, "y": {"distr": scale}},
+            axes=({"size": 28}, {"size": 50}),
+            padding=(12, 24, 0, 0),
             legend={"show": False},
             height=PLOT_HEIGHT,
         )
@@ -106,7 +109,7 @@ class Panel:
             viewer.touch()
 
         def limit() -> None:
-            self._scrub.value, self._scrub.disabled = 0.0, player.clip is None
+            self._scrub.value, self._scrub.visible = 0.0, player.clip is not None
             self._scrub.max = max(round(player.duration, 2), 0.01)
             viewer.door.admit(self._scrub, within(0.0, self._scrub.max))
 
