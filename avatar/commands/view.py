@@ -96,17 +96,14 @@ def run_view(arguments: Namespace) -> int:
 def follow(viewer: Viewer, newest: Newest, arguments: Namespace) -> None:
     """Show each newer avatar of a run and how far its training is, for ever."""
     shown = viewer.renderer.trained
-    run = shown.source.parent if shown.source.with_name(RUN_FILE).is_file() else None
-    if run is not None:
-        viewer.panel.draw_curves(read_curves(run), shown.step < shown.config.trainer.iterations)
+    run = shown.source.parent
+    viewer.panel.draw_curves(read_curves(run), shown.step < shown.config.trainer.iterations)
     while True:
-        if run is not None:
-            viewer.progress = progress(shown, run)
+        viewer.progress = progress(shown, run)
         time.sleep(POLL_SECONDS)
         if (newer := newest.poll(shown, lambda: open_trained(arguments.run, arguments.head))) is not None:
             viewer.follow(shown := newer)
-            if run is not None:
-                viewer.panel.draw_curves(read_curves(run), True)
+            viewer.panel.draw_curves(read_curves(run), True)
 
 
 def checked_token(given: str | None) -> str | None:

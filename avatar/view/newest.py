@@ -10,8 +10,6 @@ from avatar.errors import UserError
 from avatar.files.lock import is_held
 from avatar.runs.trained import TrainedAvatar
 
-State = tuple[int, ...]
-
 
 class Newest:
     """Made before the avatar is opened, so that nothing that is written meanwhile is missed."""
@@ -40,7 +38,7 @@ def progress(trained: TrainedAvatar, run: Path) -> str:
     return f"Step {trained.step:,} of {last:,}: {state}"
 
 
-def _state(path: Path) -> State:
+def _state(path: Path) -> tuple[int, ...]:
     """Another one once the file has changed."""
     try:
         status = path.stat()

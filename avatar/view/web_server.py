@@ -117,7 +117,7 @@ class WebServer:
     def __init__(self, listening: socket.socket, gate: Gate, door: Door, complaints: Complaints, label: str) -> None:
         self._gate, self._door, self._complaints = gate, door, complaints
         self._listening = listening
-        self._head = f"<title>{html.escape(label)} - avatar</title>{DARK_MODE}".encode()
+        self._head = f"<title>{html.escape(label)} - avatar</title>{DARK_MODE}".encode(errors="replace")
         self._library: library.Server | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a client may leave at any time

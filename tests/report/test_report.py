@@ -50,10 +50,13 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     assert len(page) < 8e6
 
 
-def test_curves_are_those_that_training_recorded(run: Path) -> None:
+def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path) -> None:
     steps, loss, psnr = read_curves(run).T
     assert steps.tolist() == [2, 4, 6, 8, 10, 12] and (loss > 0).all() and (psnr > 0).all()
     assert len(read_curves(run / "nowhere")) == 0
+    for damaged in (b"", b"step,loss,psnr\n1,2,3\n4,5", b"step,loss,psnr\n1,2,x\n", b"\xff"):
+        (tmp_path / "curves.csv").write_bytes(damaged)
+        assert len(read_curves(tmp_path)) == 0
 
 
 def test_protocols_without_a_figure_have_a_dash() -> None:
