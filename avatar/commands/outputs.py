@@ -12,7 +12,7 @@ from avatar.runs.curves import CURVES_FILE
 from avatar.runs.run import RUN_FILE
 
 RUN_FILES = (RUN_FILE, AVATAR_FILE, CURVES_FILE, LOCK_FILE)
-RUN_FOLDERS = ("checkpoints", "tensorboard", "previews", "eval", "rounds")
+RUN_FOLDERS = ("checkpoints", "previews", "eval", "rounds")
 
 
 def check_file(output: Path, suffixes: Sequence[str], what: str) -> None:

@@ -167,11 +167,11 @@ def _frames(run: Run) -> list[Markup]:
 
 def _curves(run: Path) -> list[Markup]:
     curves = read_curves(run)
-    steps, *columns = curves[:: max(1, -(-len(curves) // MAX_POINTS))].T
+    steps, psnr, loss, *_ = curves[:: max(1, -(-len(curves) // MAX_POINTS))].T
     if len(steps) == 0:
         return [element("p", "No curves were recorded.", class_="soft")]
     plots = []
-    for title, scale, values in zip(("loss", "PSNR, dB"), ("log", "linear"), columns, strict=True):
+    for title, scale, values in (("loss", "log", loss), ("PSNR, dB", "linear", psnr)):
         figure, (axes,) = figure_of()
         axes.plot(steps, values, color=SERIES[0], linewidth=0.9)
         axes.set(xlabel="step", ylabel=title, yscale=scale)

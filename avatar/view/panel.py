@@ -53,16 +53,16 @@ class Panel:
         if player.is_playing:
             self._scrub.value = round(player.seconds, 2)
 
-    def draw_curves(self, curves: Float64[np.ndarray, "N 3"], is_open: bool) -> None:
+    def draw_curves(self, curves: Float64[np.ndarray, "N 6"], is_open: bool) -> None:
         """Loss and PSNR of the training, of `read_curves`; `is_open` unfolds them where they are new."""
         if len(curves) == 0:
             return
         means = np.array([part.mean(axis=0) for part in np.array_split(curves, min(len(curves), CURVE_POINTS))])
-        steps, *values = np.ascontiguousarray(means.T)
+        steps, psnr, loss = np.ascontiguousarray(means.T[:3])
         if not self._plots:
             with self._gui.add_folder("Training", order=self._status.order + 0.5, expand_by_default=is_open):
                 self._plots = [self._plot("Loss", LOG), self._plot("PSNR, dB", LINEAR)]
-        for plot, column in zip(self._plots, values, strict=True):
+        for plot, column in zip(self._plots, (loss, psnr), strict=True):
             plot.data = (steps, column)
 
     def _plot(self, title: str, scale: int) -> Any:

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small_runs import train_small
 from tracked_folder import write_tracked_folder
@@ -51,10 +52,11 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
 
 
 def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path) -> None:
-    steps, loss, psnr = read_curves(run).T
-    assert steps.tolist() == [2, 4, 6, 8, 10, 12] and (loss > 0).all() and (psnr > 0).all()
+    steps, psnr, total, *terms = read_curves(run).T
+    assert steps.tolist() == [2, 4, 6, 8, 10, 12] and (total > 0).all() and (psnr > 0).all()
+    np.testing.assert_allclose(sum(terms), total, rtol=1e-5)
     assert len(read_curves(run / "nowhere")) == 0
-    for damaged in (b"", b"step,loss,psnr\n1,2,3\n4,5", b"step,loss,psnr\n1,2,x\n", b"\xff"):
+    for damaged in (b"", b"step,psnr,total\n1,2,3\n", b"step\n1,2,3,4,5,x\n", b"\xff"):
         (tmp_path / "curves.csv").write_bytes(damaged)
         assert len(read_curves(tmp_path)) == 0
 

@@ -45,7 +45,6 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
         "curves.csv",
         "previews",
         "run.json",
-        "tensorboard",
     ]
     assert (tmp_path / "run" / "previews" / "step_00000120.png").is_file()
     assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 3
