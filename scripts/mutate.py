@@ -34,7 +34,6 @@ def load() -> None:
     import scipy.linalg
     import scipy.spatial
     import scipy.stats  # noqa: F401
-    import torch.utils.tensorboard  # noqa: F401
     import trimesh  # noqa: F401
 
 

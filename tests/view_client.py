@@ -66,7 +66,7 @@ class Page:
         self.folders: list[str] = []
         self.notifications: list[str] = []
         self.pictures = 0
-        self._picture = b""
+        self._picture, self.format = b"", ""
         self.send(camera(**window))
 
     def __enter__(self) -> Page:
@@ -119,7 +119,7 @@ class Page:
         kind, props = message["type"], message.get("props") or {}
         if kind == "BackgroundImageMessage" and (data := message["rgb_data"]) is not None:
             self._picture = buffers[data["__binary_index"]] if isinstance(data, dict) else data
-            self.pictures += 1
+            self.pictures, self.format = self.pictures + 1, message["format"]
         elif kind == "GuiFolderMessage":
             self.folders.append(props["label"])
         elif kind == "GuiUpdateMessage":

@@ -31,9 +31,11 @@ from avatar.files.third_party import (
 from avatar.version import __version__
 
 DOWNLOAD = "avatar models --download"
-EXTRAS = {"mediapipe": ("track", "track videos"), "viser": ("view", "avatar view")} | dict.fromkeys(
-    ("matplotlib", "tensorboard"), ("plots", "curves, reports")
-)
+EXTRAS = {
+    "mediapipe": ("track", "track videos"),
+    "viser": ("view", "avatar view"),
+    "matplotlib": ("plots", "curves, reports"),
+}
 
 
 class Finding(NamedTuple):

@@ -14,6 +14,7 @@ from argparse import Namespace
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
@@ -24,9 +25,11 @@ from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_run
 from avatar.runs.clips import Clip, driven_clip, own_clip
+from avatar.runs.curves import read_curves
 from avatar.runs.run import RUN_FILE, Run, open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained import TrainedAvatar, avatar_path
 from avatar.view.auth import LOCAL
+from avatar.view.newest import Newest, progress
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.view_renderer import ViewRenderer
@@ -34,13 +37,18 @@ from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.pictures import open_source
 
+if TYPE_CHECKING:
+    from avatar.view.server import Viewer
+
 WIDTHS = (64, 2048)
 CACHED_PICTURES = 64
 EVERY_ADDRESS = ("0.0.0.0", "::", "")
 END_SECONDS = 5.0  # after Ctrl-C
+POLL_SECONDS = 1.0
 
 
 def run_view(arguments: Namespace) -> int:
+    newest = Newest(avatar_path(arguments.run))
     run = open_with_video(arguments)
     trained = open_trained(arguments.run, arguments.head) if run is None else run.trained
     if arguments.size is not None and not WIDTHS[0] <= arguments.size <= WIDTHS[1]:
@@ -60,8 +68,8 @@ def run_view(arguments: Namespace) -> int:
     renderer = ViewRenderer(trained, None if run is None else truth_of(run))
     live = open_live(arguments, trained, token)
     try:
-        newest, name = (None, "") if live is None else (live.newest, live.name)
-        player = Player(trained, motions, time.monotonic, newest, name)
+        frames, name = (None, "") if live is None else (live.newest, live.name)
+        player = Player(trained, motions, time.monotonic, frames, name)
         about = (None, None) if live is None else (live.status, live.calibrate)
         viewer = Viewer(renderer, player, width, arguments.host, arguments.port, token, url, *about)
         try:
@@ -71,8 +79,7 @@ def run_view(arguments: Namespace) -> int:
             elif live is not None:
                 live.start(viewer.wake.set)
             print("Ctrl-C ends it.", flush=True)
-            while True:
-                time.sleep(3600)
+            follow(viewer, newest, arguments)
         except KeyboardInterrupt:
             end = threading.Timer(END_SECONDS, os._exit, (INTERRUPTED,))  # whatever a library's thread still waits for
             end.daemon = True
@@ -84,6 +91,19 @@ def run_view(arguments: Namespace) -> int:
         if live is not None:
             live.close()
     return OK
+
+
+def follow(viewer: Viewer, newest: Newest, arguments: Namespace) -> None:
+    """Show each newer avatar of a run and how far its training is, for ever."""
+    shown = viewer.renderer.trained
+    run = shown.source.parent
+    viewer.panel.draw_curves(read_curves(run), shown.step < shown.config.trainer.iterations)
+    while True:
+        viewer.progress = progress(shown, run)
+        time.sleep(POLL_SECONDS)
+        if (newer := newest.poll(shown, lambda: open_trained(arguments.run, arguments.head))) is not None:
+            viewer.follow(shown := newer)
+            viewer.panel.draw_curves(read_curves(run), True)
 
 
 def checked_token(given: str | None) -> str | None:

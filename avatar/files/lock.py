@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.atomic import is_running
 from avatar.files.opening import read_json
 
 LOCK_FILE = ".lock"
@@ -43,6 +44,15 @@ def locked(folder: Path, otherwise: str = "choose another --out") -> Iterator[No
         if is_new:
             with suppress(OSError):  # it is not empty
                 folder.rmdir()
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a process works in the folder, as far as its lock file says; a lock that is asked is not taken."""
+    try:
+        holder = read_json(folder / LOCK_FILE)
+        return holder["machine"] != platform.node() or is_running(holder["process"])
+    except (UserError, KeyError, TypeError):
+        return False
 
 
 def _acquire(path: Path) -> int:

@@ -24,6 +24,7 @@ from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import check_data, moved_source
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
+from avatar.runs.curves import CURVES_FILE
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
@@ -130,6 +131,8 @@ def finish_training(
             f"Note: the decoded frames take {shown_size(decoded)}, of which {shown_size(CACHE_BYTES)} are kept in memory; "
             "the others are decoded again at each turn"
         )
+    if config.trainer.checkpoint_every < config.trainer.iterations:
+        print(f"Watch        avatar view {run} (from step {config.trainer.checkpoint_every} on)")
     begin = time.monotonic()
     done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
     first = checkpoint.step if checkpoint else 0
@@ -141,6 +144,5 @@ def finish_training(
     print(f"Trained in {seconds:.0f} s ({rate}).")
     print(f"Avatar       {run / 'avatar.safetensors'}")
     print(f"Previews     {run / 'previews'}")
-    if next((curves := run / "tensorboard").glob("events*"), None) is not None:
-        print(f"Curves       tensorboard --logdir {curves}")
+    print(f"Curves       {run / CURVES_FILE}")
     return OK

@@ -17,6 +17,7 @@ from avatar.files.opening import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
 from avatar.report.pictures import frame_panels
+from avatar.runs.curves import read_curves
 from avatar.runs.run import Run, versions
 
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
@@ -38,7 +39,7 @@ if (slider) { slider.addEventListener("input", show); show(); }
 def write_report(run: Run) -> Path:
     """Write RUN/report.html and return it. Parts that a run does not have yet (its evaluation, its curves) are named as
     missing. Raises UserError when the evaluation's results cannot be read, a frame is gone, or a package is missing."""
-    check_installed("a report", "plots", "matplotlib", "tensorboard")
+    check_installed("a report", "plots", "matplotlib")
     path = run.path / "report.html"
     write_atomically(path, render_report(run).encode())
     return path
@@ -61,7 +62,7 @@ def render_report(run: Run) -> str:
         section("Run", tiles(facts)),
         section("Held-out figures", *_figures(run, results)),
         section("Held-out frames", *_frames(run)),
-        section("Training", *_curves(run.path / "tensorboard")),
+        section("Training", *_curves(run.path)),
         section("Origin", *_origin(run, results)),
     ]
     return document(f"Run {run.path.name}", parts, SCRIPT)
@@ -164,37 +165,18 @@ def _frames(run: Run) -> list[Markup]:
     return [*by_tracker, element("div", slider, join(figures), id="frames")]
 
 
-def _curves(folder: Path) -> list[Markup]:
-    try:
-        curves = read_curves(folder)
-    except UnicodeEncodeError:
-        return [element("p", "Curves are not read from a folder whose name is not UTF-8.", class_="soft")]
-    shown = [(tag, title) for tag, title in (("loss/total", "loss"), ("train/psnr", "PSNR, dB")) if curves.get(tag)]
-    if not shown:
+def _curves(run: Path) -> list[Markup]:
+    curves = read_curves(run)
+    steps, psnr, loss, *_ = curves[:: max(1, -(-len(curves) // MAX_POINTS))].T
+    if len(steps) == 0:
         return [element("p", "No curves were recorded.", class_="soft")]
     plots = []
-    for tag, title in shown:
+    for title, scale, values in (("loss", "log", loss), ("PSNR, dB", "linear", psnr)):
         figure, (axes,) = figure_of()
-        steps, values = zip(*curves[tag], strict=True)
         axes.plot(steps, values, color=SERIES[0], linewidth=0.9)
-        axes.set(xlabel="step", ylabel=title, yscale="log" if tag.startswith("loss") else "linear")
+        axes.set(xlabel="step", ylabel=title, yscale=scale)
         plots.append(plot(figure, f"{title[:1].upper()}{title[1:]} of the training frames as they came", title))
     return [element("div", *plots, class_="plots")]
-
-
-def read_curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """(step, value) of every scalar that training recorded, at most `MAX_POINTS` of each; empty without a recording."""
-    if not folder.is_dir():
-        return {}
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # takes a second
-
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 1})
-    events.Reload()
-    curves = {}
-    for tag in events.Tags().get("scalars", []):
-        points = [(point.step, point.value) for point in events.Scalars(tag)]
-        curves[tag] = points[:: max(1, -(-len(points) // MAX_POINTS))]
-    return curves
 
 
 def _origin(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:

@@ -176,8 +176,8 @@ def avatar_path(path: Path) -> Path:
     if not (path / AVATAR_FILE).is_file():
         if (path / "run.json").is_file():
             raise UserError(
-                f"{path} holds no {AVATAR_FILE}: no checkpoint has been written yet, or another version of the program "
-                "made the run; train it (further) with this one"
+                f"{path} holds no {AVATAR_FILE}: no checkpoint has been written yet; wait for the first where the training "
+                "runs (trainer.checkpoint_every), else train again"
             )
         raise UserError(
             f"{path} is neither a run nor an avatar file; give the folder that avatar train wrote (--out), or its "
@@ -188,7 +188,7 @@ def avatar_path(path: Path) -> Path:
 
 def runs_in(folder: Path) -> str:
     """The end of a sentence about a folder that is no run: which runs it holds."""
-    runs = sorted(path.parent for path in folder.glob("*/run.json"))
+    runs = sorted(path.parent for pattern in ("*/run.json", "rounds/*/run/run.json") for path in folder.glob(pattern))
     return f"; {folder} holds {', '.join(map(str, runs[:3]))}{' ...' if len(runs) > 3 else ''}" if runs else ""
 
 

@@ -1,4 +1,4 @@
-"""What a run shows while it works: a progress bar, preview images and, where tensorboard is installed, its scalars."""
+"""What a run shows while it works: a progress bar, preview images and curves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import imageio.v3 as iio
 import numpy as np
@@ -14,23 +13,20 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from avatar.errors import MissingPackage, check_installed
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
+from avatar.runs.curves import LOSSES, read_curves, write_curves
 
 LOG_EVERY = 10  # steps between points of the training curves
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
 
 
 class TrainingLog:
-    """Writes RUN/tensorboard and RUN/previews; a context manager, so that an interruption still closes its files."""
+    """Writes RUN/curves.csv and RUN/previews; a context manager, so that an interruption still ends the bar."""
 
     def __init__(self, run: Path, start: int, stop: int) -> None:
-        self._previews = run / "previews"
-        self._writer = _open_writer(run / "tensorboard", start)
+        self._run, self._previews = run, run / "previews"
+        self._rows = [tuple(row) for row in read_curves(run) if row[0] <= start]
         self._bar = tqdm(total=stop, initial=start, unit="step", desc="train", dynamic_ncols=True)
         self._loss = self._psnr = math.nan
 
@@ -39,8 +35,6 @@ class TrainingLog:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
-        if self._writer is not None:
-            self._writer.close()
 
     def step(self, step: int, loss: PhotometricLoss, render: Tensor, truth: Tensor) -> None:
         """Record one step; `step` counts from 1. The PSNR is computed only for the steps that are logged."""
@@ -62,14 +56,15 @@ class TrainingLog:
         self._bar.update(1)
         if self.shows(step):
             self._psnr = smoothed(self._psnr, quality, LOG_EVERY)
-            if self._writer is not None:
-                for name, term in terms.items():
-                    self._writer.add_scalar(f"loss/{name}", term, step)
-                self._writer.add_scalar("train/psnr", quality, step)
+            self._rows.append((step, quality, *(terms[name] for name in LOSSES)))
         shown = {"loss": f"{self._loss:.5f}"}
         if not math.isnan(self._psnr):  # none is measured before the first step that is logged
             shown["psnr"] = f"{self._psnr:.2f}"
         self._bar.set_postfix(shown, refresh=False)
+
+    def save(self) -> None:
+        """Write the curves. Raises UserError when the disk refuses."""
+        write_curves(self._run, self._rows)
 
     def say(self, news: str) -> None:
         """Above the bar, and where it is."""
@@ -81,24 +76,6 @@ class TrainingLog:
         image = np.round(pair.cpu().numpy() * 255).astype(np.uint8)
         self._previews.mkdir(parents=True, exist_ok=True)
         iio.imwrite(self._previews / f"step_{step:08d}.png", image)
-        if self._writer is not None:
-            self._writer.add_image("preview", image, step, dataformats="HWC")
-
-
-def _open_writer(folder: Path, start: int) -> SummaryWriter | None:
-    """None where no curves can be written, which it says."""
-    try:
-        check_installed("recording curves", "plots", "tensorboard")
-        from torch.utils.tensorboard import SummaryWriter
-
-        return SummaryWriter(str(folder), purge_step=start)
-    except MissingPackage as missing:
-        print(f"Note: {missing}")
-    except ImportError as error:  # a package that it needs is of another version
-        print(f"Note: curves are not recorded: tensorboard cannot be imported ({error})")
-    except UnicodeEncodeError:
-        print(f"Note: curves are not recorded: tensorboard cannot write to {folder}, whose name is not UTF-8")
-    return None
 
 
 def smoothed(mean: float, value: float, steps: int) -> float:

@@ -84,6 +84,7 @@ def train(
         if corrections is not None:
             tensors[f"{PREFIX}moves"] = corrections.moves.detach()
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta))
+        log.save()
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
     frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None

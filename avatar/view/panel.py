@@ -5,12 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import Float64
+
 from avatar.view.messages import Value, one_of, pressed, switched, within
 from avatar.view.view_renderer import Setting
 
 if TYPE_CHECKING:
     from avatar.view.server import Viewer
 
+CURVE_POINTS = 100  # means of as many parts of a training
+PLOT_HEIGHT = 120  # pixels
+LINEAR, LOG = 1, 3  # "distr" of uPlot
+LINE = "#228be6"
 LABELS = {
     "jaw": "jaw open",
     "look_left": "look to its left",
@@ -31,6 +38,7 @@ class Panel:
         self._live = (
             None if live_name is None else gui.add_text(live_name.capitalize(), "", multiline=True, disabled=True)
         )
+        self._plots: list[Any] = []
         self._add_motion(calibrate)
         self._add_picture()
         self._add_face()
@@ -43,7 +51,31 @@ class Panel:
         player = self._viewer.player
         self._play.label = "Pause" if player.is_playing else "Play"
         if player.is_playing:
-            self._scrub.value = round(player.share, 3)
+            self._scrub.value = round(player.seconds, 2)
+
+    def draw_curves(self, curves: Float64[np.ndarray, "N 6"], is_open: bool) -> None:
+        """Loss and PSNR of the training, of `read_curves`; `is_open` unfolds them where they are new."""
+        if len(curves) == 0:
+            return
+        means = np.array([part.mean(axis=0) for part in np.array_split(curves, min(len(curves), CURVE_POINTS))])
+        steps, psnr, loss = np.ascontiguousarray(means.T[:3])
+        if not self._plots:
+            with self._gui.add_folder("Training", order=self._status.order + 0.5, expand_by_default=is_open):
+                self._plots = [self._plot("Loss", LOG), self._plot("PSNR, dB", LINEAR)]
+        for plot, column in zip(self._plots, (loss, psnr), strict=True):
+            plot.data = (steps, column)
+
+    def _plot(self, title: str, scale: int) -> Any:
+        return self._gui.add_uplot(
+            (np.zeros(1), np.ones(1)),
+            ({"label": "step"}, {"label": title, "stroke": LINE, "width": 1.5}),
+            title=title,
+            scales={"x": {"time": False}, "y": {"distr": scale}},
+            axes=({"size": 28}, {"size": 50}),
+            padding=(12, 24, 0, 0),
+            legend={"show": False},
+            height=PLOT_HEIGHT,
+        )
 
     def _safe(self, act: Callable[[Any], object]) -> Callable[[Any], None]:
         """An error belongs to who pressed the control."""
@@ -73,7 +105,13 @@ class Panel:
         def choose(_: Any) -> None:
             with viewer.lock:
                 player.choose(motion.value)
+            limit()
             viewer.touch()
+
+        def limit() -> None:
+            self._scrub.value, self._scrub.visible = 0.0, player.clip is not None
+            self._scrub.max = max(round(player.duration, 2), 0.01)
+            viewer.door.admit(self._scrub, within(0.0, self._scrub.max))
 
         def toggle(event: Any) -> None:
             if player.clip is None:
@@ -93,8 +131,9 @@ class Panel:
             motion = gui.add_dropdown("Motion", player.names, initial_value=player.name)
             self._input(motion, one_of(player.names), choose)
             self._play = self._button("Play", toggle)
-            scrub = gui.add_slider("Place", min=0.0, max=1.0, step=0.001, initial_value=0.0)
-            self._scrub = self._input(scrub, within(0.0, 1.0), seek)
+            scrub = gui.add_slider("Time, s", min=0.0, max=0.01, step=0.01, initial_value=0.0)
+            self._scrub = self._input(scrub, within(0.0, 0.0), seek)
+            limit()
             if calibrate is not None:
                 self._button("Take this face as neutral", lambda _: calibrate())
 
@@ -130,15 +169,15 @@ class Panel:
         self._button("Reset face", reset)
 
     def _slider(self, label: str, limits: tuple[float, float], part: str, key: int | str) -> Any:
-        low, high = (round(limit, 2) for limit in limits)
-        if low == high:
-            low, high = limits
-        slider = self._gui.add_slider(label, min=low, max=high, step=(high - low) / 200, initial_value=0.0)
+        """In percent of the farthest that training shows."""
+        farthest = max(-limits[0], limits[1])
+        low, high = (float(round(100 * limit / farthest)) for limit in limits)
+        slider = self._gui.add_slider(label, min=low, max=high, step=1.0, initial_value=0.0)
 
         def moved(_: Any) -> None:
             with self._viewer.lock:
                 values = getattr(self._viewer.setting, part)
-                self._viewer.change(**{part: {**values, key: float(slider.value)}})
+                self._viewer.change(**{part: {**values, key: float(slider.value) / 100 * farthest}})
 
         return self._input(slider, within(low, high), moved)
 

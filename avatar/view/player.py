@@ -58,9 +58,14 @@ class Player:
         return (self._first + passed) % len(clip)
 
     @property
-    def share(self) -> float:
-        clip = self.clip
-        return self.index / max(len(clip) - 1, 1) if clip else 0.0
+    def seconds(self) -> float:
+        """Of the frame that is shown, from the clip's first."""
+        return self.index / self.clip.fps if self.clip else 0.0
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the clip's first frame to its last."""
+        return (len(self.clip) - 1) / self.clip.fps if self.clip else 0.0
 
     def choose(self, name: str) -> None:
         if name not in self.names:
@@ -74,10 +79,10 @@ class Player:
     def pause(self) -> None:
         self._first, self.is_playing = self.index, False
 
-    def seek(self, share: float) -> None:
-        """To a part of the clip, from 0 to 1; what plays goes on from there."""
+    def seek(self, seconds: float) -> None:
+        """To the nearest frame of the clip; what plays goes on from there."""
         if (clip := self.clip) is not None:
-            self._first = round(min(max(share, 0.0), 1.0) * (len(clip) - 1))
+            self._first = round(min(max(seconds, 0.0), self.duration) * clip.fps)
             self._since = self._clock()
 
     def now(self) -> Shown:

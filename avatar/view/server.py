@@ -19,6 +19,7 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
+from avatar.runs.trained import TrainedAvatar
 from avatar.view.auth import LOCAL, Gate
 from avatar.view.live import Pace
 from avatar.view.messages import Door
@@ -56,6 +57,8 @@ class Viewer:
         """Raises UserError when the address cannot be listened on. Port 0 takes a free one, then in `port`."""
         self.renderer, self.player, self._width = renderer, player, width
         self.setting, self._changed = Setting(), 0.0
+        self.progress = ""  # of the training, in the panel
+        self._newer: TrainedAvatar | None = None
         self._moving_width = width
         self.lock, self.wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
         self._last: tuple[object, ...] = ()
@@ -79,7 +82,7 @@ class Viewer:
         server.initial_camera.position = (x, y, z)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.up = (0.0, 1.0, 0.0)
-        self._panel = Panel(self, server.gui, None if live_status is None else player.live_name, calibrate)
+        self.panel = Panel(self, server.gui, None if live_status is None else player.live_name, calibrate)
         server.on_client_connect(self._welcome)
         self._thread = threading.Thread(target=self._loop, daemon=True, name="viewer")
         self._thread.start()
@@ -97,6 +100,11 @@ class Viewer:
             before, self.setting = self.setting, replace(self.setting, **values)
         if self.setting != before:
             self.touch()
+
+    def follow(self, newer: TrainedAvatar) -> None:
+        """From the next picture on, show the avatar after more training."""
+        self._newer = newer
+        self.wake.set()
 
     def touch(self) -> None:
         self._changed = time.monotonic()
@@ -126,21 +134,24 @@ class Viewer:
     def _step(self) -> None:
         """Draw and send what has changed, or wait for that."""
         with self.lock:
-            shown, setting, now = self.player.now(), self.setting, time.monotonic()
+            newer, self._newer = self._newer, None
+            if newer is not None:
+                self.renderer = self.renderer.of(newer)
+            renderer, shown, setting, now = self.renderer, self.player.now(), self.setting, time.monotonic()
             newest = max(self._changed, shown.taken or 0.0)
             is_moving = self.player.is_playing or now - newest < STILL_AFTER
         clients = self.server.get_clients()
         windows = tuple((number, client.camera.aspect) for number, client in clients.items())
         width = self._moving_width if is_moving else self._width
-        key = (shown.key, setting, width, windows)
+        key = (shown.key, setting, width, windows, is_moving, renderer)
         if key != self._last:
             self._last = key
             begin = time.perf_counter()
-            picture = self.renderer.draw((shown.params, shown.camera), setting, width, shown.recorded)
+            picture = renderer.draw((shown.params, shown.camera), setting, width, shown.recorded)
             self.milliseconds = 1000 * (time.perf_counter() - begin)
             self.picture = picture
             for number, aspect in windows:
-                self._send(clients[number], aspect, picture)
+                self._send(clients[number], aspect, picture, is_moving)
             if shown.taken is not None:
                 self.pace.add(shown.taken, time.monotonic())
             if is_moving:
@@ -151,17 +162,17 @@ class Viewer:
         if now - self._told > STATUS_EVERY:
             self._told = now
             is_recorded = shown.recorded is not None
-            self._tell(self.renderer.distance(self.renderer.params(shown.params, setting)), setting, is_recorded)
+            self._tell(renderer.distance(renderer.params(shown.params, setting)), setting, is_recorded)
 
     def _fit(self, milliseconds: float) -> None:
         low, high = TARGET_MS
         factor = 0.85 if milliseconds > high else 1.15 if milliseconds < low else 1.0
         self._moving_width = round(min(max(self._moving_width * factor, LEAST_WIDTH), self._width))
 
-    def _send(self, client: Any, aspect: float, picture: np.ndarray) -> None:
+    def _send(self, client: Any, aspect: float, picture: np.ndarray, is_moving: bool) -> None:
         try:
             image = padded(picture, aspect, self.renderer.trained.config.data.background)
-            client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
+            client.scene.set_background_image(image, "jpeg" if is_moving else "png", jpeg_quality=JPEG_QUALITY)
         except Exception as error:  # the others get theirs
             self.complaints.add(f"a picture could not be sent ({type(error).__name__})")
 
@@ -169,6 +180,7 @@ class Viewer:
         height, width = (0, 0) if self.picture is None else self.picture.shape[:2]
         _, is_supported = self.renderer.within(setting.look)
         lines = [
+            *([self.progress] if self.progress else []),
             f"{width} x {height} pixels, {self.milliseconds:.0f} ms a picture",
             f"Distance from training: {distance:.2f}" + (" (**far**: the avatar guesses)" if distance > 1 else ""),
             *notes(setting, self.renderer.truth is not None, is_recorded),
@@ -177,21 +189,21 @@ class Viewer:
             lines.append("**The camera is where the training video never was: the avatar guesses.**")
         if (pace := self.pace.now(time.monotonic())) is not None:
             lines.append(f"Latency {pace[0]:.0f} ms at {pace[1]:.0f} pictures a second")
-        self._panel.tell(lines, "" if self._live_status is None else self._live_status())
+        self.panel.tell(lines, "" if self._live_status is None else self._live_status())
 
     def save_picture(self, event: Any) -> None:
         with self.lock:
-            shown, setting = self.player.now(), self.setting
+            renderer, shown, setting = self.renderer, self.player.now(), self.setting
         with self._saving(event.client) as may_save:
             if may_save:
-                picture = self.renderer.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
+                picture = renderer.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
                 data = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
                 event.client.send_file_download(f"{self.renderer.trained.name}.png", data, save_immediately=True)
 
     def save_video(self, event: Any) -> None:
         """The whole motion as it is seen now."""
         with self.lock:
-            clip, setting = self.player.clip, self.setting
+            renderer, clip, setting = self.renderer, self.player.clip, self.setting
         if clip is None:
             event.client.add_notification("No motion", "Choose a motion first: a face at rest makes no video.")
             return
@@ -200,7 +212,7 @@ class Viewer:
             for frame, recorded in zip(clip.frames, clip.recorded or (None,) * len(clip), strict=True):
                 if self._stop.is_set():
                     raise UserError("the viewer has ended")
-                yield self.renderer.draw(frame, setting, self._width, recorded)
+                yield renderer.draw(frame, setting, self._width, recorded)
 
         with self._saving(event.client) as may_save, tempfile.TemporaryDirectory() as folder:
             if may_save:
@@ -224,7 +236,8 @@ class Viewer:
 
 
 def padded(picture: np.ndarray, aspect: float, background: tuple[float, ...]) -> np.ndarray:
-    """The picture in the middle of one of another width over height, smaller where that would be larger than LARGEST."""
+    """The picture in the middle of one of another width over height, or at the top of an upright one, where a phone has no
+    controls; smaller where that would be larger than LARGEST."""
     height, width = picture.shape[:2]
     factor = min(LARGEST / max(width, height * aspect), LARGEST / max(height, width / aspect), 1.0)
     if factor < 1.0:
@@ -234,7 +247,7 @@ def padded(picture: np.ndarray, aspect: float, background: tuple[float, ...]) ->
     tall = min(max(height, round(width / aspect)), LARGEST)
     sheet = np.empty((tall, wide, 3), np.uint8)
     sheet[:] = np.round(np.asarray(background) * 255)
-    top, left = (tall - height) // 2, (wide - width) // 2
+    top, left = 0 if aspect < 1 else (tall - height) // 2, (wide - width) // 2
     sheet[top : top + height, left : left + width] = picture
     return sheet
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -65,6 +66,13 @@ class ViewRenderer:
         self.joints = joint_ranges(recording.motion(train))
         cameras = [recording.camera(i) for i in train]
         self.limits: OrbitLimits = orbit_limits(trained.rest_camera(), cameras)
+
+    def of(self, newer: TrainedAvatar) -> ViewRenderer:
+        """The same for the avatar after more training on the same video, which is moved to where this one computes."""
+        newer.avatar.to(self.trained.avatar.quats.device)
+        renderer = copy.copy(self)
+        renderer.trained = newer
+        return renderer
 
     @property
     def overlays(self) -> tuple[Overlay, ...]:

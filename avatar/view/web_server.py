@@ -7,6 +7,7 @@ replaced by one that adds the checks and takes a socket which listens already. N
 from __future__ import annotations
 
 import asyncio
+import html
 import http
 import io
 import logging
@@ -43,6 +44,10 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address holds the token
     "X-Content-Type-Options": "nosniff",
 }
+# Of viser's page, which is light unless its address says otherwise.
+DARK_MODE = """<script>
+__VISER_EMBED_CONFIG__ = { darkMode: matchMedia("(prefers-color-scheme: dark)").matches };
+</script>"""
 PageServer = Callable[[ServerConnection, Request], Response | None]
 
 
@@ -112,6 +117,7 @@ class WebServer:
     def __init__(self, listening: socket.socket, gate: Gate, door: Door, complaints: Complaints, label: str) -> None:
         self._gate, self._door, self._complaints = gate, door, complaints
         self._listening = listening
+        self._head = f"<title>{html.escape(label)} - avatar</title>{DARK_MODE}".encode(errors="replace")
         self._library: library.Server | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a client may leave at any time
@@ -185,9 +191,11 @@ class WebServer:
             if refusal.location is None:
                 self._complaints.add(f"a request was refused: {refusal.sentence}")
             return _response(refusal)
-        response = page(connection, Request("/", request.headers))
+        response = page(connection, Request("/", Headers()))  # neither in parts nor compressed
         if response is not None:
-            response.headers.update(HEADERS)
+            response.body = response.body.replace(b"<title>Viser</title>", self._head, 1)
+            del response.headers["Content-Length"]
+            response.headers.update({"Content-Length": str(len(response.body)), **HEADERS})
             connection.is_served = True
         return response
 

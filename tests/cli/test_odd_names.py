@@ -47,11 +47,10 @@ def test_evaluating_and_comparing(place: Path) -> None:
     assert "caf" in (place / ODD / "compare.csv").read_text(encoding="utf-8")
 
 
-def test_training_where_tensorboard_cannot_write(place: Path) -> None:
+def test_training(place: Path) -> None:
     words = ("--frame-offset", 1, "--out", place / "another run", *SMALL, "trainer.iterations=2")
-    said = avatar("train", place / "someone", *words)
-    assert "whose name is not UTF-8" in said and "tensorboard --logdir" not in said
-    assert (place / "another run" / "avatar.safetensors").is_file()
+    avatar("train", place / "someone", *words)
+    assert (place / "another run" / "curves.csv").is_file() and (place / "another run" / "avatar.safetensors").is_file()
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".safetensors", ".mp4"])

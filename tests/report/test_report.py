@@ -14,7 +14,8 @@ from small_runs import train_small
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
-from avatar.report.page import bins_tables, means_table, read_curves
+from avatar.report.page import bins_tables, means_table
+from avatar.runs.curves import read_curves
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 MOVE_SLIDER = """
@@ -50,11 +51,14 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     assert len(page) < 8e6
 
 
-def test_curves_are_those_that_training_recorded(run: Path) -> None:
-    curves = read_curves(run / "tensorboard")
-    assert [step for step, _ in curves["loss/total"]] == [2, 4, 6, 8, 10, 12]
-    assert all(np.isfinite(value) for _, value in curves["train/psnr"])
-    assert read_curves(run / "nowhere") == {}
+def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path) -> None:
+    steps, psnr, total, *terms = read_curves(run).T
+    assert steps.tolist() == [2, 4, 6, 8, 10, 12] and (total > 0).all() and (psnr > 0).all()
+    np.testing.assert_allclose(sum(terms), total, rtol=1e-5)
+    assert len(read_curves(run / "nowhere")) == 0
+    for damaged in (b"", b"step,psnr,total\n1,2,3\n", b"step\n1,2,3,4,5,x\n", b"\xff"):
+        (tmp_path / "curves.csv").write_bytes(damaged)
+        assert len(read_curves(tmp_path)) == 0
 
 
 def test_protocols_without_a_figure_have_a_dash() -> None:

@@ -42,9 +42,9 @@ def test_training_gets_better_and_leaves_its_files(tracked_folder: Path, tmp_pat
     assert [p.name for p in sorted((tmp_path / "run").iterdir())] == [
         "avatar.safetensors",
         "checkpoints",
+        "curves.csv",
         "previews",
         "run.json",
-        "tensorboard",
     ]
     assert (tmp_path / "run" / "previews" / "step_00000120.png").is_file()
     assert len(list_checkpoints(tmp_path / "run" / "checkpoints")) == 3
@@ -79,6 +79,7 @@ def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(
     assert whole.tensors.keys() == broken.tensors.keys()
     differing = [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])]
     assert not differing
+    assert len({(tmp_path / run / "curves.csv").read_text() for run in ("whole", "broken")}) == 1
 
 
 @pytest.mark.parametrize("model", ["covariance", "ndgs", "splattingavatar", "monogaussianavatar"])

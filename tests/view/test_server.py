@@ -83,7 +83,7 @@ def test_pictures_keep_their_shape() -> None:
     picture = np.zeros((10, 20, 3), np.uint8)
     assert padded(picture, 4.0, (1.0, 1.0, 1.0)).shape == (10, 40, 3)
     tall = padded(picture, 0.5, (1.0, 0.5, 0.0))
-    assert tall.shape == (40, 20, 3) and (tall[15:25] == 0).all() and tall[0, 0].tolist() == [255, 128, 0]
+    assert tall.shape == (40, 20, 3) and (tall[:10] == 0).all() and tall[10, 0].tolist() == [255, 128, 0]
 
 
 @pytest.mark.parametrize("aspect", [1 / 16384, 10 / 900, 0.46, 1.0, 3000.0, 16384.0])
@@ -119,6 +119,22 @@ def test_the_panel_says_why_nothing_plays_and_there_is_no_truth(viewer: Viewer) 
         assert "No truth to show" not in str(page.values)
 
 
+def test_controls_are_in_percent_and_seconds_and_still_pictures_lose_nothing(viewer: Viewer) -> None:
+    with Page(f"http://127.0.0.1:{viewer.port}/{TOKEN}/") as page:
+        page.until(lambda: page.format == "png")
+        page.set("jaw open", 50)
+        until(lambda: viewer.setting.joints)
+        assert viewer.setting.joints["jaw"] == pytest.approx(0.5 * viewer.renderer.joints["jaw"][1])
+        page.set("Motion", "train")
+        until(lambda: viewer.player.duration)
+        page.set("Play", True)
+        page.until(lambda: page.format == "jpeg")
+        page.set("Play", True)
+        page.until(lambda: page.format == "png")
+        page.set("Time, s", 0.2)
+        until(lambda: viewer.player.seconds == pytest.approx(0.2))
+
+
 @pytest.mark.chromium
 def test_a_person_plays_and_moves_a_slider(viewer: Viewer) -> None:
     with chromium() as browser:
@@ -141,6 +157,7 @@ CANVAS = (
     "(() => { const c = window.__viserMutable?.canvas?.getBoundingClientRect();"
     " return c ? [c.width, c.height, c.right] : null })()"
 )
+SCHEME = "document.documentElement.dataset.mantineColorScheme"
 IMAGE = (
     "(() => { const i = window.__viserMutable?.backgroundMaterial?.uniforms.colorMap.value?.image;"
     " return i ? i.width / i.height : 0 })()"
@@ -156,9 +173,12 @@ def test_the_panel_does_not_cover_the_picture_and_a_phone_does_not_stretch_it(vi
         panel.wait_for(timeout=30000)
         until_shaped(page)
         assert page.evaluate(CANVAS)[2] <= panel.bounding_box()["x"], "the picture ends where the panel begins"
-        phone = browser.new_context(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True).new_page()
+        assert page.title() == "someone - avatar" and page.evaluate(SCHEME) == "light"
+        small = {"width": 390, "height": 844}
+        phone = browser.new_page(viewport=small, is_mobile=True, has_touch=True, color_scheme="dark")
         phone.goto(page_of(viewer))
         until_shaped(phone)
+        assert phone.evaluate(SCHEME) == "dark"
         phone.set_viewport_size({"width": 844, "height": 390})
         until_shaped(phone)
 

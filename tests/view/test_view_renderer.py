@@ -100,8 +100,10 @@ def test_a_motion_plays_pauses_and_is_scrubbed(trained: TrainedAvatar) -> None:
     player.pause()
     now[0] += 10
     assert player.index == 3
-    player.seek(1.0)
-    assert player.index == len(clip) - 1 and player.share == 1.0
+    player.seek(4.2 / clip.fps)
+    assert player.index == 4 and player.seconds == 4 / clip.fps
+    player.seek(1e3)
+    assert player.index == len(clip) - 1 and player.seconds == player.duration
     player.play()
     now[0] += 1.5 / clip.fps
     assert player.index == 0, "it starts again after its end"
