@@ -80,6 +80,9 @@ def test_the_command_writes_a_frame_and_a_sequence(run: Path, tmp_path: Path) ->
     sequence = sorted(tmp_path.glob("x-*.ply"))
     assert len(sequence) == 30 and sequence[3].read_bytes() == one != sequence[4].read_bytes()
     assert "x-00000.ply to x-00029.ply, 25 a second" in said
+    said = avatar("export", run, "--out", out, "--motion", "test")
+    shorter = sorted(tmp_path.glob("x-*.ply"))
+    assert shorter == sequence[: len(shorter)] != sequence and f"Removed {sequence[len(shorter)]} to x-00029" in said
     assert "--frame must be from 0 to 29" in avatar("export", run, "--out", out, "--frame", 30, status=1)
     assert "give one of the two" in avatar("export", run, "--out", out, "--frame", 1, "--motion", "test", status=1)
     assert "or a drive file" in avatar("export", run, "--out", out, "--motion", "tset", status=1)
