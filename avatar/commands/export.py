@@ -155,7 +155,7 @@ def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | N
     if motion in OWN:
         return own_clip(trained, motion, width)
     if Path(motion).suffix.lower() not in DRIVE_SUFFIXES:
-        raise UserError(f"--motion must be {', '.join(OWN)}, or a drive file (.npz, .csv), not {motion}")
+        raise UserError(f"--motion must be {', '.join(OWN)}, or a drive file (.npz, .csv, .json), not {motion}")
     return driven_clip(trained, open_drive_file(Path(motion), trained), width)
 
 
