@@ -1,9 +1,10 @@
-"""What the Makefile's targets would run."""
+"""What the Makefile's targets would run, and what an image is made of."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -40,3 +41,15 @@ def test_slow_tests_are_left_to_test_all(tmp_path: Path) -> None:
         "test-all", tmp_path
     )
     assert "make test-all" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_an_image_is_made_of_what_a_wheel_takes() -> None:
+    """.dockerignore leaves out all but what CMakeLists.txt and pyproject.toml read."""
+    allowed = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = project["tool"]["scikit-build"]["wheel"]["packages"]
+    files = ["CMakeLists.txt", "pyproject.toml", "constraints.txt", "LICENSE", project["project"]["readme"]]
+    assert allowed == {"configs", *packages, *files} and all((ROOT / name).exists() for name in allowed)
+    image = (ROOT / "Dockerfile").read_text()
+    assert "[track,view]" in image and {"track", "view"} <= set(project["project"]["optional-dependencies"])
+    assert "USER 1000" in image and image.rstrip().endswith('ENTRYPOINT ["avatar"]')

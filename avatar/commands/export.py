@@ -19,7 +19,7 @@ from avatar.export.movie import write_movie
 from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
-from avatar.files.names import shortened
+from avatar.files.numbered import numbered, remove_longer
 from avatar.pipeline import OK
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
@@ -110,6 +110,7 @@ def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> Non
     else:
         for number, (params, camera) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
             write_atomically(numbered(out, number), encode_ply(trained.gaussians(params, camera), licence))
+        remove_longer(out, len(clip), print)
         print(f"Splats   {numbered(out, 0)} to {numbered(out, len(clip) - 1).name}, {clip.fps:g} a second")
     print(f"Licence  {licence}")
 
@@ -154,12 +155,8 @@ def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | N
     if motion in OWN:
         return own_clip(trained, motion, width)
     if Path(motion).suffix.lower() not in DRIVE_SUFFIXES:
-        raise UserError(f"--motion must be {', '.join(OWN)}, or a drive file (.npz, .csv), not {motion}")
+        raise UserError(f"--motion must be {', '.join(OWN)}, or a drive file (.npz, .csv, .json), not {motion}")
     return driven_clip(trained, open_drive_file(Path(motion), trained), width)
-
-
-def numbered(out: Path, number: int) -> Path:
-    return out.with_name(f"{shortened(out.stem)}-{number:05d}{out.suffix}")
 
 
 def write_avatar_format(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:

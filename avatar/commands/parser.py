@@ -145,7 +145,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     reenact = commands.add_parser("reenact")
     add_avatar(reenact)
     reenact.add_argument(
-        "words", nargs="*", metavar="DRIVER", help="tracked folder, video, or a drive file (.npz, .csv)"
+        "words", nargs="*", metavar="DRIVER", help="tracked folder, video, or a drive file (.npz, .csv, .json)"
     )
     reenact.add_argument("--driver", type=Path, metavar="DRIVER", help="the same")
     add_reading(reenact)
@@ -184,7 +184,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     add_view(commands.add_parser("view"))
 
     send = commands.add_parser("send")
-    send.add_argument("drive", type=Path, metavar="FILE", help="drive file (.npz, .csv)")
+    send.add_argument("drive", type=Path, metavar="FILE", help="drive file (.npz, .csv, .json)")
     send.add_argument("port", type=int, metavar="PORT", help="of avatar view --stream on this machine")
     send.add_argument("--head", type=Path, metavar="PATH", required=True, help="the avatar's head model")
     add_token(send, "that of avatar view (default: $AVATAR_TOKEN)")

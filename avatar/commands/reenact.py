@@ -8,6 +8,7 @@ from pathlib import Path
 
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.files.names import safe_name
+from avatar.files.numbered import existing
 from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
 from avatar.pipeline.backdrop import parse_backdrop
@@ -35,7 +36,7 @@ def run_reenact(arguments: Namespace) -> int:
     )
     behind = None if arguments.background is None else Path(arguments.background)
     inputs = [driver, behind, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
-    check_outputs([first_file(out), *sidecars(out)], inputs)
+    check_outputs([first_file(out), *(existing(out) if first_file(out) != out else ()), *sidecars(out)], inputs)
     if driver.suffix.lower() in DRIVE_SUFFIXES:
         reenact(trained, open_drive_file(driver, trained), out, choices, backdrop=backdrop)
     else:

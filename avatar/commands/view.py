@@ -186,7 +186,7 @@ def clips(trained: TrainedAvatar, drives: list[Path]) -> dict[str, Clip]:
     found = {name: own_clip(trained, name) for name in ("test", "train") if len(getattr(split, name))}
     for path in drives:
         if path.suffix.lower() not in DRIVE_SUFFIXES:
-            raise UserError(f"--drive takes drive files (.npz, .csv), not {path}")
+            raise UserError(f"--drive takes drive files (.npz, .csv, .json), not {path}")
         found[path.name] = driven_clip(trained, open_drive_file(path, trained))
     return found
 

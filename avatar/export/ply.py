@@ -1,8 +1,9 @@
 """Gaussians in the PLY files of 3D Gaussian splatting, which viewers and editors of splats read.
 
 x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (channel by channel, padded with zeros to degree 3), opacity (logit),
-scale_0..2 (natural logarithm, metres), rot_0..3 (w x y z); float32, little-endian. The space is the head's own: x to the
-person's left, y up, z to the front; the head's pose is in the camera and therefore not in the file.
+scale_0..2 (natural logarithm, metres), rot_0..3 (w x y z); float32, little-endian. Viewers take -y as up, as after training
+on COLMAP's cameras, so the axes are x to the person's right, y down, z to the front: head space, turned by 180 degrees
+about z. The head's pose is in the camera and therefore not in the file.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ def encode_ply(gaussians: Gaussians, comment: str = "") -> bytes:
 
     Raises UserError for values that are not finite: finite parameters can stand for infinite sizes.
     """
+    gaussians = upside_down(gaussians)
     N, coefficients = gaussians.sh.shape[:2]
     rest = torch.zeros(N, REST, 3)
     rest[:, : coefficients - 1] = gaussians.sh[:, 1:]
@@ -54,3 +56,16 @@ def encode_ply(gaussians: Gaussians, comment: str = "") -> bytes:
         "end_header\n",
     ]
     return "\n".join(header).encode() + np.ascontiguousarray(values).tobytes()
+
+
+def upside_down(gaussians: Gaussians) -> Gaussians:
+    """The same, turned by 180 degrees about z: k q for quaternions, and (-1)^m Y_lm for spherical harmonics, where
+    i = l^2 + l + m is odd as m is."""
+    w, x, y, z = gaussians.quats.unbind(dim=1)
+    sh = gaussians.sh.clone()
+    sh[:, 1::2] *= -1
+    return gaussians._replace(
+        means=gaussians.means * gaussians.means.new_tensor([-1, -1, 1]),
+        quats=torch.stack((-z, -y, x, w), dim=1),
+        sh=sh,
+    )

@@ -104,7 +104,21 @@ def _from_arkit(
     values = {
         shape: table.column(name, LARGEST if _POSE.fullmatch(shape) else LARGEST_SHAPE) for shape, name in own.items()
     }
-    arrays, unmapped = from_blendshapes(values, len(table), num_expressions, names)
+    return from_arkit(path, own, values, num_expressions, names, say), unread
+
+
+def from_arkit(
+    path: Path,
+    own: Mapping[str, str],
+    values: Mapping[str, np.ndarray],
+    num_expressions: int,
+    names: ExpressionNames,
+    say: Callable[[str], None],
+) -> dict[str, np.ndarray]:
+    """Arrays of an .npz drive file from ARKit's blendshapes [T] by their plain names; `own` has the file's names for them.
+    Says what moves nothing; raises UserError where the head model has no name for any that moves."""
+    frames = len(next(iter(values.values())))
+    arrays, unmapped = from_blendshapes(values, frames, num_expressions, names)
     lost = [shape for shape in unmapped if values[shape].any() and shape != "tongueout"]  # no head model has a tongue
     if lost and not any(names.targets(shape) for shape in values):
         known = (
@@ -119,7 +133,7 @@ def _from_arkit(
         say(f"Note: {len(unmapped)} of ARKit's blendshapes move nothing on this head model: {shown}")
     if any(shape.startswith("head") for shape in values if _POSE.fullmatch(shape)):
         say(f"Note: the head's turns in {path.name} are not used; the avatar's own camera is shown")
-    return arrays, unread
+    return arrays
 
 
 def from_blendshapes(

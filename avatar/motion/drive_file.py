@@ -1,4 +1,4 @@
-"""Drive files: motion for an avatar from any tracker, as .npz or .csv; docs/reenact.md is their definition.
+"""Drive files: motion for an avatar from any tracker, as .npz, .csv or .json; docs/reenact.md is their definition.
 
 An .npz holds, for T frames (only `expression` is required; what is missing is at rest):
 
@@ -13,7 +13,8 @@ An .npz holds, for T frames (only `expression` is required; what is missing is a
     names           [T] text                  of the frames
     head            [] text                   fingerprint of the head model that the coefficients belong to
 
-Nothing in a drive file can execute code.
+VHAP's tracked_flame_params*.npz is read by its own names (`FLAME_KEYS`), without the head's pose. Nothing in a drive file
+can execute code.
 """
 
 from __future__ import annotations
@@ -33,11 +34,13 @@ from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.motion.drive import Drive
 from avatar.motion.drive_csv import DEFAULT_FPS, LARGEST, read_drive_csv
+from avatar.motion.drive_json import read_drive_json
 from avatar.motion.drive_times import BOUNDS
 from avatar.types import IDENTITY_6D, Camera, HeadParams
 
 MAX_FRAMES = 1_000_000
 CAMERA_KEYS = ("R", "t", "K", "size")
+FLAME_KEYS = {"expr": "expression", "jaw_pose": "jaw", "eyes_pose": "eyes", "neck_pose": "neck"}
 KEYS = ("expression", "jaw", "eyes", "eyelids", "neck", "fps", *CAMERA_KEYS, "shape", "names", "head")
 
 
@@ -47,8 +50,10 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     Raises UserError with the file and what is wrong with it.
     """
     path = Path(path)
-    is_csv = path.suffix.lower() == ".csv"
-    arrays = read_drive_csv(path, assets.num_expressions, assets.names, say) if is_csv else load_npz(path)
+    read_arkit = {".csv": read_drive_csv, ".json": read_drive_json}.get(path.suffix.lower())
+    arrays = read_arkit(path, assets.num_expressions, assets.names, say) if read_arkit else load_npz(path)
+    if "expr" in arrays and "expression" not in arrays:
+        arrays = {FLAME_KEYS.get(key, key): a.ravel() if key == "shape" else a for key, a in arrays.items()}
     unknown = sorted(set(arrays) - set(KEYS))
     if "expression" not in arrays:
         raise UserError(f"{path} holds no expression (it holds {', '.join(unknown) or 'nothing'}); see docs/reenact.md")

@@ -18,7 +18,7 @@ from avatar.runs.trained import TrainedAvatar, load_avatar
 from data_prep.prepare.open import find_head, open_subject
 from data_prep.prepare.wrong_inputs import check_folder
 
-DRIVE_SUFFIXES = (".npz", ".csv")
+DRIVE_SUFFIXES = (".npz", ".csv", ".json")
 
 
 def source_of(arguments: Namespace) -> Source:

@@ -2,7 +2,7 @@
 
 NAME.mp4               the driver's picture, where there is one, beside the render; under them each frame's distance from
                        the training expressions; with a backdrop the render alone
-NAME-00000.png ...     in place of the video, for NAME.png
+NAME-00000.png ...     in place of the video, for NAME.png; those of an earlier, longer run are removed
 NAME.distances.csv     those distances
 NAME.choices.json      every choice that made the video
 """
@@ -27,6 +27,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
+from avatar.files.numbered import numbered, remove_longer
 from avatar.files.video import Sound, side_by_side, write_video
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
@@ -118,6 +119,7 @@ def reenact(
         shown = tqdm(frames, total=len(drive), desc="reenact", unit="frame", dynamic_ncols=True)
         if first != out:
             write_pictures(out, shown)
+            remove_longer(out, len(drive), say)
         else:
             write_video(out, shown, drive.fps, heard)
     table, record = sidecars(out)
@@ -147,17 +149,12 @@ def write_pictures(out: Path, frames: Iterable[UInt8[np.ndarray, "H W C"]]) -> N
     for number, frame in enumerate(frames):
         order = cv2.COLOR_RGBA2BGRA if frame.shape[2] == 4 else cv2.COLOR_RGB2BGR
         _, data = cv2.imencode(PICTURES, cv2.cvtColor(frame, order))
-        write_atomically(picture_file(out, number), data.tobytes())
-
-
-def picture_file(out: Path, number: int) -> Path:
-    """Where the picture of a frame is written, for an `out` that ends in .png."""
-    return out.with_name(f"{shortened(out.stem)}-{number:05d}{PICTURES}")
+        write_atomically(numbered(out, number), data.tobytes())
 
 
 def first_file(out: Path) -> Path:
     """What is written first: `out`, or the first picture for one that ends in .png."""
-    return picture_file(out, 0) if out.suffix.lower() == PICTURES else out
+    return numbered(out, 0) if out.suffix.lower() == PICTURES else out
 
 
 def sidecars(video: Path) -> tuple[Path, Path]:

@@ -90,6 +90,15 @@ def test_pictures_and_refusals(run: Path, drive: Path, tmp_path: Path) -> None:
     pictures = sorted(tmp_path.glob("a-*.png"))
     assert pictures[0].name == "a-00000.png" and len(pictures) > 1
     assert cv2.imread(str(pictures[0]), cv2.IMREAD_UNCHANGED).shape[2] == 4
+    longer = [tmp_path / f"a-{len(pictures) + i:05d}.png" for i in range(2)]  # of an earlier run
+    others = [tmp_path / name for name in (f"a-{len(pictures) + 3:05d}.png", "a-20270101.png", "ab-00000.png")]
+    for path in (*longer, *others):
+        cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
+    said = avatar("reenact", run, drive, "--background", "red", "--out", tmp_path / "a.png")
+    assert f"Removed {longer[0]} to {longer[1].name}, of an earlier run" in said
+    assert sorted(tmp_path.glob("a*.png")) == sorted([*pictures, *others])
+    refused = avatar("reenact", run, drive, "--background", pictures[1], "--out", tmp_path / "a.png", status=1)
+    assert f"{pictures[1]} is an input of this command" in refused
     refused = avatar("reenact", run, drive, "--background", "transparent", "--out", tmp_path / "a.mp4", status=1)
     assert "a transparent video is written as .mov or .webm or .png" in refused
     assert "not nothing.jpg" in avatar("reenact", run, drive, "--background", "nothing.jpg", status=1)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
+import shutil
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +24,7 @@ from avatar.export.movie import limits_of, path_camera
 from avatar.export.ply import FIELDS, encode_ply
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained import TrainedAvatar
-from avatar.types import Gaussians
+from avatar.types import Camera, Gaussians
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +64,45 @@ def read_splats(data: bytes) -> Gaussians:
     )
 
 
+def from_below(camera: Camera) -> Camera:
+    """The camera for splats of which -y is up."""
+    return replace(camera, R_cam_world=camera.R_cam_world * torch.tensor([-1.0, -1.0, 1.0]))
+
+
 def test_splats_read_back_draw_the_same_picture(trained: TrainedAvatar) -> None:
     for i in (0, 7):
         params, camera = trained.recording.params(i), trained.recording.camera(i, 96)
         again = read_splats(encode_ply(trained.gaussians(params, camera), "a\nb"))
         assert again.sh.shape[1] == 16
-        picture = trained.avatar.draw(again, camera, trained.background).image
+        picture = trained.avatar.draw(again, from_below(camera), trained.background).image
         assert psnr(picture, trained.render(params, camera).image) > 50
-    other = trained.avatar.draw(again, trained.recording.camera(0, 96), trained.background).image
+    other = trained.avatar.draw(again, from_below(trained.recording.camera(0, 96)), trained.background).image
     assert psnr(other, trained.render(trained.recording.params(0), trained.recording.camera(0, 96)).image) < 40
+
+
+def test_a_viewers_reader_finds_the_head_upright(trained: TrainedAvatar, tmp_path: Path) -> None:
+    """PlayCanvas' converter reads splats as SuperSplat does; the y of glTF is up."""
+    converter = shutil.which("splat-transform")
+    if converter is None:
+        pytest.skip("npm's @playcanvas/splat-transform is not installed")
+    gaussians = trained.gaussians(trained.rest_params())
+    (tmp_path / "a.ply").write_bytes(encode_ply(gaussians))
+    subprocess.run([converter, "--gpu", "cpu", tmp_path / "a.ply", tmp_path / "a.glb"], check=True)
+    tree, buffer = gltf_parts((tmp_path / "a.glb").read_bytes())
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+
+    def values(name: str, width: int) -> np.ndarray:
+        view = tree["bufferViews"][tree["accessors"][attributes[name]]["bufferView"]]
+        return np.frombuffer(buffer, "<f4", len(gaussians.means) * width, view["byteOffset"]).reshape(-1, width)
+
+    np.testing.assert_allclose(values("POSITION", 3), gaussians.means, atol=1e-6)
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=1).roll(-1, dims=1).numpy()
+    same = np.abs((values("KHR_gaussian_splatting:ROTATION", 4) * quats).sum(axis=1))
+    np.testing.assert_allclose(same, 1, atol=1e-5)
+    for i in range(gaussians.sh.shape[1]):
+        degree = math.isqrt(i)
+        name = f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{i - degree**2}"
+        np.testing.assert_allclose(values(name, 3), gaussians.sh[:, i], atol=1e-6)
 
 
 def test_the_command_writes_a_frame_and_a_sequence(run: Path, tmp_path: Path) -> None:
@@ -80,6 +114,9 @@ def test_the_command_writes_a_frame_and_a_sequence(run: Path, tmp_path: Path) ->
     sequence = sorted(tmp_path.glob("x-*.ply"))
     assert len(sequence) == 30 and sequence[3].read_bytes() == one != sequence[4].read_bytes()
     assert "x-00000.ply to x-00029.ply, 25 a second" in said
+    said = avatar("export", run, "--out", out, "--motion", "test")
+    shorter = sorted(tmp_path.glob("x-*.ply"))
+    assert shorter == sequence[: len(shorter)] != sequence and f"Removed {sequence[len(shorter)]} to x-00029" in said
     assert "--frame must be from 0 to 29" in avatar("export", run, "--out", out, "--frame", 30, status=1)
     assert "give one of the two" in avatar("export", run, "--out", out, "--frame", 1, "--motion", "test", status=1)
     assert "or a drive file" in avatar("export", run, "--out", out, "--motion", "tset", status=1)
@@ -151,7 +188,6 @@ def test_the_texture_is_what_is_seen(trained: TrainedAvatar) -> None:
 def lively_copy(trained: TrainedAvatar) -> TrainedAvatar:
     """The same avatar with opaque Gaussians whose colour changes slowly over the mesh."""
     import copy
-    from dataclasses import replace
 
     model = copy.deepcopy(trained.avatar)
     points = model.embedding.points(model.mesh.neutral_vertices())

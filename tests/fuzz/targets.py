@@ -51,6 +51,9 @@ DRIVE_CSV = b"""time,expression_0,smile_right,jaw_x,jaw_y,jaw_z,eyelid_left,eyel
 0.04,0.2,+0.5,0.2,0,0,"0.5",1,bad
 0.08,0.3,1,0.1,0,-0.01,0,1,good
 """
+DRIVE_JSON = b"""{"names": ["jawOpen", "mouthSmileLeft"], "metadata": {"fps": 30.0, "frame_count": 2},
+"frames": [{"weights": [0.1, 0.2], "time": 0.0, "rotation": []}, {"weights": [0.2, -1e-3], "time": 0.03, "rotation": []}]}
+"""
 LIVE_LINK_FACE = b"""\xef\xbb\xbfTimecode,BlendShapeCount,EyeBlinkLeft,EyeLookDownLeft,JawOpen,MouthSmileLeft,HeadYaw
 10:31:09:58.123,61,0.1,0.2,0.3,0.4,0.5
 10:31:09:59.140,61,0.1,0.2,0.3,0.4,0.5
@@ -191,6 +194,7 @@ def make_targets(place: Path) -> dict[str, Target]:
         "drive .npz, checksums right": Target([member(drive, "R.npy")], driven("b.npz"), 1, in_drive),
         "drive .csv": Target([DRIVE_CSV], driven("a.csv")),
         "Live Link Face": Target([LIVE_LINK_FACE], driven("b.csv")),
+        "drive .json": Target([DRIVE_JSON], driven("a.json")),
         "override": Target(
             [b"trainer.iterations=3", b"model=flashavatar", b"data.size=64", b"trainer.seed=1"],
             (None, lambda d: load_config([d.decode("utf-8", "replace")])),

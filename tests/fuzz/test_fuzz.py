@@ -43,7 +43,8 @@ NAMES = (
     "NeRSemble tracking, checksums right", "NHA tracking", "NHA split",
     "manifest", "tracks", "checkpoint", "run.json", "UV obj", "head model",
     "regions", "eyelid", "image", "protocol", "drive .npz", "drive .npz, checksums right",
-    "drive .csv", "Live Link Face", "override", "avatar file", "avatar file, its text", "avatar file with its head",
+    "drive .csv", "Live Link Face", "drive .json", "override", "avatar file", "avatar file, its text",
+    "avatar file with its head",
     "tracked folder", "its tracking", "its tracking, checksums right", "landmarks", "embedding", "sweep",
 )  # fmt: skip
 
