@@ -58,7 +58,9 @@ class StepInputs(NamedTuple):
         )
         params = HeadParams(**{name: named[name] for name in _PARAMS})
         frame = replace(self.frame, camera=camera, params=params, **{name: named[name] for name in _IMAGES})
-        return StepInputs(frame, named["vertices"], named["background"], **{name: named.get(name) for name in _OPTIONAL})
+        return StepInputs(
+            frame, named["vertices"], named["background"], **{name: named.get(name) for name in _OPTIONAL}
+        )
 
 
 class StepOutputs(NamedTuple):
