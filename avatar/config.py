@@ -113,7 +113,7 @@ class TrainerConfig:
     )
     dssim_weight: Annotated[float, WEIGHT, "weight of D-SSIM in steps where it replaces LPIPS"] = 0.2
     dssim_early: Annotated[float, WEIGHT, "weight of D-SSIM before the perceptual loss begins"] = 0.1
-    opposite_background: Annotated[
+    opposite_background_every: Annotated[
         int | None, STEPS, "every so many-th step is over black where the background is light, else white; null: none"
     ] = 3
     pose_rate: Annotated[

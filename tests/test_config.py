@@ -95,7 +95,7 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "trainer.sparse_lpips": (True, False),
         "trainer.dssim_weight": (0.2, 0.05),
         "trainer.dssim_early": (0.1, 0.0),
-        "trainer.opposite_background": (3, None),
+        "trainer.opposite_background_every": (3, None),
         "trainer.pose_rate": (0.01, 0.0),
         "trainer.condition_noise": (0.2, 0.0),
     }

@@ -83,7 +83,7 @@ class Objective:
 
     def background_of(self, step: int) -> Float[Tensor, 3]:
         """Behind the head in step `step` (from 0): over one colour alone, Gaussians of that colour cost nothing."""
-        every = self.config.opposite_background
+        every = self.config.opposite_background_every
         return self._opposite if every is not None and step % every == every - 1 else self.background
 
     @cached_property

@@ -117,7 +117,8 @@ class StepRunner:
         if term is None or not term.crops:
             crop = [None, None]
         frame = replace(frame, camera=camera)
-        background = self._state.objective.background_of(step)
+        avatar, objective = self._state.avatar, self._state.objective
+        background = objective.background_of(step) if avatar.has_colours else objective.background
         return StepInputs(frame, self.vertices(frame), background, self._noise_of(step), row, jacobian, *crop)
 
     def _constants_of(self, frame: Frame) -> FrameConstants:
