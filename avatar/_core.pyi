@@ -77,7 +77,7 @@ def interpolate_forward(grid: Tensor, cells: Tensor, weights: Tensor, simd: str,
 def interpolate_backward(
     grad: Tensor, begins: Tensor, gaussians: Tensor, weights: Tensor, simd: str, threads: int, grad_grid: Tensor
 ) -> None: ...
-def compose_forward(
+def apply_offsets_forward(
     points: Tensor,
     quats: Tensor,
     log_scales: Tensor,
@@ -90,7 +90,7 @@ def compose_forward(
     scales: Tensor,
     opacities: Tensor,
 ) -> None: ...
-def compose_backward(
+def apply_offsets_backward(
     quats: Tensor,
     log_scales: Tensor,
     raw: Tensor,

@@ -15,7 +15,7 @@ from functools import reduce
 from typing import Annotated, Any, Literal, get_type_hints
 
 from avatar.config_values import Range, cause, check_device, checked_value, config_dir, meaning_of, shown, typed_value
-from avatar.data.background import Colour
+from avatar.data.colours import Colour
 from avatar.errors import UserError
 
 MAX_OVERRIDE = 1000  # characters; a message quotes the override
@@ -97,7 +97,7 @@ class TrainerConfig:
     """The optimisation."""
 
     iterations: Annotated[int, STEPS, "optimizer steps, one random training frame each"] = 4000
-    passes: Annotated[int | None, STEPS, "most passes over the training frames; null: no limit"] = 10
+    max_epochs: Annotated[int | None, STEPS, "most passes over the training frames; null: no limit"] = 10
     seed: Annotated[int, Range(0, 2**31 - 1), "seed of the initial weights and of the order of frames"] = 0
     learning_rates: LearningRates = field(default_factory=LearningRates)
     lr_decay: Annotated[bool, "warm up, then decay all learning rates along half a cosine; false: constant"] = True
@@ -141,7 +141,7 @@ class Config:
 def load_config(overrides: Sequence[str] = ()) -> Config:
     """The default recipe with `group=option` and `key=value` overrides, keys after groups, later ones winning.
 
-    `trainer.iterations` without `trainer.passes` lifts the limit of passes over the frames.
+    `trainer.iterations` without `trainer.max_epochs` lifts the limit of passes over the frames.
     Raises UserError for an unknown key or option, a wrong type or a value out of range.
     """
     files, _ = _composed(overrides)
@@ -150,8 +150,8 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
     for key, text in given.items():
         *sections, name = key.split(".")
         reduce(dict.__getitem__, sections, values)[name] = typed_value(text)
-    if "trainer.iterations" in given and "trainer.passes" not in given:
-        values["trainer"]["passes"] = None
+    if "trainer.iterations" in given and "trainer.max_epochs" not in given:
+        values["trainer"]["max_epochs"] = None
     return config_from_dict(values)
 
 

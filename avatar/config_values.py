@@ -7,7 +7,7 @@ import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
+from avatar.data.colours import COLOUR_WORDS, Colour, parse_colour
 from avatar.errors import UserError
 
 DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")

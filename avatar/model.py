@@ -56,7 +56,7 @@ class FlashAvatar(UVAvatar):
             make = gpu_function("make Gaussians")
             return make(vertices, values, packed, *self.base(), self.embedding, self.grid, binding)
         latents = self.interpolate(values)
-        return self.compose(self.points(vertices, params), self.offsets(latents))
+        return self.apply_offsets(self.points(vertices, params), self.offsets(latents))
 
     def points(self, vertices: Float[Tensor, "V 3"], params: HeadParams) -> Float[Tensor, "N 3"]:
         """Where the Gaussians are before their offsets, metres: on the posed mesh and, by a share, on the skull."""
@@ -76,7 +76,7 @@ class FlashAvatar(UVAvatar):
         """Position, rotation and scale of each Gaussian relative to its point, before the tanh."""
         return latents if self.hyper is None else self.hyper(latents)
 
-    def compose(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
+    def apply_offsets(self, points: Float[Tensor, "N 3"], offsets: Float[Tensor, "N 10"]) -> Gaussians:
         return apply_offsets(points, *self.base(), offsets)
 
     def parameter_groups(self, trainer: TrainerConfig) -> Groups:

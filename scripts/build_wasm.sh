@@ -11,9 +11,9 @@ mkdir -p "$build" "$out"
 # Debian's emscripten runs a node that warns of its own fetch.
 export NODE_OPTIONS="${NODE_OPTIONS:-} --no-experimental-fetch"
 flags=(-std=c++17 -O3 -msimd128 -msse2 -fno-math-errno -fno-trapping-math -ffp-contract=off -I "$source")
-kernels=(compose/kernels.cpp hyper/kernels.cpp splat/kernel_table.cpp)
-plain=(compose/dispatch.cpp hyper/dispatch.cpp splat/dispatch.cpp instruction_set.cpp block_store.cpp
-  splat/bin.cpp splat/project.cpp splat/splat.cpp web/one_thread.cpp web/pack.cpp web/portrait.cpp web/exports.cpp)
+kernels=(apply_offsets/kernels.cpp hyper/kernels.cpp splat/kernel_table.cpp)
+plain=(apply_offsets/dispatch.cpp hyper/dispatch.cpp splat/dispatch.cpp instruction_set.cpp block_store.cpp
+  splat/bin.cpp splat/project.cpp splat/splat.cpp web/one_thread.cpp web/pack.cpp web/web_avatar.cpp web/exports.cpp)
 objects=()
 compile() { # FILE [FLAGS]
   local object

@@ -20,7 +20,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from playwright.sync_api import sync_playwright
 
-from avatar.export.stage import faded
+from avatar.export.default_view import faded
 from avatar.export.web_page import write_page
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar

@@ -33,8 +33,8 @@ from torch import Tensor
 
 from avatar.commands.reenact import head_of
 from avatar.errors import UserError
+from avatar.export.default_view import front_camera
 from avatar.export.mediapipe_pack import PACK, make_pack
-from avatar.export.stage import front_camera
 from avatar.export.web_arrays import reduce_avatar
 from avatar.export.web_page import WEB, write_page, write_web_avatar
 from avatar.head.lips import lip_gap, lip_pairs

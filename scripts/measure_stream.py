@@ -29,8 +29,8 @@ from avatar.view.packets import BLENDSHAPES, LIVE_LINK, LIVE_LINK_VERSION
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.sender import encode_line
-from avatar.view.server import Viewer
 from avatar.view.view_renderer import ViewRenderer
+from avatar.view.viewer import Viewer
 
 # Sends packets, given as JSON of hexadecimal texts, and prints when each went out, in seconds of CLOCK_MONOTONIC.
 SENDER = """

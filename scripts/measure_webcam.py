@@ -23,8 +23,8 @@ from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.live import Live, Pace
 from avatar.view.player import WEBCAM, Player
-from avatar.view.server import Viewer
 from avatar.view.view_renderer import ViewRenderer
+from avatar.view.viewer import Viewer
 from avatar.view.webcam import Webcam
 from data_prep.live.follow import FaceFollower
 from data_prep.live.frame_fit import FrameFit

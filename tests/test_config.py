@@ -84,7 +84,7 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "model.head_rotation": (True, False),
         "model.teeth": (True, False),
         "trainer.iterations": (4000, 30000),
-        "trainer.passes": (10, None),
+        "trainer.max_epochs": (10, None),
         "trainer.learning_rates.sh_dc": (1e-2, 2.5e-3),
         "trainer.learning_rates.sh_rest": (2.5e-3, 1.25e-4),
         "trainer.learning_rates.scale": (2e-2, 5e-3),
@@ -107,10 +107,10 @@ def test_default_recipe_is_the_defaults_of_the_dataclasses() -> None:
 
 
 def test_iterations_lift_the_limit_of_passes() -> None:
-    assert load_config().trainer.passes == 10
-    assert load_config(["trainer.iterations=7000"]).trainer.passes is None
-    assert load_config(["trainer.iterations=7000", "trainer.passes=3"]).trainer.passes == 3
-    assert load_config(["trainer.passes=3", "trainer.iterations=7000"]).trainer.passes == 3
+    assert load_config().trainer.max_epochs == 10
+    assert load_config(["trainer.iterations=7000"]).trainer.max_epochs is None
+    assert load_config(["trainer.iterations=7000", "trainer.max_epochs=3"]).trainer.max_epochs == 3
+    assert load_config(["trainer.max_epochs=3", "trainer.iterations=7000"]).trainer.max_epochs == 3
 
 
 def test_later_overrides_win_and_survive_a_round_trip() -> None:

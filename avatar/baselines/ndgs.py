@@ -89,7 +89,7 @@ class NdgsAvatar(FlashAvatar):
         assert self.hyper is not None
         return self.hyper(latents)
 
-    def compose(self, points: Float[Tensor, "N 3"], offsets: Slice) -> Gaussians:
+    def apply_offsets(self, points: Float[Tensor, "N 3"], offsets: Slice) -> Gaussians:
         """Gaussians that move, through tanh as FlashAvatar's do, and fade; they do not turn or grow."""
         quats, log_scales, opacity_logits, sh = self.base()
         means, opacities = points + torch.tanh(offsets.position), torch.sigmoid(opacity_logits) * offsets.density

@@ -31,7 +31,7 @@ from avatar.pipeline.refine_plan import WITH_REFINEMENT, round_steps
 from avatar.pose_refinement.refine import refine_subject
 from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import choose_perceptual
-from avatar.train.order import planned_steps, within_passes
+from avatar.train.order import planned_steps, within_epochs
 from avatar.train.trainer import train
 from data_prep.prepare.open import find_head, open_subject
 
@@ -91,7 +91,7 @@ class Trial:
 
     def trained(self, recording: Recording, name: str) -> Avatar:
         """An avatar of the subject's pictures with this tracking. Raises KeyboardInterrupt after an interruption."""
-        trainer = within_passes(self.config.trainer, len(recording.split.train))
+        trainer = within_epochs(self.config.trainer, len(recording.split.train))
         config, subject = replace(self.config, trainer=trainer), replace(self.subject, recording=recording)
         torch.manual_seed(config.trainer.seed)
         avatar = make_avatar(self.assets, subject.identity, config.model)
@@ -103,7 +103,7 @@ class Trial:
     def refined(self, recording: Recording, name: str) -> Recording:
         """The tracking refined through a shortly trained avatar. Raises KeyboardInterrupt after an interruption."""
         frames = len(recording.split.train)
-        trainer = within_passes(self.config.trainer, frames)
+        trainer = within_epochs(self.config.trainer, frames)
         steps = round_steps(trainer.iterations, frames)
         short = replace(self.config, trainer=replace(trainer, iterations=steps))
         avatar = replace(self, config=short).trained(recording, name)

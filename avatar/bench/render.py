@@ -35,7 +35,7 @@ SIZES, QUICK_SIZES = (256, 512), (32,)
 GAUSSIANS_TOLERANCE = 1e-4  # of a field's norm: float32 through a network of some layers
 IMAGE_TOLERANCE = 1e-5  # mean over the pixels; single pixels may differ by 1/255 where a splat is at a cut-off
 
-STEPS = {"embedding": "points", "heads": "offsets", "compose": "compose"}  # methods of the avatar
+STEPS = {"embedding": "points", "heads": "offsets", "apply_offsets": "apply_offsets"}  # methods of the avatar
 Input = tuple[HeadParams, Camera]
 
 

@@ -188,7 +188,7 @@ def stages(learner: Learner, repeats: int) -> dict[str, Time]:
         watched += [(avatar, "points", "embedding"), (avatar.deformation, "forward", "network")]
         watched += [] if avatar.grid is None else [(avatar, "interpolate", "interpolation")]
         watched += [] if avatar.hyper is None else [(avatar, "offsets", "heads")]
-        watched.append((avatar, "compose", "compose"))
+        watched.append((avatar, "apply_offsets", "apply_offsets"))
     with ExitStack() as stack:
         for owner, name, stage in watched:
             stack.enter_context(stopwatch.watching(owner, name, stage))

@@ -39,7 +39,7 @@ from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
 from avatar.train.objective import choose_perceptual
-from avatar.train.order import within_passes
+from avatar.train.order import within_epochs
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.track.first_pass import MAX_PICTURES
 from data_prep.track.footage.pictures import open_footage
@@ -161,7 +161,7 @@ def count_frames(footage: Footage) -> int:
 
 def training_seconds(config: Config, rounds: int, frames: int, train: int, device: str) -> float:
     """On two cores, or a GPU; with the rounds of refinement, `train` of the frames being trained on."""
-    steps = within_passes(config.trainer, train).iterations
+    steps = within_epochs(config.trainer, train).iterations
     return STEP[device] * (steps + rounds * round_steps(steps, train)) + rounds * frames * REFINED_FRAME
 
 

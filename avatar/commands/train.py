@@ -194,8 +194,8 @@ def refuse_changed_run(run: Path, info: RunInfo, arguments: Namespace, overrides
         recorded = {**flatten(info.config.to_dict()), **info.options}
         asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
         limited = (
-            recorded["trainer.passes"] is not None
-            and asked["trainer.passes"] == recorded["trainer.passes"]
+            recorded["trainer.max_epochs"] is not None
+            and asked["trainer.max_epochs"] == recorded["trainer.max_epochs"]
             and asked["trainer.iterations"] > recorded["trainer.iterations"]
         )
         free = {"device", *(["trainer.iterations"] if limited else [])}  # what was asked for is not recorded

@@ -38,7 +38,7 @@ from data_prep.live.follow import FaceFollower
 from data_prep.live.pictures import open_source
 
 if TYPE_CHECKING:
-    from avatar.view.server import Viewer
+    from avatar.view.viewer import Viewer
 
 WIDTHS = (64, 2048)
 CACHED_PICTURES = 64
@@ -61,7 +61,7 @@ def run_view(arguments: Namespace) -> int:
     url = None if arguments.url is None else checked_url(arguments.url)
     token = checked_token(arguments.token) or secrets.token_hex(16)
     check_installed("avatar view", "view", "viser")
-    from avatar.view.server import Viewer
+    from avatar.view.viewer import Viewer
 
     motions = clips(trained, arguments.drive)
     trained.avatar.to(choose_device(arguments.device or "auto", print))

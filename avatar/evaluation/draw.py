@@ -12,10 +12,10 @@ import torch
 from jaxtyping import UInt8
 
 from avatar.compute.device import to_device
-from avatar.data.background import Colour
+from avatar.data.colours import Colour
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
-from avatar.evaluation.protocol import Look
+from avatar.evaluation.protocol import ImageFormat
 from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
@@ -28,19 +28,19 @@ SHEET_WIDTH = 1600  # pixels at most
 TIMED_FRAMES, WARM_UP = 30, 3
 
 
-def draw(renderer: Renderer, frame: Frame, looks: Iterable[Look]) -> dict[Look, Pair]:
-    """Render and truth of a frame for each look, where the avatar is; looks of one background share the drawing."""
+def draw(renderer: Renderer, frame: Frame, formats: Iterable[ImageFormat]) -> dict[ImageFormat, Pair]:
+    """Render and truth of a frame for each format, where the avatar is; those of one background share the drawing."""
     device = renderer.background.device
     gaussians = renderer.gaussians(frame.params, frame.camera)
     images: dict[Colour, Pair] = {}
     pairs = {}
-    for look in looks:
-        if look.background not in images:
-            colour = torch.tensor(look.background)
+    for image_format in formats:
+        if image_format.background not in images:
+            colour = torch.tensor(image_format.background)
             with checked_drawings():
                 picture = renderer.draw(gaussians, frame.camera, to_device(colour, device))
-            images[look.background] = Pair(picture.image, to_device(frame.composite(colour), device))
-        pairs[look] = Pair(*(as_seen(image, look) for image in images[look.background]))
+            images[image_format.background] = Pair(picture.image, to_device(frame.composite(colour), device))
+        pairs[image_format] = Pair(*(as_seen(image, image_format) for image in images[image_format.background]))
     return pairs
 
 

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from avatar.data.background import colour_name
+from avatar.data.colours import colour_name
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import MissingPackage, UserError
@@ -186,7 +186,7 @@ def measure(
     known = {drive: conditions(run.avatar.head, recording, order) for drive, recording in recordings.items()}
     results: Measured = {drive: {protocol.name: [] for protocol in protocols} for drive in recordings}
     numbers, own = numbers_of(subject), subject.recording
-    jitter = {(drive, protocol.look): JitterMeter() for drive in recordings for protocol in protocols}
+    jitter = {(drive, protocol.image_format): JitterMeter() for drive in recordings for protocol in protocols}
     filmed = {name: min((own.view(i) for i in found), default=0) for name, found in indices.items()}  # one camera's
     with FrameLoader(subject, data.size) as loader:
         for frame in tqdm(loader.frames(order), total=len(order), desc="eval", unit="frame", disable=None):
@@ -194,12 +194,12 @@ def measure(
             masks = region_masks(frame, run.avatar.head, {"head", *(r for p in wanted for r in p.regions)})
             for drive, recording in recordings.items():
                 camera, params = recording.camera(frame.index, data.size), recording.params(frame.index)
-                pairs = draw(renderer, replace(frame, camera=camera, params=params), [p.look for p in wanted])
-                for look, pair in pairs.items():
-                    jitter[drive, look].add(own.view(frame.index), numbers[frame.index], pair, masks["head"])
+                pairs = draw(renderer, replace(frame, camera=camera, params=params), [p.image_format for p in wanted])
+                for image_format, pair in pairs.items():
+                    jitter[drive, image_format].add(own.view(frame.index), numbers[frame.index], pair, masks["head"])
                 measurer = FrameMeasurer(pairs, masks, networks)
                 for protocol in wanted:
-                    figures, pair = measurer.measure(protocol), pairs[protocol.look]
+                    figures, pair = measurer.measure(protocol), pairs[protocol.image_format]
                     row = FrameResult(frame.index, frame.name, figures, known[drive][frame.index])
                     results[drive][protocol.name].append(row)
                     add_to_film = films.get(protocol.name) if own.view(frame.index) == filmed[protocol.name] else None
@@ -211,7 +211,7 @@ def measure(
                         write_pictures(run.path / "eval" / protocol.name, frame.index, pictures)
     for drive, found in results.items():
         for protocol in protocols:
-            add_jitter(found[protocol.name], jitter[drive, protocol.look], run)
+            add_jitter(found[protocol.name], jitter[drive, protocol.image_format], run)
     return results
 
 
@@ -255,7 +255,7 @@ def worst_sheet(run: Run, renderer: Renderer, protocol: Protocol, worst: Sequenc
     subject, panels = run.subject.as_tracked(), []
     for entry in worst:
         frame = subject.frame(entry["frame"], run.config.data.size)
-        pair = draw(renderer, frame, [protocol.look])[protocol.look]
+        pair = draw(renderer, frame, [protocol.image_format])[protocol.image_format]
         panels.append(panel(pair, (f"truth of {entry['name']}", f"render, {entry['psnr']:.2f} dB")))
     return contact_sheet(panels)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from avatar.compute.device import CPU, to_device
-from avatar.evaluation.protocol import Levels, Look, Protocol, Region, column, columns_of
+from avatar.evaluation.protocol import ImageFormat, Levels, Protocol, Region, column, columns_of
 from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.losses.metrics import SSIM_RADIUS, bounding_box, grown_box, squared_error, ssim_map, weighted_mean
 
@@ -27,11 +27,11 @@ class Pair(NamedTuple):
     truth: Tensor  # [H, W, 3]
 
 
-def as_seen(image: Float[Tensor, "..."], look: Look) -> Tensor:
+def as_seen(image: Float[Tensor, "..."], image_format: ImageFormat) -> Tensor:
     """An image as a protocol compares it: uint8 after rounding or truncation, or float32."""
-    if look.clamp:
+    if image_format.clamp:
         image = image.clamp(0.0, 1.0)
-    return image if look.levels == "float" else to_8_bit(image, look.levels)
+    return image if image_format.levels == "float" else to_8_bit(image, image_format.levels)
 
 
 def to_8_bit(image: Float[Tensor, "..."], levels: Levels = "round") -> UInt8[Tensor, "..."]:
@@ -45,17 +45,17 @@ class FrameMeasurer:
 
     def __init__(
         self,
-        pairs: Mapping[Look, Pair],
+        pairs: Mapping[ImageFormat, Pair],
         masks: Mapping[Region, UInt8[Tensor, "H W"]],
         networks: Mapping[Net, Lpips | None],
     ) -> None:
         """`masks` lacks a region that the head model cannot show; "head" is there always."""
-        self._pairs = {look: tuple(_as_values(image) for image in pair) for look, pair in pairs.items()}
+        self._pairs = {image_format: tuple(_as_values(image) for image in pair) for image_format, pair in pairs.items()}
         device = next((pair[0].device for pair in self._pairs.values()), CPU)
         self._masks = {region: to_device(mask, device).double() / 255.0 for region, mask in masks.items()}
         self._networks = networks
-        self._maps: dict[tuple[Look, bool], tuple[Tensor, Tensor]] = {}
-        self._lpips: dict[tuple[Look, str, Net], float] = {}
+        self._maps: dict[tuple[ImageFormat, bool], tuple[Tensor, Tensor]] = {}
+        self._lpips: dict[tuple[ImageFormat, str, Net], float] = {}
 
     def measure(self, protocol: Protocol) -> Figures:
         """All figures of the protocol but its jitter. NaN: undefined (a region without a pixel) or not measured."""
@@ -68,7 +68,7 @@ class FrameMeasurer:
                     figures |= dict.fromkeys(columns_of(region), float("nan"))
                     continue
             multiply = region is None and protocol.mask == "multiply"
-            error, similarity = self._maps_of(protocol.look, multiply)
+            error, similarity = self._maps_of(protocol.image_format, multiply)
             inside = None if mask is None else mask[INSIDE, INSIDE]
             figures[column("psnr", region)] = -10.0 * torch.log10(weighted_mean(error, mask)).item()
             figures[column("ssim", region)] = weighted_mean(similarity, inside).item()
@@ -77,26 +77,28 @@ class FrameMeasurer:
                 figures[lpips] = protocol.lpips_scale * self._lpips_of(protocol, what)
         return figures
 
-    def _images(self, look: Look, multiply: bool) -> tuple[Tensor, Tensor]:
-        render, truth = self._pairs[look]
+    def _images(self, image_format: ImageFormat, multiply: bool) -> tuple[Tensor, Tensor]:
+        render, truth = self._pairs[image_format]
         if not multiply:
             return render, truth
         weight = self._masks["head"][..., None]
         return render * weight, truth * weight
 
-    def _maps_of(self, look: Look, multiply: bool) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H-10 W-10"]]:
-        key = (look, multiply)
+    def _maps_of(
+        self, image_format: ImageFormat, multiply: bool
+    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H-10 W-10"]]:
+        key = (image_format, multiply)
         if key not in self._maps:
-            images = self._images(look, multiply)
+            images = self._images(image_format, multiply)
             self._maps[key] = squared_error(*images), ssim_map(*images).mean(dim=-1)
         return self._maps[key]
 
     def _lpips_of(self, protocol: Protocol, what: str) -> float:
         """LPIPS before scaling; `what` is a region, or "multiply" or "none" for the whole frame."""
-        key = (protocol.look, what, protocol.lpips_net)
+        key = (protocol.image_format, what, protocol.lpips_net)
         if key not in self._lpips:
             network = self._networks[protocol.lpips_net]
-            images = self._images(protocol.look, what == "multiply")
+            images = self._images(protocol.image_format, what == "multiply")
             if what in self._masks:
                 self._lpips[key] = lpips_in_mask(network, images, self._masks[what])
             else:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 from avatar.config_values import config_dir
-from avatar.data.background import COLOUR_WORDS, Colour, parse_colour
+from avatar.data.colours import COLOUR_WORDS, Colour, parse_colour
 from avatar.data.split import Split
 from avatar.errors import UserError
 from avatar.files.plain_yaml import read_yaml
@@ -58,7 +58,7 @@ SHARED_CHOICES = {
 }
 
 
-class Look(NamedTuple):
+class ImageFormat(NamedTuple):
     """How render and truth become the pictures that are compared; protocols that agree in it share the pictures."""
 
     background: Colour
@@ -85,8 +85,8 @@ class Protocol:
     lpips_scale: float  # factor on LPIPS
 
     @property
-    def look(self) -> Look:
-        return Look(self.background, self.clamp, self.levels)
+    def image_format(self) -> ImageFormat:
+        return ImageFormat(self.background, self.clamp, self.levels)
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A trained avatar reduced to what drawing it takes: plain arrays, in the order that csrc/web/portrait.h names."""
+"""A trained avatar reduced to what drawing it takes: plain arrays, in the order that csrc/web/web_avatar.h names."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.export.stage import faded
+from avatar.export.default_view import faded
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.model import FlashAvatar
 from avatar.runs.trained import TrainedAvatar
 
-# The arrays of csrc/web/portrait.h, in its order.
+# The arrays of csrc/web/web_avatar.h, in its order.
 ARRAYS = (
     "shape",
     "expression_dirs",
@@ -53,7 +53,7 @@ class WebArrays:
     Only the expression coefficients `kept` take part; the others were zero in all of the training video.
     """
 
-    sizes: dict[str, int]  # of csrc/web/portrait.h, in its order
+    sizes: dict[str, int]  # of csrc/web/web_avatar.h, in its order
     arrays: dict[str, Float[np.ndarray, "..."]]  # of ARRAYS
     corners: Int[np.ndarray, "G 3"]
     cells: Int[np.ndarray, "C 4"]  # empty where the network is evaluated at every Gaussian

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 
 from avatar.errors import UserError
+from avatar.export.default_view import front_camera
 from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
-from avatar.export.stage import front_camera
 from avatar.export.web_arrays import ARRAYS, WebArrays, reduce_avatar
 from avatar.gaussians.head_rotation import LIMIT
 from avatar.motion.controls import expression_controls, joint_ranges

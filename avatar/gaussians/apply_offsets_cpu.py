@@ -13,7 +13,7 @@ from avatar import _core
 from avatar.compute.native import instruction_set, thread_count
 from avatar.types import Gaussians
 
-_COMPOSED = Gaussians._fields[:4]  # all but sh
+_ACTIVATED = Gaussians._fields[:4]  # all but sh
 
 
 def apply_offsets_cpu(
@@ -41,25 +41,25 @@ class _ApplyOffsets(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *parameters: Tensor) -> tuple[Tensor, ...]:
         points, quats, log_scales, opacity_logits, raw = (tensor.detach().contiguous() for tensor in parameters)
-        composed = tuple(torch.empty_like(tensor) for tensor in (points, quats, log_scales, opacity_logits))
-        _core.compose_forward(
-            points, quats, log_scales, opacity_logits, raw, instruction_set(), thread_count(), *composed
+        activated = tuple(torch.empty_like(tensor) for tensor in (points, quats, log_scales, opacity_logits))
+        _core.apply_offsets_forward(
+            points, quats, log_scales, opacity_logits, raw, instruction_set(), thread_count(), *activated
         )
-        ctx.save_for_backward(quats, log_scales, raw, composed[2], composed[3])
-        return composed
+        ctx.save_for_backward(quats, log_scales, raw, activated[2], activated[3])
+        return activated
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         quats, log_scales, raw, scales, opacities = ctx.saved_tensors
         gradients = _Gradients(*(torch.empty_like(tensor) for tensor in (quats, log_scales, opacities, raw)))
-        _core.compose_backward(
+        _core.apply_offsets_backward(
             quats,
             log_scales,
             raw,
             scales,
             opacities,
-            **{f"by_{name}": grad.contiguous() for name, grad in zip(_COMPOSED, upstream, strict=True)},
+            **{f"by_{name}": grad.contiguous() for name, grad in zip(_ACTIVATED, upstream, strict=True)},
             simd=instruction_set(),
             threads=thread_count(),
             **{f"grad_{name}": gradient for name, gradient in gradients._asdict().items()},

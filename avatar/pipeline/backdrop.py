@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.data.background import COLOURS, parse_colour
+from avatar.data.colours import COLOURS, parse_colour
 from avatar.data.images import read_image
 from avatar.errors import UserError
 from avatar.types import Rendering

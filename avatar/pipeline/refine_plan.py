@@ -21,7 +21,7 @@ from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.train.cost_estimate import measure_cost
 from avatar.train.objective import choose_perceptual
-from avatar.train.order import within_passes
+from avatar.train.order import within_epochs
 from data_prep.prepare.open import open_subject
 
 ROUNDS_FOLDER = "rounds"
@@ -82,7 +82,7 @@ class Plan:
         """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
         many rounds are still to come; never fewer than make an avatar."""
         assert self.minutes is not None
-        asked = within_passes(load_config(self.overrides).trainer, frames).iterations
+        asked = within_epochs(load_config(self.overrides).trainer, frames).iterations
         able = affordable_iterations(plannable(self.minutes) - self.spent, pace.step, pace.refinement, rounds, frames)
         chosen = min(asked, max(able, LEAST_STEPS))
         print(
@@ -145,7 +145,7 @@ def steps_in_time(
     subject, assets = open_subject(source, config.data.test_frames, print)
     subject.refuse_several_cameras("--refine")
     frames = len(subject.split.train)
-    asked = within_passes(config.trainer, frames).iterations
+    asked = within_epochs(config.trainer, frames).iterations
     if minutes is None:
         return asked, round_steps(asked, frames)
     term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))

@@ -29,7 +29,7 @@ from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.objective import PerceptualTerm, choose_perceptual
-from avatar.train.order import within_passes
+from avatar.train.order import within_epochs
 from avatar.train.trainer import save_avatar, train
 from data_prep.prepare.open import open_subject
 
@@ -54,10 +54,10 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
 
 
 def on_subject(config: Config, subject: Subject) -> Config:
-    """With the steps that `trainer.passes` leaves on this subject; says so where they are fewer."""
-    trainer = within_passes(config.trainer, len(subject.split.train))
+    """With the steps that `trainer.max_epochs` leaves on this subject; says so where they are fewer."""
+    trainer = within_epochs(config.trainer, len(subject.split.train))
     if trainer.iterations < config.trainer.iterations:
-        print(f"{trainer.passes} passes over the training frames are {trainer.iterations:,} steps (trainer.passes)")
+        print(f"{trainer.max_epochs} epochs are {trainer.iterations:,} steps (trainer.max_epochs)")
     return replace(config, trainer=trainer)
 
 

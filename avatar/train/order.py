@@ -10,16 +10,18 @@ import numpy as np
 from avatar.config import TrainerConfig
 
 
-def within_passes(config: TrainerConfig, frames: int) -> TrainerConfig:
-    """The same with no more iterations than `passes` passes over so many training frames take."""
-    if config.passes is None:
+def within_epochs(config: TrainerConfig, frames: int) -> TrainerConfig:
+    """The same with no more iterations than `max_epochs` passes over so many training frames take."""
+    if config.max_epochs is None:
         return config
-    return replace(config, iterations=min(config.iterations, config.passes * frames))
+    return replace(config, iterations=min(config.iterations, config.max_epochs * frames))
 
 
 def planned_steps(config: TrainerConfig) -> str:
     """How many steps that is, for a heading, before the number of frames is known."""
-    return f"{config.iterations} steps" + (f", at most {config.passes} passes" if config.passes is not None else "")
+    return f"{config.iterations} steps" + (
+        f", at most {config.max_epochs} epochs" if config.max_epochs is not None else ""
+    )
 
 
 def frame_order(frames: Sequence[int], seed: int, start: int, stop: int) -> Iterator[int]:

@@ -31,7 +31,7 @@ class Refusal(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Gate:
+class AccessCheck:
     token: str
     is_local: bool  # the viewer listens on this machine alone
     url: str | None = None  # where a proxy shows the viewer: http or https, host, path

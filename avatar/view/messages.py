@@ -45,7 +45,7 @@ class _Change(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_u
     updates: _New
 
 
-class Door:
+class MessageCheck:
     """Lets through what a page may send."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ from avatar.view.messages import Value, one_of, pressed, switched, within
 from avatar.view.view_renderer import Setting
 
 if TYPE_CHECKING:
-    from avatar.view.server import Viewer
+    from avatar.view.viewer import Viewer
 
 CURVE_POINTS = 100  # means of as many parts of a training
 PLOT_HEIGHT = 120  # pixels
@@ -89,13 +89,13 @@ class Panel:
         return safely
 
     def _input(self, handle: Any, check: Callable[[Value], Value], act: Callable[[Any], object]) -> Any:
-        self._viewer.door.admit(handle, check)
+        self._viewer.messages.admit(handle, check)
         handle.on_update(self._safe(act))
         return handle
 
     def _button(self, label: str, act: Callable[[Any], object]) -> Any:
         button = self._gui.add_button(label)
-        self._viewer.door.admit(button, pressed)
+        self._viewer.messages.admit(button, pressed)
         button.on_click(self._safe(act))
         return button
 
@@ -111,7 +111,7 @@ class Panel:
         def limit() -> None:
             self._scrub.value, self._scrub.visible = 0.0, player.clip is not None
             self._scrub.max = max(round(player.duration, 2), 0.01)
-            viewer.door.admit(self._scrub, within(0.0, self._scrub.max))
+            viewer.messages.admit(self._scrub, within(0.0, self._scrub.max))
 
         def toggle(event: Any) -> None:
             if player.clip is None:

@@ -30,7 +30,7 @@ LINES = (30, 200, 120)  # RGB of the mesh
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewOffset:
     """How the camera is turned away from that of the frame: degrees, and a factor."""
 
     yaw: float = 0.0
@@ -42,7 +42,7 @@ class Look:
 class Setting:
     """All that a person has set, but the frame of a motion that is shown."""
 
-    look: Look = Look()
+    look: ViewOffset = ViewOffset()
     expressions: Mapping[int, float] = field(default_factory=dict)  # number of a control -> how far
     joints: Mapping[str, float] = field(default_factory=dict)
     overlay: Overlay = "none"
@@ -79,10 +79,10 @@ class ViewRenderer:
         """Those that this avatar has."""
         return tuple(name for name in OVERLAYS if name != "error" or self.truth is not None)
 
-    def within(self, look: Look) -> tuple[Look, bool]:
+    def within(self, look: ViewOffset) -> tuple[ViewOffset, bool]:
         """The nearest look that is allowed, and whether the training video shows the head from there."""
         (yaw_low, yaw_high), (pitch_low, pitch_high) = self.limits
-        kept = Look(
+        kept = ViewOffset(
             min(max(look.yaw, yaw_low - MARGIN), yaw_high + MARGIN),
             min(max(look.pitch, pitch_low - MARGIN), pitch_high + MARGIN),
             min(max(look.zoom, ZOOM[0]), ZOOM[1]),

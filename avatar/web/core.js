@@ -1,7 +1,7 @@
 // An avatar in memory and the WebAssembly module that draws it. Runs in a page, a worker and node; no DOM.
 
 export const MAGIC = "AVW4";
-// The arrays that the module takes, in its order (avatar/csrc/web/portrait.h).
+// The arrays that the module takes, in its order (avatar/csrc/web/web_avatar.h).
 const ARRAYS = [
   "shape", "expression_dirs", "pose_dirs", "weights", "eyelid_dirs", "joints_at_rest", "expression_joints", "barycentric",
   "of_code", "for_condition", "input_bias", "hidden_weights", "hidden_biases", "output_weights", "output_bias",

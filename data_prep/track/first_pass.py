@@ -27,7 +27,7 @@ _DARK = 12.0  # grey levels: below, a picture is called black
 
 
 @dataclass(frozen=True)
-class Look:
+class FirstPass:
     """What is known after the first look; frame numbers are places on a regular grid in time."""
 
     landmarks: Landmarks  # T frames, in pixels of the upright source pictures
@@ -38,7 +38,7 @@ class Look:
     begins: float = 0.0  # seconds into the video, of frame 0
 
 
-def look_at(footage: Footage, span: Span, progress: Progress) -> Look:
+def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
     """Find one person's face in the clip's longest shot. Raises UserError, with what to do, where there is none."""
     notes: list[str] = []
     view = whole(footage.width, footage.height, LOOKED_AT)
@@ -101,7 +101,7 @@ def _without_pauses(shot: Shot, times: np.ndarray) -> list[Shot]:
 
 def _on_grid(
     footage: Footage, shot: Shot, times: np.ndarray, faces: list[Face | None], is_whole: bool, notes: list[str]
-) -> Look:
+) -> FirstPass:
     own = times[shot.start : shot.end]
     stated = None if footage.rate is None else footage.rate / stride(footage.rate)
     timing = regular_timing(own, stated)
@@ -127,7 +127,7 @@ def _on_grid(
         )
     size = footage.width, footage.height
     landmarks = Landmarks(points, scores, detected, size, timing.fps)
-    return Look(landmarks, pictures, len(times), is_whole, notes, float(own[0]))
+    return FirstPass(landmarks, pictures, len(times), is_whole, notes, float(own[0]))
 
 
 def _too_long(footage: Footage, first: float, last: float) -> str:
@@ -142,7 +142,7 @@ def _because(notes: list[str]) -> str:
     return f" ({'; '.join(notes)})" if notes else ""
 
 
-def to_json(look: Look) -> dict[str, Any]:
+def to_json(look: FirstPass) -> dict[str, Any]:
     """All but the landmarks."""
     return {
         "pictures": look.pictures.tolist(),
@@ -153,6 +153,6 @@ def to_json(look: Look) -> dict[str, Any]:
     }
 
 
-def from_json(raw: dict[str, Any], landmarks: Landmarks) -> Look:
+def from_json(raw: dict[str, Any], landmarks: Landmarks) -> FirstPass:
     pictures = np.array(raw["pictures"], np.int64)
-    return Look(landmarks, pictures, raw["read"], raw["is_whole"], list(raw["notes"]), raw["begins"])
+    return FirstPass(landmarks, pictures, raw["read"], raw["is_whole"], list(raw["notes"]), raw["begins"])

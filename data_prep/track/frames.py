@@ -16,7 +16,7 @@ from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress
 from data_prep.track.despill import despilled
 from data_prep.track.faces.landmarks import Landmarks
-from data_prep.track.first_pass import Look
+from data_prep.track.first_pass import FirstPass
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.user_mattes import OPAQUE, OwnMattes, share_on
 
@@ -47,7 +47,7 @@ def in_view(landmarks: Landmarks, view: View) -> Landmarks:
     )
 
 
-def write_frames(folder: Path, footage: Footage, view: View, span: Span, look: Look, progress: Progress) -> None:
+def write_frames(folder: Path, footage: Footage, view: View, span: Span, look: FirstPass, progress: Progress) -> None:
     """The view of every picture with the face, by frame number, as JPEG."""
     pictures = footage.read(view, span, lambda _: None)
     for number, picture in _chosen(pictures, footage.path, look, progress, "writing frames"):
@@ -55,7 +55,7 @@ def write_frames(folder: Path, footage: Footage, view: View, span: Span, look: L
 
 
 def write_given_mattes(
-    folder: Path, mattes: OwnMattes, view: View, span: Span, look: Look, progress: Progress
+    folder: Path, mattes: OwnMattes, view: View, span: Span, look: FirstPass, progress: Progress
 ) -> list[int]:
     """The user's own mattes; returns the frames in which they leave out most of the face. Raises UserError where these are
     many, and where the mattes are not of all pictures."""
@@ -76,7 +76,7 @@ def write_given_mattes(
 
 
 def _chosen(
-    pictures: Iterator[TimedPicture], path: Path, look: Look, progress: Progress, title: str
+    pictures: Iterator[TimedPicture], path: Path, look: FirstPass, progress: Progress, title: str
 ) -> Iterator[tuple[int, TimedPicture]]:
     """The pictures that belong to the frames with a face, with the frames' numbers."""
     wanted = {int(look.pictures[number]): int(number) for number in np.flatnonzero(look.landmarks.detected)}

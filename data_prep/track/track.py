@@ -33,7 +33,7 @@ from data_prep.formats.avatar_track import (
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress, silent
 from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
-from data_prep.track.first_pass import Look, from_json, look_at, to_json
+from data_prep.track.first_pass import FirstPass, from_json, look_at, to_json
 from data_prep.track.fit.focal import Focal
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.rotated import turned
@@ -155,7 +155,7 @@ def _look(
     mattes: OwnMattes | None,
     inputs: dict[str, Any],
     progress: Progress,
-) -> tuple[int, Look]:
+) -> tuple[int, FirstPass]:
     """By how many degrees the pictures are turned clockwise, and the first look at them then.
 
     Raises UserError for mattes that do not show the person.
@@ -184,7 +184,7 @@ def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, f
     return focal.pixels * view.width / view.box.width, focal.pixels * view.height / view.box.height, *centre
 
 
-def _left_out(look: Look) -> dict[int, str]:
+def _left_out(look: FirstPass) -> dict[int, str]:
     lost = np.flatnonzero(~look.landmarks.detected).tolist()
     return {n: "no face was found" if look.pictures[n] >= 0 else "the video has no picture at this time" for n in lost}
 

@@ -17,7 +17,7 @@ from data_prep.track import background_plate, despill
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
-from data_prep.track.first_pass import Look
+from data_prep.track.first_pass import FirstPass
 from data_prep.track.fit.fitting import fit_tracks
 from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
@@ -82,14 +82,14 @@ class TrackingStages:
     def _mask(self, number: int, kind: str = MATTE) -> np.ndarray:
         return read_mask(mask_file(self._folder / kind, number))
 
-    def view_and_focal(self, look: Look) -> tuple[View, Focal]:
+    def view_and_focal(self, look: FirstPass) -> tuple[View, Focal]:
         points = look.landmarks.points[look.landmarks.detected]
         size = self._footage.width, self._footage.height
         view = choose_view(self._choices.crop, self._choices.size, *size, points)
         given = self._choices.focal, self._choices.field_of_view, self._footage.equivalent_focal
         return view, choose_focal(*size, points, *given)
 
-    def frames(self, look: Look, view: View, inputs: list[Any]) -> str:
+    def frames(self, look: FirstPass, view: View, inputs: list[Any]) -> str:
         def make(folder: Path) -> dict[str, Any]:
             write_frames(folder, self._footage, view, self._choices.span, look, self._progress)
             return {}
@@ -97,7 +97,13 @@ class TrackingStages:
         return self._stages.run(FRAMES, {"of": inputs, "view": [*view.box, view.width, view.height]}, make)[1]
 
     def mattes(
-        self, look: Look, view: View, given: OwnMattes | None, network: str, frames_key: str, options: dict[str, Any]
+        self,
+        look: FirstPass,
+        view: View,
+        given: OwnMattes | None,
+        network: str,
+        frames_key: str,
+        options: dict[str, Any],
     ) -> tuple[list[int], str]:
         """Returns the frames in which given mattes leave out the face, and the stage's key."""
         numbers = _numbers(look.landmarks)
@@ -214,7 +220,7 @@ class TrackingStages:
         first = next(iter(fit.tracks.values()))
         return Fit.load(self._folder / "torso" / TRACKS_FILE, first.intrinsics.tolist(), first.size, figures, key)
 
-    def overlay(self, fit: Fit, look: Look) -> None:
+    def overlay(self, fit: Fit, look: FirstPass) -> None:
         def read(number: int) -> FrameParts:
             return FrameParts(self._image(number), self._mask(number, HEAD), self._mask(number, MOUTH))
 

@@ -69,7 +69,7 @@ def test_a_slice_is_the_conditional_distribution_of_the_joint_one(n: int) -> Non
 
     points, logits = torch.randn(num, 3, dtype=torch.float64), torch.randn(num, dtype=torch.float64)
     avatar = SimpleNamespace(base=lambda: (quats, log_scales, logits, torch.zeros(num, 1, 3)))
-    splats = NdgsAvatar.compose(avatar, points, Slice(1e-3 * position, density))
+    splats = NdgsAvatar.apply_offsets(avatar, points, Slice(1e-3 * position, density))
     torch.testing.assert_close(splats.means, points + torch.tanh(1e-3 * expected))
     torch.testing.assert_close(splats.opacities, torch.sigmoid(logits) * density)
     assert torch.equal(splats.scales, log_scales.exp())

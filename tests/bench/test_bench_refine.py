@@ -78,7 +78,7 @@ def test_the_share_recovered_and_the_report() -> None:
         Row("disturbed, refined", Figures(27.4, 0.9, 0.05), 0.3),
     ]
     assert recovered(rows) == pytest.approx(0.8)
-    config = SimpleNamespace(trainer=SimpleNamespace(iterations=1500, passes=None))
+    config = SimpleNamespace(trainer=SimpleNamespace(iterations=1500, max_epochs=None))
     text = report(rows, config)  # type: ignore[arg-type]
     assert "1500 steps" in text[0] and "80% of the PSNR lost" in text[-1]
     assert text[5].split() == ["disturbed,", "refined", "27.40", "0.9000", "0.300"]

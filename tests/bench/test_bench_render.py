@@ -32,7 +32,7 @@ def test_quick_run_prints_a_table_and_writes_figures(
     written = json.loads((tmp_path / "bench_render.json").read_text())
     assert written["avatar"]["step"] == 12 and written["machine"]["threads"] == torch.get_num_threads()
     (row,) = written["rows"]
-    assert set(row["steps"]) == {"skinning", "embedding", "network", "heads", "compose", "splat"}
+    assert set(row["steps"]) == {"skinning", "embedding", "network", "heads", "apply_offsets", "splat"}
     for span in (*row["steps"].values(), row["frame"], row["latency"], row["latency_of_avatar"]):
         assert 0 < span["median"] <= span["p95"] and span["repeats"] == 3
     assert row["stream_fps"] > 0

@@ -64,7 +64,7 @@ def test_quick_run_prints_a_table_and_writes_figures(
     output = capsys.readouterr().out
     figures = json.loads((tmp_path / "bench_train.json").read_text())
     assert [row["recipe"] for row in figures["rows"]] == ["paper", "default"]
-    both = {"network", "heads", "compose", "splat", "loss"}
+    both = {"network", "heads", "apply_offsets", "splat", "loss"}
     for row in figures["rows"]:
         assert f"{row['late']['median']:.1f} ({row['late']['p95']:.1f})" in output
         assert row["early"]["median"] > 0

@@ -113,7 +113,7 @@ def test_a_run_of_few_frames_ends_with_its_passes_and_is_resumed_by_the_same_com
     own_folder: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    command = ("train", own_folder, "--out", run, *OPTIONS, "data.test_frames=8", "trainer.passes=2")
+    command = ("train", own_folder, "--out", run, *OPTIONS, "data.test_frames=8", "trainer.max_epochs=2")
     output = avatar(*command)
     assert "2 passes over the training frames are 8 steps" in output and "8 held out, 8 steps" in output
     assert [path.stem[-2:] for path in list_checkpoints(run / "checkpoints")] == ["04", "08"]

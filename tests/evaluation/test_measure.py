@@ -12,7 +12,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from avatar.evaluation.measure import LPIPS_CROP, Figures, FrameMeasurer, Pair, as_seen, lpips_crop, to_8_bit
-from avatar.evaluation.protocol import Look, Protocol, choose_protocols
+from avatar.evaluation.protocol import ImageFormat, Protocol, choose_protocols
 from avatar.losses.lpips_network import Lpips
 
 PROTOCOLS = {protocol.name: protocol for protocol in choose_protocols(None)}
@@ -33,7 +33,9 @@ def pictures(height: int = 90, width: int = 100) -> tuple[torch.Tensor, ...]:
 
 def measure(protocol: Protocol, render: Any, truth: Any, head: Any, mouth: Any, lpips: Lpips | None = None) -> Figures:
     masks = {"head": head, "mouth": mouth}
-    return FrameMeasurer({protocol.look: Pair(render, truth)}, masks, {protocol.lpips_net: lpips}).measure(protocol)
+    return FrameMeasurer({protocol.image_format: Pair(render, truth)}, masks, {protocol.lpips_net: lpips}).measure(
+        protocol
+    )
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -121,9 +123,9 @@ def test_levels_are_rounded_or_cut_and_floats_stay() -> None:
     assert to_8_bit(values).tolist() == [0, 0, 0, 1, 99, 100, 255, 255]
     assert to_8_bit(values, "truncate").tolist() == [0, 0, 0, 0, 99, 99, 255, 255]
     white = (1.0, 1.0, 1.0)
-    assert torch.equal(as_seen(values, Look(white, True, "round")), to_8_bit(values))
-    assert torch.equal(as_seen(values, Look(white, True, "float")), values.clamp(0, 1))
-    assert torch.equal(as_seen(values, Look(white, False, "float")), values)
+    assert torch.equal(as_seen(values, ImageFormat(white, True, "round")), to_8_bit(values))
+    assert torch.equal(as_seen(values, ImageFormat(white, True, "float")), values.clamp(0, 1))
+    assert torch.equal(as_seen(values, ImageFormat(white, False, "float")), values)
 
 
 def test_truncation_keeps_the_levels_of_8_bit_files() -> None:

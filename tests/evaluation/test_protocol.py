@@ -155,7 +155,11 @@ def test_every_choice_can_be_made(tmp_path: Path) -> None:
         "regions: [rest, head]\nlpips_net: alex\nlpips_scale: 0.05\n"
     )
     protocol = read_protocol(path)
-    assert protocol.name == "other" and protocol.frames == 12 and protocol.look == ((0.0, 0.5, 1.0), False, "float")
+    assert (
+        protocol.name == "other"
+        and protocol.frames == 12
+        and protocol.image_format == ((0.0, 0.5, 1.0), False, "float")
+    )
     assert protocol.mask == "only" and protocol.lpips_net == "alex" and protocol.lpips_scale == 0.05
     assert protocol.columns == (
         *("psnr", "ssim", "lpips"),

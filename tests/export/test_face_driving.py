@@ -14,7 +14,7 @@ from browsers import node
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from lively import lively_avatar
 
-from avatar.export.stage import front_camera
+from avatar.export.default_view import front_camera
 from avatar.export.web_page import write_web_avatar
 from avatar.head.model import matrix_from_6d
 from avatar.motion.rest import RestPose

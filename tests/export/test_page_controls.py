@@ -13,7 +13,7 @@ from lively import lively_avatar
 from pages import shown, until
 
 from avatar.export import stage
-from avatar.export.stage import front_camera, neck_fade, neck_heights
+from avatar.export.default_view import front_camera, neck_fade, neck_heights
 from avatar.export.web_page import write_page
 from avatar.runs.trained import TrainedAvatar
 

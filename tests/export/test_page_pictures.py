@@ -15,7 +15,7 @@ from browsers import WEB
 from lively import lively_avatar, psnr
 from pages import until
 
-from avatar.export.stage import faded, front_camera
+from avatar.export.default_view import faded, front_camera
 from avatar.export.web_page import write_page
 from avatar.runs.trained import TrainedAvatar
 

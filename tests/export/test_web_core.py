@@ -16,7 +16,7 @@ from browsers import WEB, node
 from lively import lively_avatar, psnr
 
 from avatar.errors import UserError
-from avatar.export.stage import faded
+from avatar.export.default_view import faded
 from avatar.export.web_page import write_web_avatar
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
@@ -149,7 +149,7 @@ def test_the_module_is_what_its_sources_compile_to() -> None:
     root = WEB.parents[1]
     lines = [line.split() for line in (WEB / "avatar.wasm.sha256").read_text().splitlines()]
     recorded = {name: digest for digest, name in lines}
-    assert {"avatar/web/avatar.wasm", "scripts/build_wasm.sh", "avatar/csrc/web/portrait.cpp"} <= set(recorded)
+    assert {"avatar/web/avatar.wasm", "scripts/build_wasm.sh", "avatar/csrc/web/web_avatar.cpp"} <= set(recorded)
     stale = [
         name for name, digest in recorded.items() if hashlib.sha256((root / name).read_bytes()).hexdigest() != digest
     ]

@@ -41,7 +41,7 @@ OPEN_BY_THEMSELVES = {
     "avatar/files/video.py",
     "avatar/html/document.py",
     "avatar/losses/lpips.py",
-    "avatar/view/server.py",
+    "avatar/view/viewer.py",
 }
 # Readers beside those of tests/fuzz, by the file that they read.
 READERS: dict[str, Callable[[Path], object]] = {

@@ -112,7 +112,7 @@ def interpolate_backward(r: random.Random) -> tuple[Arguments, Shapes]:
     return call, shapes
 
 
-def compose(shapes: Shapes) -> Callable[[random.Random], tuple[Arguments, Shapes]]:
+def apply_offsets(shapes: Shapes) -> Callable[[random.Random], tuple[Arguments, Shapes]]:
     return lambda r: ({**arrays(shapes, {"N": r.choice(COUNTS)}), **KERNEL}, shapes)
 
 
@@ -123,7 +123,7 @@ def dssim(r: random.Random) -> tuple[Arguments, Shapes]:
     return call, shapes
 
 
-COMPOSED = {"means": "N 3", "out_quats": "N 4", "scales": "N 3", "opacities": "N"}
+ACTIVATED = {"means": "N 3", "out_quats": "N 4", "scales": "N 3", "opacities": "N"}
 BASES = {"quats": "N 4", "log_scales": "N 3", "raw": "N 10"}
 BINDINGS: dict[str, Callable[[random.Random], tuple[Arguments, Shapes]]] = {
     "splat_forward": splat_forward,
@@ -134,13 +134,13 @@ BINDINGS: dict[str, Callable[[random.Random], tuple[Arguments, Shapes]]] = {
     "hyper_apply": lambda r: hyper(r, {"matrix": "N n 10", "bias": "N 10", "offsets": "N 10"}),
     "interpolate_forward": interpolate_forward,
     "interpolate_backward": interpolate_backward,
-    "compose_forward": compose({"points": "N 3", **BASES, "opacity_logits": "N", **COMPOSED}),
-    "compose_backward": compose(
+    "apply_offsets_forward": apply_offsets({"points": "N 3", **BASES, "opacity_logits": "N", **ACTIVATED}),
+    "apply_offsets_backward": apply_offsets(
         {
             **BASES,
             "scales": "N 3",
             "opacities": "N",
-            **{f"by_{name.removeprefix('out_')}": shape for name, shape in COMPOSED.items()},
+            **{f"by_{name.removeprefix('out_')}": shape for name, shape in ACTIVATED.items()},
             **{f"grad_{name}": shape for name, shape in BASES.items()},
             "grad_opacity_logits": "N",
         }

@@ -149,9 +149,9 @@ def test_what_is_not_used_or_not_contiguous() -> None:
 def test_apply_offsets_takes_the_kernel_for_float32_only() -> None:
     inputs = parameters(30)
     sh = torch.randn(30, 16, 3)
-    composed = apply_offsets(*inputs[:4], sh, inputs[4])
-    assert composed.sh is sh
-    assert all(torch.equal(a, b) for a, b in zip(composed[:4], apply_offsets_cpu(*inputs), strict=True))
+    activated = apply_offsets(*inputs[:4], sh, inputs[4])
+    assert activated.sh is sh
+    assert all(torch.equal(a, b) for a, b in zip(activated[:4], apply_offsets_cpu(*inputs), strict=True))
     doubles = [tensor.double() for tensor in inputs]
     exact = apply_offsets(*doubles[:4], sh.double(), doubles[4])
     assert all(torch.equal(a, b) for a, b in zip(exact[:4], plain(*doubles), strict=True))

@@ -24,7 +24,7 @@ from avatar.compute.device import CPU
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation.draw import draw
-from avatar.evaluation.protocol import Look as EvaluationLook
+from avatar.evaluation.protocol import ImageFormat
 from avatar.pose_refinement import refine as refine_module
 from avatar.pose_refinement.refine import _Work, frozen
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
@@ -57,7 +57,7 @@ DRAWN: dict[str, Callable[[TrainedAvatar], object]] = {
     "a picture": lambda trained: trained.render(trained.rest_params(), trained.rest_camera(32)),
     "a stream": lambda trained: list(streamed(trained)),
     "an evaluated frame": lambda trained: draw(
-        trained.renderer, frame_of(trained, CPU), [EvaluationLook((1.0, 1.0, 1.0), True, "round")]
+        trained.renderer, frame_of(trained, CPU), [ImageFormat((1.0, 1.0, 1.0), True, "round")]
     ),
     "a viewed frame": lambda trained: ViewRenderer(trained).draw(
         (trained.rest_params(), trained.rest_camera(32)), Setting(), 32

@@ -7,13 +7,13 @@ from itertools import islice
 import pytest
 from small_runs import small_config
 
-from avatar.train.order import frame_order, within_passes
+from avatar.train.order import frame_order, within_epochs
 
 
 @pytest.mark.parametrize(("passes", "steps"), [(None, 12), (1, 5), (2, 10), (3, 12)])
 def test_passes_limit_the_steps_where_frames_are_few(passes: int | None, steps: int) -> None:
-    asked = small_config(f"trainer.passes={'null' if passes is None else passes}").trainer
-    given = within_passes(asked, frames=5)
+    asked = small_config(f"trainer.max_epochs={'null' if passes is None else passes}").trainer
+    given = within_epochs(asked, frames=5)
     assert given.iterations == steps
     assert dataclasses.replace(given, iterations=12) == asked
 

@@ -38,8 +38,8 @@ def viewer(shown_avatar: TrainedAvatar) -> Iterator[object]:
     from view_client import TOKEN, WIDTH
 
     from avatar.view.player import Player
-    from avatar.view.server import Viewer
     from avatar.view.view_renderer import ViewRenderer
+    from avatar.view.viewer import Viewer
 
     player = Player(shown_avatar, {"train": own_clip(shown_avatar, "train")}, time.monotonic)
     renderer = ViewRenderer(shown_avatar, lambda _, width: torch.full((width, width, 3), 0.4))

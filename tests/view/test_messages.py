@@ -15,7 +15,7 @@ import msgspec
 from view_client import camera
 from viser._messages import Message
 
-from avatar.view.messages import MAX_WINDOW, Door, MessageError, one_of, pressed, switched, within
+from avatar.view.messages import MAX_WINDOW, MessageCheck, MessageError, one_of, pressed, switched, within
 
 encode, decode = msgspec.msgpack.encode, msgspec.msgpack.decode
 
@@ -25,28 +25,28 @@ def handle(name: str) -> Any:
 
 
 @pytest.fixture
-def door() -> Door:
-    door = Door()
-    door.admit(handle("slider"), within(-0.5, 2.0))
-    door.admit(handle("button"), pressed)
-    door.admit(handle("checkbox"), switched)
-    door.admit(handle("list"), one_of(("none", "mesh")))
-    return door
+def messages() -> MessageCheck:
+    messages = MessageCheck()
+    messages.admit(handle("slider"), within(-0.5, 2.0))
+    messages.admit(handle("button"), pressed)
+    messages.admit(handle("checkbox"), switched)
+    messages.admit(handle("list"), one_of(("none", "mesh")))
+    return messages
 
 
 def change(name: str, value: object, **more: object) -> bytes:
     return encode({"type": "GuiUpdateMessage", "uuid": name, "updates": {"value": value}, **more})
 
 
-def value_of(door: Door, name: str, value: object) -> object:
-    return decode(door.passed(change(name, value)))["updates"]["value"]
+def value_of(messages: MessageCheck, name: str, value: object) -> object:
+    return decode(messages.passed(change(name, value)))["updates"]["value"]
 
 
-def test_controls_get_values_of_their_own_kind(door: Door) -> None:
-    assert value_of(door, "slider", 1.5) == 1.5 and value_of(door, "slider", 1) == 1
-    assert value_of(door, "slider", 1e308) == 2 and value_of(door, "slider", -7) == -0.5, "it stays at its ends"
-    assert value_of(door, "button", True) is True and value_of(door, "checkbox", False) is False
-    assert value_of(door, "list", "mesh") == "mesh"
+def test_controls_get_values_of_their_own_kind(messages: MessageCheck) -> None:
+    assert value_of(messages, "slider", 1.5) == 1.5 and value_of(messages, "slider", 1) == 1
+    assert value_of(messages, "slider", 1e308) == 2 and value_of(messages, "slider", -7) == -0.5, "it stays at its ends"
+    assert value_of(messages, "button", True) is True and value_of(messages, "checkbox", False) is False
+    assert value_of(messages, "list", "mesh") == "mesh"
     wrong: dict[str, tuple[object, ...]] = {
         "slider": (math.nan, math.inf, "nan", "1", True, None, [1], {}, b"1"),
         "button": (False, 1, "x", None),
@@ -56,10 +56,10 @@ def test_controls_get_values_of_their_own_kind(door: Door) -> None:
     for name, values in wrong.items():
         for value in values:
             with pytest.raises(MessageError):
-                door.passed(change(name, value))
+                messages.passed(change(name, value))
 
 
-def test_only_values_of_controls_can_be_changed(door: Door) -> None:
+def test_only_values_of_controls_can_be_changed(messages: MessageCheck) -> None:
     for message in (
         change("another", 1.0),
         change("slider", 1.0, more=1),
@@ -69,13 +69,13 @@ def test_only_values_of_controls_can_be_changed(door: Door) -> None:
         encode({"type": "GuiUpdateMessage", "uuid": 1, "updates": {"value": 1.0}}),
     ):
         with pytest.raises(MessageError):
-            door.passed(message)
+            messages.passed(message)
 
 
-def test_cameras_are_finite_and_windows_bounded(door: Door) -> None:
-    assert decode(door.passed(encode(camera()))) == camera()
+def test_cameras_are_finite_and_windows_bounded(messages: MessageCheck) -> None:
+    assert decode(messages.passed(encode(camera()))) == camera()
     for size, kept in ((0, 1), (-5, 1), (10, 10), (10**5, MAX_WINDOW)):
-        assert decode(door.passed(encode(camera(image_width=size))))["image_width"] == kept
+        assert decode(messages.passed(encode(camera(image_width=size))))["image_width"] == kept
     for changes in (
         {"position": [math.nan, 0.0, 1.0]},
         {"position": [1e308, 0.0, 1.0]},
@@ -88,20 +88,20 @@ def test_cameras_are_finite_and_windows_bounded(door: Door) -> None:
         {"excluded_self_client": 1},
     ):
         with pytest.raises(MessageError):
-            door.passed(encode(camera(**changes)))
+            messages.passed(encode(camera(**changes)))
 
 
-def test_every_other_message_of_viser_is_refused(door: Door) -> None:
+def test_every_other_message_of_viser_is_refused(messages: MessageCheck) -> None:
     """Among them the one that opens a public tunnel."""
     others = {kind.__name__ for kind in Message.get_subclasses()} - {"ViewerCameraMessage", "GuiUpdateMessage"}
     assert {"ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload", "GuiFormDirtyMessage"} < others
     for kind in others:
         for fields in ({}, {"uuid": "slider", "updates": {"value": 1.0}}):
             with pytest.raises(MessageError):
-                door.passed(encode({"type": kind, **fields}))
+                messages.passed(encode({"type": kind, **fields}))
 
 
-def test_text_and_what_is_no_message_is_refused(door: Door) -> None:
+def test_text_and_what_is_no_message_is_refused(messages: MessageCheck) -> None:
     for data in (
         "{}",
         b"",
@@ -113,10 +113,10 @@ def test_text_and_what_is_no_message_is_refused(door: Door) -> None:
         encode(None),
     ):
         with pytest.raises(MessageError):
-            door.passed(data)
+            messages.passed(data)
 
 
-def test_damaged_messages_are_refused_and_nothing_else(door: Door) -> None:
+def test_damaged_messages_are_refused_and_nothing_else(messages: MessageCheck) -> None:
     rng = random.Random(0)
     whole = [encode(camera()), change("slider", 0.25), change("list", "mesh"), change("button", True)]
     refused = passed = 0
@@ -135,7 +135,7 @@ def test_damaged_messages_are_refused_and_nothing_else(door: Door) -> None:
                 )
             )
         try:
-            message = decode(door.passed(bytes(data)))
+            message = decode(messages.passed(bytes(data)))
         except MessageError as error:
             assert len(str(error)) < 100
             refused += 1

@@ -23,7 +23,7 @@ from avatar.runs.avatar_file import write_avatar
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.newest import Newest, progress
-from avatar.view.server import Viewer
+from avatar.view.viewer import Viewer
 
 
 @pytest.fixture

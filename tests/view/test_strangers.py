@@ -23,8 +23,8 @@ from waiting import until
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
-from avatar.view.server import Viewer
 from avatar.view.view_renderer import ViewRenderer
+from avatar.view.viewer import Viewer
 
 FRAME = b'{"expression": [0.5]}\n'
 

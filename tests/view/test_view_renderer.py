@@ -16,7 +16,7 @@ from avatar.runs.clips import own_clip
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.live import Live
 from avatar.view.player import NEUTRAL, STREAM, Player
-from avatar.view.view_renderer import MARGIN, Look, Setting, ViewRenderer, to_bytes
+from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer, to_bytes
 
 WIDTH = 64
 
@@ -33,7 +33,7 @@ def renderer(trained: TrainedAvatar) -> ViewRenderer:
 
 def test_a_frame_is_drawn_as_the_program_draws_it(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     params, camera = trained.recording.params(5), trained.recording.camera(5, 48)
-    look = Look(renderer.limits.yaw[1], renderer.limits.pitch[0], 1.5)
+    look = ViewOffset(renderer.limits.yaw[1], renderer.limits.pitch[0], 1.5)
     drawn = renderer.draw((params, camera), Setting(look), WIDTH, 5)
     expected = trained.render(params, orbited(camera.resized(WIDTH, WIDTH), look.yaw, look.pitch, look.zoom)).image
     np.testing.assert_array_equal(drawn, to_bytes(expected))
@@ -52,9 +52,11 @@ def test_controls_add_and_joints_replace(renderer: ViewRenderer, trained: Traine
 
 
 def test_the_camera_stays_where_the_avatar_is_known(renderer: ViewRenderer) -> None:
-    kept, is_supported = renderer.within(Look(500.0, -500.0, 100.0))
-    assert kept == Look(renderer.limits.yaw[1] + MARGIN, renderer.limits.pitch[0] - MARGIN, 4.0) and not is_supported
-    assert renderer.within(Look()) == (Look(), True)
+    kept, is_supported = renderer.within(ViewOffset(500.0, -500.0, 100.0))
+    assert (
+        kept == ViewOffset(renderer.limits.yaw[1] + MARGIN, renderer.limits.pitch[0] - MARGIN, 4.0) and not is_supported
+    )
+    assert renderer.within(ViewOffset()) == (ViewOffset(), True)
 
 
 def test_overlays(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
@@ -66,7 +68,7 @@ def test_overlays(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     both = renderer.draw(frame, Setting(overlay="error", with_truth=True), WIDTH, 5)
     assert both.shape == (WIDTH, 3 * WIDTH, 3)
     assert (both[:, WIDTH : 2 * WIDTH] == round(255 * 0.05)).all(), "the truth of frame 5"
-    turned = renderer.draw(frame, Setting(Look(5.0), overlay="error"), WIDTH, 5)
+    turned = renderer.draw(frame, Setting(ViewOffset(5.0), overlay="error"), WIDTH, 5)
     np.testing.assert_array_equal(turned[:, WIDTH:], both[:, 2 * WIDTH :], "the error is of the recorded view")
     assert renderer.draw(frame, Setting(overlay="error", with_truth=True), WIDTH).shape == plain.shape, (
         "no truth of other motion"

@@ -5,7 +5,7 @@
 
 namespace nb = nanobind;
 
-void bind_compose(nb::module_& m);
+void bind_apply_offsets(nb::module_& m);
 void bind_hyper(nb::module_& m);
 void bind_large_tensor(nb::module_& m);
 void bind_mesh(nb::module_& m);
@@ -17,7 +17,7 @@ NB_MODULE(_core, m) {
     nb::set_leak_warnings(false);
     // Every call of an operator asks, and os.environ takes longer over it than some of them.
     m.def("environment", [](const char* name) -> const char* { return std::getenv(name); }, nb::arg("name"));
-    bind_compose(m);
+    bind_apply_offsets(m);
     bind_hyper(m);
     bind_large_tensor(m);
     bind_mesh(m);

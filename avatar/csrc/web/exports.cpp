@@ -4,13 +4,13 @@
 #include <memory>
 #include <new>
 
-#include "web/portrait.h"
+#include "web/web_avatar.h"
 
 namespace {
 
 avatar::web::Sizes measured;
 std::int64_t lengths[avatar::web::kArrays];
-std::unique_ptr<avatar::web::Portrait> portrait;
+std::unique_ptr<avatar::web::WebAvatar> web_avatar;
 std::unique_ptr<std::uint8_t[]> picture;
 std::int64_t picture_pixels = 0;
 double camera_values[18];  // rotation 9, translation 3, fx, fy, cx, cy, width, height
@@ -51,18 +51,18 @@ EMSCRIPTEN_KEEPALIVE double avatar_length(int which) {
     return which >= 0 && which < avatar::web::kArrays ? static_cast<double>(lengths[which]) : -1.0;
 }
 // Compiled without exceptions: want of memory ends the module.
-EMSCRIPTEN_KEEPALIVE void avatar_create() { portrait.reset(new avatar::web::Portrait(measured)); }
-EMSCRIPTEN_KEEPALIVE float* avatar_array(int which) { return portrait->array(which); }
-EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_corners() { return portrait->corners(); }
-EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_cells() { return portrait->cells(); }
-EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_parents() { return portrait->parents; }
-EMSCRIPTEN_KEEPALIVE float* avatar_parameters() { return portrait->parameters(); }
-EMSCRIPTEN_KEEPALIVE float* avatar_facing() { return portrait->facing; }
-EMSCRIPTEN_KEEPALIVE void avatar_set_blur(double blur) { portrait->blur = blur; }
+EMSCRIPTEN_KEEPALIVE void avatar_create() { web_avatar.reset(new avatar::web::WebAvatar(measured)); }
+EMSCRIPTEN_KEEPALIVE float* avatar_array(int which) { return web_avatar->array(which); }
+EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_corners() { return web_avatar->corners(); }
+EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_cells() { return web_avatar->cells(); }
+EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_parents() { return web_avatar->parents; }
+EMSCRIPTEN_KEEPALIVE float* avatar_parameters() { return web_avatar->parameters(); }
+EMSCRIPTEN_KEEPALIVE float* avatar_facing() { return web_avatar->facing; }
+EMSCRIPTEN_KEEPALIVE void avatar_set_blur(double blur) { web_avatar->blur = blur; }
 EMSCRIPTEN_KEEPALIVE double* avatar_camera() { return camera_values; }
 EMSCRIPTEN_KEEPALIVE float* avatar_background() { return background; }
-EMSCRIPTEN_KEEPALIVE int avatar_is_sound() { return portrait->is_sound(); }
-EMSCRIPTEN_KEEPALIVE void avatar_pose() { portrait->pose(); }
+EMSCRIPTEN_KEEPALIVE int avatar_is_sound() { return web_avatar->is_sound(); }
+EMSCRIPTEN_KEEPALIVE void avatar_pose() { web_avatar->pose(); }
 
 // The picture's address, or null when it cannot be drawn.
 EMSCRIPTEN_KEEPALIVE std::uint8_t* avatar_draw() {
@@ -74,10 +74,10 @@ EMSCRIPTEN_KEEPALIVE std::uint8_t* avatar_draw() {
         picture_pixels = picture ? pixels : 0;
         if (!picture) return nullptr;
     }
-    return portrait->draw(camera, background, picture.get()) ? picture.get() : nullptr;
+    return web_avatar->draw(camera, background, picture.get()) ? picture.get() : nullptr;
 }
 
 // Where the packed Gaussians are.
-EMSCRIPTEN_KEEPALIVE const float* avatar_pack() { return portrait->pack(camera_in_pixels()); }
+EMSCRIPTEN_KEEPALIVE const float* avatar_pack() { return web_avatar->pack(camera_in_pixels()); }
 
 }  // extern "C"

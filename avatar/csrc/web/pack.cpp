@@ -3,7 +3,7 @@
 #include <cmath>
 
 #include "splat/sh.h"
-#include "web/portrait.h"
+#include "web/web_avatar.h"
 
 namespace avatar::web {
 namespace {
@@ -40,7 +40,7 @@ void covariance(const float* quat, const float* scales, float out[6]) {
 
 }  // namespace
 
-const float* Portrait::pack(const splat::Camera& camera) {
+const float* WebAvatar::pack(const splat::Camera& camera) {
     const std::int64_t G = sizes_.gaussians;
     const int K = sizes_.coefficients;
     const double *R = camera.rotation, *t = camera.translation;

@@ -66,9 +66,9 @@ void array_lengths(const Sizes& sizes, std::int64_t lengths[kArrays]);
 // triangle of the covariance (xx, xy, xz, yy, yz, zz).
 constexpr int kPacked = 13;
 
-class Portrait {
+class WebAvatar {
 public:
-    explicit Portrait(const Sizes& sizes);
+    explicit WebAvatar(const Sizes& sizes);
 
     // Where a caller writes the values of an array; null for one that does not exist.
     float* array(int which);

@@ -1,8 +1,8 @@
 // Compiled once for each instruction set; AVATAR_KERNELS says which.
-#include "compose/activations.h"
-#include "compose/compose.h"
+#include "apply_offsets/activations.h"
+#include "apply_offsets/apply_offsets.h"
 
-namespace avatar::compose {
+namespace avatar::apply_offsets {
 namespace {
 
 constexpr int kBlock = 64;  // Gaussians whose values lie side by side, one array a component, while they are worked on
@@ -84,7 +84,7 @@ inline Offsets offsets(const Block<kOffsets>& raw, int i) {
     return o;
 }
 
-void forward_block(const Parameters& from, std::int64_t begin, int count, const Composed& to) {
+void forward_block(const Parameters& from, std::int64_t begin, int count, const Activated& to) {
     Block<kOffsets> raw;
     Block<3> points, log_scales;
     Block<4> quats;
@@ -122,8 +122,8 @@ void backward_block(const Parameters& from, const Upstream& upstream, std::int64
     quats_grad.read(upstream.quats, begin, count);
     scales_grad.read(upstream.scales, begin, count);
     opacities_grad.read(upstream.opacities, begin, count);
-    scales.read(upstream.composed_scales, begin, count);
-    opacities.read(upstream.composed_opacities, begin, count);
+    scales.read(upstream.activated_scales, begin, count);
+    opacities.read(upstream.activated_opacities, begin, count);
     // Each gradient takes the place of what it is the gradient of, or came from.
     for (int i = 0; i < count; i += kLanes) {
         const Offsets o = offsets(raw, i);
@@ -168,7 +168,7 @@ inline int size_of_block(std::int64_t begin, std::int64_t end) {
     return end - begin < kBlock ? static_cast<int>(end - begin) : kBlock;
 }
 
-void forward(const Parameters& from, std::int64_t begin, std::int64_t end, const Composed& to) {
+void forward(const Parameters& from, std::int64_t begin, std::int64_t end, const Activated& to) {
     for (; begin < end; begin += kBlock) forward_block(from, begin, size_of_block(begin, end), to);
 }
 
@@ -182,4 +182,4 @@ void backward(const Parameters& from, const Upstream& upstream, std::int64_t beg
 extern const Kernels AVATAR_KERNELS;
 const Kernels AVATAR_KERNELS = {forward, backward};
 
-}  // namespace avatar::compose
+}  // namespace avatar::apply_offsets

@@ -21,9 +21,9 @@ from waiting import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Origin
 
-from avatar.view import rate_limited_log, web_server
-from avatar.view.server import LARGEST, Viewer
+from avatar.view import rate_limited_log, viser_server
 from avatar.view.view_renderer import ViewRenderer
+from avatar.view.viewer import LARGEST, Viewer
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +75,7 @@ def test_the_page_and_its_websocket_need_the_token(viewer: Viewer) -> None:
 
 
 def test_a_proxy_that_was_named_passes_websockets(viewer: Viewer) -> None:
-    viewer._web._gate = replace(viewer._web._gate, url="https://hub.example.org/proxy/8080/")
+    viewer._web._access = replace(viewer._web._access, url="https://hub.example.org/proxy/8080/")
     hub = f"http://127.0.0.1:{viewer.port}/proxy/8080/{TOKEN}"
     opened(hub, origin=Origin("https://hub.example.org")).close()
     with pytest.raises(InvalidStatus):
@@ -195,15 +195,15 @@ def test_half_open_requests_do_not_stop_the_viewer(
             another.next_picture()
         assert still_drawn(viewer, page) and time.monotonic() - begin < 15
         assert viewer._web._library is not None
-        assert len(viewer._web._library.handlers) <= web_server.MAX_WAITING + 10
+        assert len(viewer._web._library.handlers) <= viser_server.MAX_WAITING + 10
         for client in sockets:
             client.close()
     assert len(said) < 5 and "Traceback" not in capfd.readouterr().err
 
 
 def test_who_says_nothing_is_closed(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web_server, "HEAD_SECONDS", 0.2)
-    monkeypatch.setattr(web_server, "FIRST_SECONDS", 0.2)
+    monkeypatch.setattr(viser_server, "HEAD_SECONDS", 0.2)
+    monkeypatch.setattr(viser_server, "FIRST_SECONDS", 0.2)
     (client,) = half_open(viewer, 1)
     assert client.recv(1000) == b""
     silent = opened(address(viewer))
@@ -213,7 +213,7 @@ def test_who_says_nothing_is_closed(viewer: Viewer, monkeypatch: pytest.MonkeyPa
 
 
 def test_there_is_always_a_place_for_another_client(viewer: Viewer) -> None:
-    pages = [Page(address(viewer)) for _ in range(web_server.MAX_CLIENTS)]
+    pages = [Page(address(viewer)) for _ in range(viser_server.MAX_CLIENTS)]
     with Page(address(viewer)) as another:
         assert still_drawn(viewer, another)
         with pytest.raises(ConnectionClosed):  # who has been silent for longest has gone
@@ -266,13 +266,13 @@ def test_closing_takes_no_time_whatever_clients_do(viewer: Viewer) -> None:
 
 
 def test_a_viser_that_listens_in_another_way_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the gate it would listen for everybody."""
-    monkeypatch.setattr(web_server.WebServer, "_serve", web_server._original)
+    """Without the access it would listen for everybody."""
+    monkeypatch.setattr(viser_server.WebServer, "_serve", viser_server._original)
     with (
         socket.create_server(("127.0.0.1", 0)) as listening,
         pytest.raises(Exception, match="does not work with viser"),
     ):
-        web_server.WebServer(listening, None, None, rate_limited_log.Complaints(), "x")  # type: ignore[arg-type]
+        viser_server.WebServer(listening, None, None, rate_limited_log.Complaints(), "x")  # type: ignore[arg-type]
 
 
 def test_complaints_are_counted() -> None:

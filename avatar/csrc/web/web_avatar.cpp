@@ -1,9 +1,9 @@
-#include "web/portrait.h"
+#include "web/web_avatar.h"
 
 #include <algorithm>
 #include <cmath>
 
-#include "compose/compose.h"
+#include "apply_offsets/apply_offsets.h"
 #include "hyper/kernels.h"
 #include "web/layer.h"
 
@@ -60,7 +60,7 @@ void array_lengths(const Sizes& s, std::int64_t lengths[kArrays]) {
     std::copy(values, values + kArrays, lengths);
 }
 
-Portrait::Portrait(const Sizes& s) : sizes_(s) {
+WebAvatar::WebAvatar(const Sizes& s) : sizes_(s) {
     const std::int64_t V = s.vertices, G = s.gaussians, M = s.nodes, W = s.width;
     std::int64_t lengths[kArrays];
     array_lengths(s, lengths);
@@ -83,9 +83,9 @@ Portrait::Portrait(const Sizes& s) : sizes_(s) {
     opacities_.resize(G);
 }
 
-float* Portrait::array(int which) { return which >= 0 && which < kArrays ? arrays_[which].data() : nullptr; }
+float* WebAvatar::array(int which) { return which >= 0 && which < kArrays ? arrays_[which].data() : nullptr; }
 
-bool Portrait::is_sound() const {
+bool WebAvatar::is_sound() const {
     const auto within = [](const std::vector<std::int32_t>& values, std::int32_t limit) {
         return std::all_of(values.begin(), values.end(), [=](std::int32_t v) { return v >= 0 && v < limit; });
     };
@@ -94,14 +94,14 @@ bool Portrait::is_sound() const {
     return within(corners_, sizes_.vertices) && within(cells_, sizes_.nodes);
 }
 
-void Portrait::pose() {
+void WebAvatar::pose() {
     skin();
     evaluate_network();
     offset();
 }
 
 // Linear blend skinning as in avatar/head/model.py, then the points of the Gaussians on the mesh.
-void Portrait::skin() {
+void WebAvatar::skin() {
     const std::int64_t V = sizes_.vertices, G = sizes_.gaussians;
     const int E = sizes_.expressions;
     const float *expression = parameters_.data(), *jaw = expression + E, *eyes = jaw + kJaw, *eyelids = eyes + kEyes,
@@ -163,7 +163,7 @@ void Portrait::skin() {
 }
 
 // Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py. `turn` is the torso's.
-void Portrait::hold(const Rotation& turn) {
+void WebAvatar::hold(const Rotation& turn) {
     bool carried[kJoints] = {};
     for (int joint = kNeckJoint; joint < kJoints; ++joint)
         carried[joint] = joint == kNeckJoint || (parents[joint] >= 0 && carried[parents[joint]]);
@@ -193,7 +193,7 @@ void Portrait::hold(const Rotation& turn) {
 }
 
 // As FoldedNetwork in avatar/render.py.
-void Portrait::evaluate_network() {
+void WebAvatar::evaluate_network() {
     const int M = sizes_.nodes, W = sizes_.width, C = moving_count(sizes_);
     std::vector<float> of_frame = arrays_[kInputBias];
     const float* weights = arrays_[kForCondition].data();
@@ -212,7 +212,7 @@ void Portrait::evaluate_network() {
                  block_.data(), latents_.data());
 }
 
-void Portrait::offset() {
+void WebAvatar::offset() {
     const std::int64_t G = sizes_.gaussians, n = sizes_.latent;
     const hyper::Kernels& kernels = hyper::select_kernels("");
     const float* latents = latents_.data();
@@ -226,12 +226,12 @@ void Portrait::offset() {
         kernels.apply(arrays_[kHeadMatrix].data(), arrays_[kHeadBias].data(), latents, n, 0, G, raw_.data());
         raw = raw_.data();
     }
-    const compose::Parameters from{points_.data(), arrays_[kQuats].data(), arrays_[kLogScales].data(),
+    const apply_offsets::Parameters from{points_.data(), arrays_[kQuats].data(), arrays_[kLogScales].data(),
                                    arrays_[kOpacityLogits].data(), raw};
-    compose::select_kernels("").forward(from, 0, G, {means_.data(), quats_.data(), scales_.data(), opacities_.data()});
+    apply_offsets::select_kernels("").forward(from, 0, G, {means_.data(), quats_.data(), scales_.data(), opacities_.data()});
 }
 
-bool Portrait::draw(const splat::Camera& camera, const float background[3], std::uint8_t* rgba) {
+bool WebAvatar::draw(const splat::Camera& camera, const float background[3], std::uint8_t* rgba) {
     const std::int64_t pixels = std::int64_t{camera.width} * camera.height;
     image_.resize(pixels * 3);
     alpha_.resize(pixels);

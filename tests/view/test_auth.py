@@ -7,17 +7,17 @@ import pytest
 pytest.importorskip("websockets")
 from websockets.datastructures import Headers
 
-from avatar.view.auth import Gate
+from avatar.view.auth import AccessCheck
 
 TOKEN = "a-token-that-is-long"
-HERE = Gate(TOKEN, True)
-EVERYWHERE = Gate(TOKEN, False)
+HERE = AccessCheck(TOKEN, True)
+EVERYWHERE = AccessCheck(TOKEN, False)
 
 
-def asked(gate: Gate, path: str = f"/{TOKEN}/", *more: tuple[str, str], host: str = "127.0.0.1:8080") -> int:
+def asked(access: AccessCheck, path: str = f"/{TOKEN}/", *more: tuple[str, str], host: str = "127.0.0.1:8080") -> int:
     """The status of the answer; 200 where the request is let in."""
     headers = Headers([("Host", host), *more])
-    refusal = gate.refusal(path, headers)
+    refusal = access.refusal(path, headers)
     return 200 if refusal is None else refusal.status
 
 
@@ -25,13 +25,13 @@ def origin(value: str) -> tuple[str, str]:
     return "Origin", value
 
 
-@pytest.mark.parametrize("gate", [HERE, EVERYWHERE])
-def test_everybody_needs_the_token(gate: Gate) -> None:
-    assert asked(gate) == asked(gate, f"/{TOKEN}") == 200
+@pytest.mark.parametrize("access", [HERE, EVERYWHERE])
+def test_everybody_needs_the_token(access: AccessCheck) -> None:
+    assert asked(access) == asked(access, f"/{TOKEN}") == 200
     for path in ("/", "", "/another/", f"/{TOKEN}x/", f"/{TOKEN}/x", "/?token=another", "/?token=", f"/?Token={TOKEN}"):
-        assert asked(gate, path) == 401, path
-    assert asked(gate, "/", ("Cookie", f"avatar_token={TOKEN}")) == 401, "a browser sends cookies to every port"
-    assert asked(gate, "/\udcff\udcfe") == asked(gate, "/?token=%ff%00") == 401
+        assert asked(access, path) == 401, path
+    assert asked(access, "/", ("Cookie", f"avatar_token={TOKEN}")) == 401, "a browser sends cookies to every port"
+    assert asked(access, "/\udcff\udcfe") == asked(access, "/?token=%ff%00") == 401
 
 
 def test_the_printed_address_leads_to_the_page() -> None:
@@ -69,10 +69,10 @@ def test_a_name_that_was_made_to_point_here_is_kept_out() -> None:
 
 def test_a_proxy_that_was_named_is_let_in() -> None:
     """Row 24 of the public reports: a proxy's own Host, or the one that it keeps; and a sub-path."""
-    gate, page = Gate(TOKEN, True, "https://hub.example.org/proxy/8080/"), origin("https://hub.example.org")
-    assert asked(gate, f"/{TOKEN}/", page) == 200, "nginx writes a Host of its own"
-    assert asked(gate, f"/{TOKEN}/", page, host="hub.example.org") == 200, "it is kept"
-    assert asked(gate, f"/proxy/8080/{TOKEN}/", page) == 200, "the sub-path is kept"
-    assert asked(gate, f"/{TOKEN}/", origin("https://evil.example")) == 403
-    assert asked(gate, f"/{TOKEN}/", origin("http://hub.example.org")) == 403
-    assert asked(gate, "/", page) == 401
+    access, page = AccessCheck(TOKEN, True, "https://hub.example.org/proxy/8080/"), origin("https://hub.example.org")
+    assert asked(access, f"/{TOKEN}/", page) == 200, "nginx writes a Host of its own"
+    assert asked(access, f"/{TOKEN}/", page, host="hub.example.org") == 200, "it is kept"
+    assert asked(access, f"/proxy/8080/{TOKEN}/", page) == 200, "the sub-path is kept"
+    assert asked(access, f"/{TOKEN}/", origin("https://evil.example")) == 403
+    assert asked(access, f"/{TOKEN}/", origin("http://hub.example.org")) == 403
+    assert asked(access, "/", page) == 401

@@ -1,4 +1,4 @@
-"""viser's server behind the gate: its handshake asks `Gate`, its messages pass `Door`, its connections are bounded.
+"""viser's server with checks: `AccessCheck` sees each handshake, `MessageCheck` each message, connections are bounded.
 
 viser listens with `websockets.asyncio.server.serve` and has no option for a check. While it starts, that function is
 replaced by one that adds the checks and takes a socket which listens already. Nothing else listens.
@@ -25,8 +25,8 @@ from websockets.http11 import Request, Response
 from websockets.protocol import State
 
 from avatar.errors import UserError
-from avatar.view.auth import Gate, Refusal
-from avatar.view.messages import MAX_MESSAGE, Door, MessageError
+from avatar.view.auth import AccessCheck, Refusal
+from avatar.view.messages import MAX_MESSAGE, MessageCheck, MessageError
 from avatar.view.rate_limited_log import Complaints
 
 MAX_WAITING = 64  # connections that have not been let in yet
@@ -54,9 +54,9 @@ PageServer = Callable[[ServerConnection, Request], Response | None]
 class Connection(ServerConnection):
     """One client: its messages are checked, counted and paced as they come in."""
 
-    def __init__(self, *arguments: Any, door: Door, complaints: Complaints, **options: Any) -> None:
+    def __init__(self, *arguments: Any, messages: MessageCheck, complaints: Complaints, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._door, self._complaints = door, complaints
+        self._messages, self._complaints = messages, complaints
         self.heard = self.loop.time()  # when its last message came, or the connection itself
         self.is_served = False  # it gets the page
         self._is_silent, self._refused = True, 0
@@ -87,7 +87,7 @@ class Connection(ServerConnection):
                     data = await super().recv()
                 if self.transport.is_closing():
                     continue  # what it left behind
-                passed = self._door.passed(data)
+                passed = self._messages.passed(data)
             except TimeoutError:
                 self._complaints.add("a silent client")
                 await self.close(1008)
@@ -112,10 +112,12 @@ class Connection(ServerConnection):
 
 
 class WebServer:
-    """viser, reached through `gate` on a socket that listens."""
+    """viser, reached through `access` on a socket that listens."""
 
-    def __init__(self, listening: socket.socket, gate: Gate, door: Door, complaints: Complaints, label: str) -> None:
-        self._gate, self._door, self._complaints = gate, door, complaints
+    def __init__(
+        self, listening: socket.socket, access: AccessCheck, messages: MessageCheck, complaints: Complaints, label: str
+    ) -> None:
+        self._access, self._messages, self._complaints = access, messages, complaints
         self._listening = listening
         self._head = f"<title>{html.escape(label)} - avatar</title>{DARK_MODE}".encode(errors="replace")
         self._library: library.Server | None = None
@@ -159,7 +161,7 @@ class WebServer:
         logger.addHandler(_Counter(self._complaints))
 
         def connect(*arguments: Any, **options: Any) -> Connection:
-            connection = Connection(*arguments, door=self._door, complaints=self._complaints, **options)
+            connection = Connection(*arguments, messages=self._messages, complaints=self._complaints, **options)
             self._library = connection.server
             return connection
 
@@ -182,7 +184,7 @@ class WebServer:
 
     def _answer(self, connection: Connection, request: Request, page: PageServer) -> Response | None:
         """The response; None opens a WebSocket."""
-        refusal = self._gate.refusal(request.path, request.headers)
+        refusal = self._access.refusal(request.path, request.headers)
         if refusal is None and [v.lower() for v in request.headers.get_all("Upgrade")] == ["websocket"]:
             refusal = self._refused_client(request.headers)
             if refusal is None:

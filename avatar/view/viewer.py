@@ -20,14 +20,14 @@ from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.auth import LOCAL, Gate
+from avatar.view.auth import LOCAL, AccessCheck
 from avatar.view.live import Pace
-from avatar.view.messages import Door
+from avatar.view.messages import MessageCheck
 from avatar.view.panel import Panel, notes
 from avatar.view.player import Player
 from avatar.view.rate_limited_log import Complaints
-from avatar.view.view_renderer import Look, Setting, ViewRenderer
-from avatar.view.web_server import WebServer
+from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
+from avatar.view.viser_server import WebServer
 
 TARGET_MS = (20.0, 33.0)  # of a picture while things move: between them its size stays
 LEAST_WIDTH = 96  # pixels
@@ -67,15 +67,15 @@ class Viewer:
         self._save_lock = threading.Lock()
         self.picture: np.ndarray | None = None
         self.milliseconds, self.pace = 0.0, Pace()
-        self.complaints, self.door = Complaints(), Door()
+        self.complaints, self.messages = Complaints(), MessageCheck()
         camera = renderer.trained.rest_camera()
         self._own: Angles = seen_from(camera)
         x, y, z = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
         self._distance = math.hypot(x, y, z)
         listening = _listen(host, port)
         self.port: int = listening.getsockname()[1]
-        gate = Gate(token, host in LOCAL, url)
-        self._web = WebServer(listening, gate, self.door, self.complaints, renderer.trained.name)
+        access = AccessCheck(token, host in LOCAL, url)
+        self._web = WebServer(listening, access, self.messages, self.complaints, renderer.trained.name)
         self.server = server = self._web.viser
         server.scene.world_axes.visible = False
         server.scene.set_up_direction("+y")
@@ -110,12 +110,12 @@ class Viewer:
         self._changed = time.monotonic()
         self.wake.set()
 
-    def look_from(self, offset: np.ndarray) -> Look:
+    def look_from(self, offset: np.ndarray) -> ViewOffset:
         """What a camera at this offset from the head means for `orbited`."""
         x, y, z = (float(v) for v in offset)
         distance = max(math.hypot(x, y, z), 1e-6)
         yaw, elevation = math.degrees(math.atan2(x, z)), math.degrees(math.atan2(y, math.hypot(x, z)))
-        return Look(self._own.yaw - yaw, elevation - self._own.elevation, self._distance / distance)
+        return ViewOffset(self._own.yaw - yaw, elevation - self._own.elevation, self._distance / distance)
 
     def _welcome(self, client: Any) -> None:
         @client.camera.on_update

@@ -1,21 +1,21 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 
-#include "compose/compose.h"
+#include "apply_offsets/apply_offsets.h"
 #include "python/arguments.h"
 #include "thread_pool.h"
 
 namespace nb = nanobind;
-using namespace avatar::compose;
+using namespace avatar::apply_offsets;
 using avatar::check_shape;
 
-void bind_compose(nb::module_& m) {
+void bind_apply_offsets(nb::module_& m) {
     using Floats = avatar::Array<float>;
     using ConstFloats = avatar::Array<const float>;
     static constexpr std::int64_t kGrain = 1024;  // Gaussians handed to a thread at a time
 
     m.def(
-        "compose_forward",
+        "apply_offsets_forward",
         [](ConstFloats points, ConstFloats quats, ConstFloats log_scales, ConstFloats opacity_logits, ConstFloats raw,
            const std::string& simd, int threads, Floats means, Floats out_quats, Floats scales, Floats opacities) {
             avatar::Size N("N");
@@ -31,12 +31,12 @@ void bind_compose(nb::module_& m) {
             avatar::check_threads(threads);
             const Parameters parameters{points.data(), quats.data(), log_scales.data(), opacity_logits.data(),
                                         raw.data()};
-            const Composed composed{means.data(), out_quats.data(), scales.data(), opacities.data()};
+            const Activated activated{means.data(), out_quats.data(), scales.data(), opacities.data()};
             const Kernels& kernels = select_kernels(simd.c_str());
             const nb::gil_scoped_release unlocked;
             avatar::parallel_for(threads, N.value, kGrain,
                                  [&](std::int64_t begin, std::int64_t end) {
-                                     kernels.forward(parameters, begin, end, composed);
+                                     kernels.forward(parameters, begin, end, activated);
                                  });
         },
         nb::arg("points").noconvert(), nb::arg("quats").noconvert(), nb::arg("log_scales").noconvert(),
@@ -45,7 +45,7 @@ void bind_compose(nb::module_& m) {
         nb::arg("opacities").noconvert());
 
     m.def(
-        "compose_backward",
+        "apply_offsets_backward",
         [](ConstFloats quats, ConstFloats log_scales, ConstFloats raw, ConstFloats scales, ConstFloats opacities,
            ConstFloats by_means, ConstFloats by_quats, ConstFloats by_scales, ConstFloats by_opacities,
            const std::string& simd, int threads, Floats grad_quats, Floats grad_log_scales,

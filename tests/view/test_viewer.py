@@ -21,8 +21,8 @@ from waiting import until
 from avatar.commands.view import address, checked_url
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.server import LARGEST, Viewer, padded
-from avatar.view.view_renderer import Look, Setting
+from avatar.view.view_renderer import Setting, ViewOffset
+from avatar.view.viewer import LARGEST, Viewer, padded
 
 
 def shows(viewer: Viewer, setting: Setting) -> bool:
@@ -37,7 +37,7 @@ def page_of(viewer: Viewer) -> str:
 
 def test_what_is_set_is_drawn(viewer: Viewer) -> None:
     until(lambda: shows(viewer, Setting()))
-    setting = Setting(Look(3.0), {0: viewer.renderer.controls[0].high}, {"jaw": 0.2}, "mesh")
+    setting = Setting(ViewOffset(3.0), {0: viewer.renderer.controls[0].high}, {"jaw": 0.2}, "mesh")
     viewer.change(**vars(setting))
     until(lambda: shows(viewer, setting))
     viewer.player.choose("train")

@@ -1,0 +1,6 @@
+#include "dispatch.h"
+#include "apply_offsets/apply_offsets.h"
+
+namespace avatar::apply_offsets {
+AVATAR_DEFINE_SELECT_KERNELS
+}  // namespace avatar::apply_offsets
