@@ -109,13 +109,13 @@ def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder
     assert "at step 8 of 12" in avatar("train", own_folder, "--out", begun, "--resume", *same)
 
 
-def test_a_run_of_few_frames_ends_with_its_passes_and_is_resumed_by_the_same_command(
+def test_a_run_of_few_frames_ends_with_its_epochs_and_is_resumed_by_the_same_command(
     own_folder: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
     command = ("train", own_folder, "--out", run, *OPTIONS, "data.test_frames=8", "trainer.max_epochs=2")
     output = avatar(*command)
-    assert "2 passes over the training frames are 8 steps" in output and "8 held out, 8 steps" in output
+    assert "2 epochs are 8 steps" in output and "8 held out, 8 steps" in output
     assert [path.stem[-2:] for path in list_checkpoints(run / "checkpoints")] == ["04", "08"]
     assert read_run_info(run).config.trainer.iterations == newest_checkpoint(run).step == 8
     list_checkpoints(run / "checkpoints")[-1].unlink()
