@@ -21,6 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from avatar.config import load_config
+from avatar.data.frame import Frame
 from avatar.demo.head import demo_head
 from avatar.demo.scene import head_assets
 from avatar.head.assets import HeadAssets
@@ -36,7 +37,7 @@ from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import TrainState, train_step
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import StepRunner
-from avatar.types import IDENTITY_6D, Frame, HeadParams
+from avatar.types import IDENTITY_6D, HeadParams
 
 META = torch.device("meta")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from avatar.types import Camera, Frame, HeadParams
+from avatar.data.frame import Frame
+from avatar.types import Camera, HeadParams
 
 
 def frame(image: torch.Tensor, alpha: torch.Tensor, head_mask: torch.Tensor) -> Frame:

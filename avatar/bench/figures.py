@@ -10,12 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.frame import Frame
 from avatar.evaluation.measure import lpips_in_mask, to_8_bit
 from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.render import Renderer
-from avatar.types import Camera, Frame, HeadParams
+from avatar.types import Camera, HeadParams
 
 
 @dataclass(frozen=True)

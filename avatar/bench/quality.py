@@ -16,6 +16,7 @@ from avatar.bench.clock import Time
 from avatar.bench.figures import head_figures
 from avatar.bench.results import Line, Panel, write_report
 from avatar.bench.train import Learner, make_learner, time_steps
+from avatar.data.frame import Frame
 from avatar.data.loader import FrameLoader
 from avatar.errors import UserError
 from avatar.evaluation.find_lpips import find_lpips
@@ -23,7 +24,6 @@ from avatar.pipeline.open import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run
 from avatar.train.objective import perceptual_start
-from avatar.types import Frame
 
 FRAMES, FULL_FRAMES, QUICK_FRAMES = 50, 10_000, 2
 REPEATS, QUICK_REPEATS = 11, 1

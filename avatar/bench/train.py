@@ -18,6 +18,7 @@ from avatar.bench.stages import Stopwatch
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import on_gpu
 from avatar.config import Config, load_config
+from avatar.data.frame import Frame
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
@@ -32,7 +33,6 @@ from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import Judge, TrainState
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import WARM, StepRunner
-from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
 
 REPEATS, QUICK_REPEATS, FULL_REPEATS = 15, 2, 41

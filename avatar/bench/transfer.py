@@ -25,6 +25,7 @@ from avatar.bench.perturb_tracking import disturbed
 from avatar.bench.refine import Trial
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config
+from avatar.data.frame import Frame
 from avatar.data.recording import Recording
 from avatar.data.source import Source
 from avatar.data.subject import Subject
@@ -38,7 +39,7 @@ from avatar.head.model import HeadModel
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.pipeline.refine_plan import WITH_REFINEMENT
-from avatar.types import Camera, Frame, HeadParams
+from avatar.types import Camera, HeadParams
 from data_prep.prepare.open import open_subject
 
 TARGET_SEED, DRIVER_SEED = 1, 2

@@ -10,8 +10,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.compute.device import to_device
+from avatar.data.frame import Frame
 from avatar.data.subject import FramePixels, Subject
-from avatar.types import Camera, Frame, HeadParams
+from avatar.types import Camera, HeadParams
 
 SHARE = 0.5  # of the memory that is free on the GPU when a training begins
 

@@ -8,9 +8,9 @@ from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
+from avatar.data.frame import Frame
 from avatar.data.gpu_frame_cache import GpuFrameCache
 from avatar.data.subject import FramePixels, Subject
-from avatar.types import Frame
 
 CACHE_BYTES = 2**30  # for decoded frames; what does not fit is decoded again
 BYTES_PER_PIXEL = 6  # image 3, alpha, head mask, mouth mask; uint8

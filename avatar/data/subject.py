@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.frame import Frame
 from avatar.data.images import read_image, read_mask, read_matte
 from avatar.data.manifest import GIVEN, TRACKS_FILE, FrameRecord, Manifest, read_manifest
 from avatar.data.recording import Recording, checked_tracks
 from avatar.data.split import Split
 from avatar.data.tensor_file import read_tensors
 from avatar.errors import UserError
-from avatar.types import Camera, Frame, HeadParams
+from avatar.types import Camera, HeadParams
 
 FAINTEST_MATTE = 10  # of 255: below it a JPEG matte is noise, not foreground
 _MAX_TRACKS = 2**30  # bytes

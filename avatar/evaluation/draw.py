@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from avatar.compute.device import to_device
 from avatar.data.colours import Colour
+from avatar.data.frame import Frame
 from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import ImageFormat
@@ -20,7 +21,6 @@ from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
 from avatar.splat.cpu import thread_count
-from avatar.types import Frame
 
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 SHEET_COLUMNS = 2

@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from avatar.data.frame import Frame
 from avatar.evaluation.protocol import RIMS, Region
 from avatar.head.model import HeadModel
-from avatar.types import Camera, Frame
+from avatar.types import Camera
 
 EYEBALLS = ("left_eyeball", "right_eyeball")  # region names of FLAME_masks.pkl
 EYE_MARGIN = 0.25  # of the eyeball's projected width and height, on every side: lids and lashes are in the box

@@ -10,13 +10,13 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from avatar.data.frame import Frame
 from avatar.errors import UserError
 from avatar.gaussianheadavatar.start_points import knn_log_scales, mouth_box, spread_points, visual_hull
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.seen_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.uv import UVTexels
 from avatar.head.model import HeadModel
-from avatar.types import Frame
 
 REACH = 1.8  # of the hull's box from the head's centre, half head lengths
 APART = 0.004  # metres from the mesh from which the hull counts as beyond it

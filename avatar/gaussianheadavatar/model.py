@@ -27,6 +27,7 @@ from avatar.baselines.ndgs import NdGaussians
 from avatar.compute.device import to_device
 from avatar.compute.memory import Need
 from avatar.config import ModelConfig, TrainerConfig
+from avatar.data.frame import Frame
 from avatar.gaussianheadavatar.hyper_sets import Attributes, HyperSets
 from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
 from avatar.gaussianheadavatar.networks import ATTRIBUTES, Blended, Networks, Outputs, encode, nearness
@@ -37,7 +38,7 @@ from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import matrix_from_6d, nearest_rotation
 from avatar.splat import splat_features
-from avatar.types import Camera, FeatureGaussians, Frame, HeadParams, Rendering
+from avatar.types import Camera, FeatureGaussians, HeadParams, Rendering
 
 FEATURES = 128  # of a point, which networks for colour and shape take
 NEAR, FAR = math.sqrt(0.1), math.sqrt(0.25)  # to the nearest landmark, half head lengths: what follows the expression

@@ -13,13 +13,14 @@ from torch import Tensor, nn
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.memory import Need
 from avatar.config import ModelConfig, TrainerConfig
+from avatar.data.frame import Frame
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import encoded_size
 from avatar.gaussians.head_rotation import VALUES, head_rotation_input, learned_turning
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.splat import splat
-from avatar.types import Camera, FeatureGaussians, Frame, Gaussians, HeadParams, Rendering
+from avatar.types import Camera, FeatureGaussians, Gaussians, HeadParams, Rendering
 
 CONDITION_EXTRAS = 20  # jaw 6, eyes 12, eyelids 2, after the expression coefficients
 

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from avatar.data.frame import Frame
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh
 from avatar.head.sample_image import sample_image
-from avatar.types import Frame
 
 DEPTH_TOLERANCE = 0.003  # metres behind the nearest surface at which a point still counts as seen
 LEAST_WEIGHT = 1e-3  # of all frames together, for a place to count as seen

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from avatar.config import OPACITY_RATE, ModelConfig, TrainerConfig
+from avatar.data.frame import Frame
 from avatar.gaussians.base_model import Avatar, Groups
 from avatar.gaussians.mesh_embedding import Embedding, knn_scales
 from avatar.gaussians.seen_colours import mean_colours
@@ -18,7 +19,6 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.head.teeth import with_teeth
 from avatar.splat.sh import C0
-from avatar.types import Frame
 
 SH_DEGREE = 3  # of the view-dependent colour
 

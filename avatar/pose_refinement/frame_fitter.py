@@ -13,11 +13,12 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from avatar.compute.device import to_device
+from avatar.data.frame import Frame
 from avatar.gaussians.base_model import Avatar
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
 from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose
-from avatar.types import Camera, Frame
+from avatar.types import Camera
 
 # The squared error of a frame counts as this many independent observations with this standard deviation. Errors of
 # neighbouring pixels come from the same fault of the avatar, so that a picture says far less than its pixels would.

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.config import Config, TrainerConfig
+from avatar.data.frame import Frame
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.runs.model_registry import make_avatar
@@ -20,7 +21,6 @@ from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
-from avatar.types import Frame
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
 _COPIES = 4  # of every parameter: itself, its gradient, Adam's two moments

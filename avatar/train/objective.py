@@ -15,6 +15,7 @@ from torch.nn.functional import interpolate, l1_loss
 
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
+from avatar.data.frame import Frame
 from avatar.errors import UserError
 from avatar.gaussians.uv_avatar import SH_DEGREE
 from avatar.losses.lpips import MissingWeights, load_lpips
@@ -29,7 +30,6 @@ from avatar.losses.photometric import (
     on_head,
     photometric_loss,
 )
-from avatar.types import Frame
 
 SH_INTERVAL = 500  # steps after which one more spherical-harmonics degree takes part
 PERCEPTUAL_START = 0.5  # share of the steps after which the perceptual term takes part (15,000 of 30,000)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from avatar.data.frame import Frame
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.losses.photometric import PhotometricLoss
@@ -20,7 +21,7 @@ from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
 from avatar.train.objective import Objective, sh_degree
 from avatar.train.pose_corrections import PoseCorrections
-from avatar.types import Frame, HeadParams
+from avatar.types import HeadParams
 
 Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
 

@@ -19,12 +19,13 @@ from torch import Tensor
 from avatar.compute.cuda_graph import Replay, new_pool
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.gpu_functions import gpu_function
+from avatar.data.frame import Frame
 from avatar.losses.photometric import crop_of_few_sizes
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import Judge, StepInputs, StepOutputs, TrainState, train_step
-from avatar.types import Camera, Frame
+from avatar.types import Camera
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
 MESH_BYTES = 2**28  # of posed meshes, 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again

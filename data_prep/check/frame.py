@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.frame import Frame
 from avatar.data.images import read_image
 from avatar.data.subject import head_of_matte
-from avatar.types import Camera, Frame
+from avatar.types import Camera
 from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage
 from data_prep.formats.frame_files import ALPHA

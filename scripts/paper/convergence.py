@@ -28,6 +28,7 @@ from write_report import machine, run, table, write_report
 
 from avatar.bench.results import new_figure
 from avatar.config import Config, load_config
+from avatar.data.frame import Frame
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
 from avatar.data.subject import Subject
@@ -51,7 +52,6 @@ from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_ten
 from avatar.train.order import frame_order
 from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
-from avatar.types import Frame
 from data_prep.prepare.open import find_head, open_subject
 
 if TYPE_CHECKING:

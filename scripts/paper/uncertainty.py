@@ -30,6 +30,7 @@ from write_report import run, table, write_report
 
 from avatar.bench.quality import held_out_frames
 from avatar.bench.results import new_figure
+from avatar.data.frame import Frame
 from avatar.data.loader import FrameLoader
 from avatar.gaussians.hyper import HyperHead
 from avatar.gaussians.hyper_cpu import OFFSETS
@@ -37,7 +38,6 @@ from avatar.losses.metrics import squared_error
 from avatar.pipeline.open import open_run
 from avatar.runs.run import RUN_FILE, Run
 from avatar.splat.sh import C0
-from avatar.types import Frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

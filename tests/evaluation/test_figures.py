@@ -12,6 +12,7 @@ import pytest
 import torch
 from disc import EYES, NECK, SIZE, TEST, Blob, BlobRenderer, make_run, read_png
 
+from avatar.data.frame import Frame
 from avatar.data.subject import Subject
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.protocol import MEASURES, RIMS, choose_protocols
@@ -19,7 +20,7 @@ from avatar.evaluation.regions import outline_rims
 from avatar.evaluation.verify import recompute
 from avatar.losses.lpips import lpips_folder, save_lpips
 from avatar.losses.lpips_network import Lpips
-from avatar.types import Frame, Rendering
+from avatar.types import Rendering
 
 
 def test_every_figure_can_be_recomputed_from_the_pictures(tmp_path: Path, subject: Subject) -> None:

@@ -21,6 +21,7 @@ pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar import render as render_module
 from avatar.compute.device import CPU
+from avatar.data.frame import Frame
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation.draw import draw
@@ -34,7 +35,6 @@ from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
-from avatar.types import Frame
 from avatar.view.view_renderer import Look, Setting, ViewRenderer
 
 OVERFLOWS = r"drawing needs \d+ pairs of a tile and a splat, the GPU's buffers hold 3; a lower --size or model.uv_size"

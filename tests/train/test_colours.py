@@ -10,13 +10,14 @@ from heads import grid_head, rest_params
 from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
+from avatar.data.frame import Frame
 from avatar.data.subject import Subject
 from avatar.gaussians import seen_colours as colours_module
 from avatar.gaussians.uv_avatar import UVAvatar
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
 from avatar.train.trainer import initialize_from_frames
-from avatar.types import Camera, Frame
+from avatar.types import Camera
 
 
 def seen_colours(avatar: UVAvatar, frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from small_runs import new_avatar, open_small, small_config, train_small
 
+from avatar.data.frame import Frame
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips_network import Lpips
@@ -21,7 +22,7 @@ from avatar.train import objective as objective_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import Objective, PerceptualTerm, Weighted, choose_perceptual
 from avatar.train.trainer import interruption, train
-from avatar.types import Camera, Frame, HeadParams
+from avatar.types import Camera, HeadParams
 
 PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=auto")  # frames of the test's size, no LPIPS weights
 
