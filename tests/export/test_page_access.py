@@ -24,10 +24,11 @@ WITHOUT_SHADE = ".frame::after { content: none }"
 CONTROLS = """() => Array.from(document.querySelectorAll("canvas, button, input, summary"))
   .filter((one) => one.checkVisibility() && !one.disabled)
   .map((one) => one.id || one.name || one.textContent)"""
-# What has the focus, whether it has a ring, and whether nothing lies over it.
+# What has the focus, whether it has a ring (the picture's lies over its shade), and whether nothing lies over it.
 FOCUSED = """() => {
   const one = document.activeElement, shown = one.closest(".button") ?? one, box = shown.getBoundingClientRect();
-  const ring = getComputedStyle(shown), top = document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2);
+  const ring = one.id === "canvas" ? getComputedStyle(one.parentElement, "::after") : getComputedStyle(shown);
+  const top = document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2);
   const isRinged = ring.outlineStyle === "solid" && parseFloat(ring.outlineWidth) >= 2;
   return [one.id || one.name || one.textContent, isRinged, shown.contains(top) || top?.contains(shown) === true];
 }"""
