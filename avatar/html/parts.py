@@ -21,10 +21,11 @@ SERIES = ("#2563a8", "#c4572b", "#3d8a5c", "#7a4fa3")  # colours of lines and po
 
 
 def data_table(head: Sequence[Content], rows: Iterable[Sequence[Content]]) -> Markup:
-    """A table whose cells that are numbers stand to the right."""
+    """A table whose cells that are numbers stand to the right; where it is too wide, the arrow keys scroll it."""
     lines = [element("tr", *(element("td", cell, class_=_kind(cell)) for cell in row)) for row in rows]
     heading = element("thead", element("tr", *(element("th", cell) for cell in head))) if head else ""
-    return element("div", element("table", heading, element("tbody", *lines)), class_="scroll")
+    table = element("table", heading, element("tbody", *lines))
+    return element("div", table, class_="scroll", tabindex=0, role="group", aria_label="table")
 
 
 def tiles(values: Mapping[str, Content]) -> Markup:

@@ -31,7 +31,10 @@ MAX_POINTS = 1000  # of a curve
 SCRIPT = """
 const slider = document.getElementById("frame");
 const panels = [...document.querySelectorAll("#frames figure")];
-function show() { panels.forEach((panel, i) => { panel.hidden = i !== Number(slider.value); }); }
+function show() {
+  panels.forEach((panel, i) => { panel.hidden = i !== Number(slider.value); });
+  slider.setAttribute("aria-valuetext", panels[slider.value].textContent);
+}
 if (slider) { slider.addEventListener("input", show); show(); }
 """
 

@@ -42,8 +42,8 @@ export function connectStage(view, header, isGazeHeld, play) {
   document.addEventListener("fullscreenchange", () => (full.textContent = document.fullscreenElement ? "Leave full screen" : "Full screen"));
   find("copy").addEventListener("click", async () => {
     find("embed").select();
-    await navigator.clipboard?.writeText(find("embed").value).catch(() => {}); // else the reader copies what is selected
-    find("copy").textContent = "Copied";
+    const copied = navigator.clipboard?.writeText(find("embed").value) ?? Promise.reject();
+    find("copy").textContent = await copied.then(() => "Copied", () => "Selected"); // which the reader copies
   });
   const keys = { e: () => gaze.click(), f: () => full.hidden || goFull(), " ": play };
   document.addEventListener("keydown", (e) => {

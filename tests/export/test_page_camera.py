@@ -151,7 +151,9 @@ def test_over_http_and_with_something_else_played(open_page: Callable[..., Any],
         page.get_by_role("button", name="Drive with your camera").click()
         says(page, FOLLOWS)
         page.locator("#neutral").click()
+        assert page.locator("#video.mirror").is_visible()
         page.locator("#mirror").uncheck()
+        assert page.locator("#video.mirror").count() == 0
         says(page, FOLLOWS)
         page.get_by_role("button", name="Play", exact=True).click()
         until(page, "document.getElementById('camera').textContent === 'Drive with your camera'")

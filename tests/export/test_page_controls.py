@@ -3,67 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lively import lively_avatar
 from pages import shown, until
 
-from avatar.export import stage
+from avatar.export import default_view
 from avatar.export.default_view import front_camera, neck_fade, neck_heights
-from avatar.export.web_page import write_page
 from avatar.runs.trained import TrainedAvatar
 
 CHANGED = "(name) => Math.abs(document.querySelector(`input[name='${name}']`).value - 0)"
-CONTRAST = """() => {
-  const luminance = (colour) => colour.match(/[\\d.]+/g).slice(0, 3).map(Number)
-    .map((c) => (c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4))
-    .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
-  const behind = (e) => {
-    for (; e; e = e.parentElement) {
-      const colour = getComputedStyle(e).backgroundColor;
-      if (!/, 0\\)$/.test(colour)) return colour;
-    }
-  };
-  const texts = Array.from(document.querySelectorAll("h1, p, label span, button, summary, output, kbd, legend"));
-  return texts.filter((e) => e.checkVisibility() && e.textContent.trim()).map((e) => {
-    const [a, b] = [getComputedStyle(e).color, behind(e)].map(luminance).sort((x, y) => y - x);
-    return [(a + 0.05) / (b + 0.05), e.textContent];
-  });
-}"""
-
-
-@pytest.fixture(scope="module")
-def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
-    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run", "model.uv_size=20")
-
-
-@pytest.fixture(scope="module")
-def page_file(trained: TrainedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_page(trained, tmp_path_factory.mktemp("page") / "someone.html").path
-
-
-@pytest.fixture
-def visit(browser: Any, page_file: Path) -> Iterator[Any]:
-    """Opens the page with a query and with options of the browser's context."""
-    contexts, wrong = [], []
-
-    def visited(query: str = "", **options: Any) -> Any:
-        context = browser.new_context(offline=True, **{"viewport": {"width": 1100, "height": 760}, **options})
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.goto(f"{page_file.as_uri()}?width=64{query}")
-        page.locator("#message").wait_for(state="hidden", timeout=20000)
-        return page
-
-    yield visited
-    for context in contexts:
-        context.close()
-    assert not wrong
 
 
 @pytest.mark.chromium
@@ -99,7 +49,7 @@ def test_the_neck_fades_from_the_chin_to_its_end(trained: TrainedAvatar, monkeyp
     embedding = trained.avatar.embedding
     heights = (trained.avatar.head.neutral_vertices()[embedding.corners, 1] * embedding.barycentric).sum(dim=1)
     end, chin = heights.quantile(torch.tensor([0.1, 0.6])).tolist()
-    monkeypatch.setattr(stage, "neck_heights", lambda trained: (end, chin))
+    monkeypatch.setattr(default_view, "neck_heights", lambda trained: (end, chin))
     fade = neck_fade(trained)
     assert (fade[heights <= end] == 0).all() and (fade[heights >= chin] > 0.999).all()
     assert (fade[heights.argsort()].diff() >= 0).all()
@@ -207,19 +157,6 @@ def test_background_full_screen_and_the_picture_alone(visit: Any) -> None:
     assert not alone.locator("aside").is_visible() and not alone.locator("#play").is_visible()
     assert alone.get_by_text("Synthetic", exact=True).is_visible()
     assert alone.locator("#canvas").bounding_box()["height"] == 760
-
-
-@pytest.mark.chromium
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_texts_have_contrast_and_controls_have_a_focus_ring(visit: Any, scheme: str) -> None:
-    page = visit(color_scheme=scheme, reduced_motion="reduce")
-    page.evaluate("document.querySelectorAll('details').forEach(box => (box.open = true))")
-    faint = [(round(ratio, 2), text) for ratio, text in page.evaluate(CONTRAST) if ratio < 4.5]
-    assert faint == []
-    for _ in range(12):
-        page.keyboard.press("Tab")
-        width = page.evaluate("parseFloat(getComputedStyle(document.activeElement).outlineWidth)")
-        assert width >= 2, page.evaluate("document.activeElement.outerHTML")
 
 
 @pytest.mark.chromium

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from browsers import WEB
-from lively import lively_avatar, psnr
+from lively import psnr
 from pages import until
 
 from avatar.export.default_view import faded, front_camera
@@ -23,11 +23,6 @@ WIDTHS = """() => {
   window.widths = [];
   avatar.addEventListener("drawn", () => widths.push(avatar.canvas.width));
 }"""
-
-
-@pytest.fixture(scope="module")
-def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedAvatar:
-    return lively_avatar(tracked_folder, tmp_path_factory.mktemp("runs") / "run", "model.uv_size=20")
 
 
 @pytest.fixture(scope="module")

@@ -136,21 +136,42 @@ def test_controls_are_in_percent_and_seconds_and_still_pictures_lose_nothing(vie
 
 
 @pytest.mark.chromium
-def test_a_person_plays_and_moves_a_slider(viewer: Viewer) -> None:
+def test_a_person_uses_every_control(viewer: Viewer) -> None:
     with chromium() as browser:
-        page = browser.new_page(viewport={"width": 1000, "height": 700})
+        page = browser.new_page(viewport={"width": 640, "height": 400})
         page.goto(page_of(viewer))
         page.get_by_role("button", name="Save picture").wait_for(timeout=30000)
-        viewer.player.choose("train")
-        page.get_by_role("button", name="Play", exact=True).click()
+        for label, choice in (("Motion", "train"), ("Overlay", "mesh")):
+            page.get_by_role("combobox", name=label).click()
+            page.get_by_role("option", name=choice).click()
+        page.get_by_role("checkbox", name="Truth beside").press(" ")
+        until(lambda: viewer.setting.overlay == "mesh" and viewer.setting.with_truth)
+        page.get_by_role("button", name="Play", exact=True).press("Enter")
         until(lambda: viewer.player.is_playing)
-        with page.expect_download() as download:
-            page.get_by_role("button", name="Save picture").click()
-        assert download.value.suggested_filename == "someone.png"
-        page.get_by_role("slider").nth(1).focus()
-        page.keyboard.press("ArrowRight")
-        until(lambda: viewer.setting.expressions)
+        page.get_by_role("button", name="Pause", exact=True).press("Enter")
+        until(lambda: not viewer.player.is_playing)
+        assert saved(page, "picture") == "someone.png"
+        for closed in ("Brows", "Cheeks"):
+            page.get_by_text(closed, exact=True).click()
+        time, *sliders = page.get_by_role("slider").all()
+        time.press("End")
+        until(lambda: viewer.player.seconds > 0.9 * viewer.player.duration)
+        for used, slider in enumerate(sliders, start=1):
+            is_at_end = slider.get_attribute("aria-valuenow") == slider.get_attribute("aria-valuemax")
+            slider.press("ArrowLeft" if is_at_end else "ArrowRight")
+            until(lambda used=used: len(viewer.setting.expressions) + len(viewer.setting.joints) == used)
+        page.get_by_role("button", name="Reset face").press("Enter")
+        until(lambda: not viewer.setting.expressions and not viewer.setting.joints)
+        until(lambda: not viewer._save_lock.locked())
+        assert saved(page, "video") == "someone-train.mp4"
     assert not viewer.complaints._counts, "viser's own page sends nothing that is refused"
+
+
+def saved(page: Any, what: str) -> str:
+    """The name of the file."""
+    with page.expect_download() as download:
+        page.get_by_role("button", name=f"Save {what}").press("Enter")
+    return download.value.suggested_filename
 
 
 CANVAS = (

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import csv
 import os
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from access import audited
+from browsers import chromium
 from folder_damage import all_zero
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 class Sources(HTMLParser):
@@ -61,10 +59,12 @@ def test_the_table_has_a_line_for_every_image(page: Path) -> None:
     assert rows[5]["overlap"] == "" and all(float(row["overlap"]) > 0.99 for row in rows if row["image"] != "00006.jpg")
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_a_browser_shows_it_without_complaint(page: Path, tmp_path: Path) -> None:
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
-    options += ["--no-first-run", "--disable-component-update", "--disable-quic", f"--user-data-dir={tmp_path}"]
-    command = [str(CHROMIUM), *options, "--enable-logging=stderr", "--dump-dom", page.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.count("<img") == 14 and "CONSOLE" not in done.stderr
+@pytest.mark.chromium
+def test_a_browser_shows_it_without_complaint_and_axe_finds_nothing(page: Path) -> None:
+    with chromium() as browser:
+        opened, wrong = browser.new_page(), []
+        opened.on("console", lambda said: wrong.append(said.text))
+        opened.goto(page.as_uri())
+        assert opened.evaluate("[...document.images].filter((one) => one.naturalWidth > 0).length") == 14
+        assert audited(opened) == []
+    assert not wrong

@@ -1,0 +1,42 @@
+"""What axe-core finds wrong with a page: WCAG 2.2, levels A and AA."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SIZES = {"desktop": {"width": 1280, "height": 800}, "phone": {"width": 390, "height": 844}}
+RUN = """async (kinds) => {
+  const levels = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"];
+  const found = await axe.run(document, { runOnly: levels, resultTypes: kinds });
+  const told = ({ id, nodes }) => nodes.map((one) => `${id}: ${one.html.slice(0, 200)} ${one.failureSummary}`);
+  return kinds.flatMap((kind) => found[kind].flatMap(told));
+}"""
+OPEN = "document.querySelectorAll('details').forEach(box => (box.open = true))"
+
+
+def violations(page: Any, *kinds: str) -> list[str]:
+    """A line for each element; `kinds` are of axe-core's results ("incomplete": what it cannot decide)."""
+    if page.evaluate("typeof axe") == "undefined":
+        page.evaluate(_axe())
+    return page.evaluate(RUN, ["violations", *kinds])
+
+
+def audited(page: Any) -> list[str]:
+    """Violations of a page at both sizes, its parts that open closed and open."""
+    found = []
+    for is_open in (False, True):
+        page.evaluate(f"document.querySelectorAll('details').forEach(box => (box.open = {str(is_open).lower()}))")
+        for size in SIZES.values():
+            page.set_viewport_size(size)
+            found += violations(page)
+    return found
+
+
+@functools.cache
+def _axe() -> str:
+    package = pytest.importorskip("axe_playwright_python")
+    return (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
