@@ -90,9 +90,10 @@ def follow_prompts(
     newest: Newest, detector: FaceDetector, screen: Screen, scale: float, seen: list[Seen], wrong: Counter[str]
 ) -> None:
     """Say each prompt in its time and what is wrong with the pictures; `seen` and `wrong` get what was seen and told."""
-    adviser, begin, shown = Adviser(), newest.take().taken, -1
+    adviser, begin, shown, end = Adviser(), None, -1, 0.0
     while True:
         picture = newest.take()
+        begin = picture.taken if begin is None else begin
         time = picture.taken - begin
         if (number := prompt_at(time, scale)) == len(PROMPTS):
             return

@@ -19,12 +19,7 @@ DARK = 80.0  # grey level that a tenth of the face exceeds; skin of every colour
 WHITE, MOST_WHITE = 250, 0.15  # grey level, and the share of the face that may have it
 LEAST_SHARP, SHARP_SHARE = 0.015, 0.3  # of `sharpness`: in focus, and of the sharpest pictures so far
 PATIENCE = 0.5  # seconds that something is wrong before it is said
-MARGINS = (
-    0.15,
-    0.3,
-    0.15,
-    0.1,
-)  # left, above, right, below the landmarks, in heights of the face: the head and some neck
+MARGINS = (-0.15, -0.3, 0.15, 0.1)  # heights of the face, from its left, top, right and bottom to the head's
 # Of the range, for `reaches`.
 HELD = 0.5  # seconds
 GRACE = 1.0  # seconds after a prompt that still count
@@ -131,7 +126,7 @@ class Adviser:
             return "go back a little"
         if box.min() < 0 or (box[2:] > size).any():
             return "move to the middle"
-        left, top, right, bottom = (max(0, int(value)) for value in box)
+        left, top, right, bottom = (int(value) for value in face.box)
         grey = cv2.cvtColor(np.ascontiguousarray(image[top:bottom, left:right]), cv2.COLOR_RGB2GRAY)
         if np.percentile(grey, 90) < DARK:
             return "more light on the face"
