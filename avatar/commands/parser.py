@@ -50,7 +50,6 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     record = commands.add_parser("record")
     record.add_argument("out", type=Path, metavar="OUT.mp4", help="the video to write")
     record.add_argument("--webcam", default="0", metavar="N|VIDEO", help="a camera's number (default: 0), or a video")
-    record.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of all prompts (default: 60)")
 
     track = commands.add_parser("track")
     track.add_argument(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from bisect import bisect_right
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -13,12 +14,11 @@ from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.pipeline import OK
 from data_prep.live.film import WARM_UP, Film
-from data_prep.live.guidance import PROMPTS, SECONDS, Adviser, Seen, measures, prompt_at, reaches
+from data_prep.live.guidance import ENDS, PROMPTS, Adviser, Seen, measures, reaches
 from data_prep.live.pictures import FILMED, Newest, open_source
 from data_prep.track.faces.detect import FaceDetector
 
 SUFFIXES = (".mp4", ".mov", ".mkv")
-LENGTHS = (20.0, 600.0)  # seconds
 OFTEN = 0.05  # share of the pictures above which what was wrong is told at the end
 
 
@@ -46,10 +46,7 @@ def run_record(arguments: Namespace) -> int:
     if out.exists() or out.is_symlink():
         raise UserError(f"{out} exists already; give another name, or remove it")
     check_file(out, SUFFIXES, "a film")
-    if not LENGTHS[0] <= arguments.seconds <= LENGTHS[1]:
-        raise UserError(f"--seconds must be from {LENGTHS[0]:g} to {LENGTHS[1]:g}, not {arguments.seconds:g}")
-    scale, screen, wrong = arguments.seconds / SECONDS, Screen(), Counter[str]()
-    seen: list[Seen] = []
+    screen, seen, wrong = Screen(), list[Seen](), Counter[str]()
     with FaceDetector() as detector:
         film = Film(open_source(arguments.webcam, FILMED))
         with closing(Newest(film)) as newest:
@@ -60,7 +57,7 @@ def run_record(arguments: Namespace) -> int:
             with video_writer(out, rate, "veryfast") as add:
                 film.begin(add, rate)
                 try:
-                    follow_prompts(newest, detector, screen, scale, seen, wrong)
+                    follow_prompts(newest, detector, screen, seen, wrong)
                 except KeyboardInterrupt:
                     screen.say("Stopped.")
                 except UserError as error:
@@ -68,7 +65,7 @@ def run_record(arguments: Namespace) -> int:
                 finally:
                     film.end()
     screen.say(f"Film     {out}")
-    report(screen, film, seen, scale, wrong)
+    report(screen, film, seen, wrong)
     screen.say(f"Next     avatar create {out} --head flame/")
     return OK
 
@@ -81,43 +78,43 @@ def wait_for_face(newest: Newest, film: Film, detector: FaceDetector, screen: Sc
             faces, rate = detector.find(newest.take().image), film.measured_rate()
             if faces and rate is not None:
                 return rate
-            screen.rewrite("Wait." if faces else "There is no face in the picture.")
+            screen.rewrite("Measuring the rate." if faces else "There is no face in the picture.")
     except UserError as error:
         raise UserError(f"{error}; nothing was filmed: that begins with a face, after {WARM_UP:g} s") from None
 
 
 def follow_prompts(
-    newest: Newest, detector: FaceDetector, screen: Screen, scale: float, seen: list[Seen], wrong: Counter[str]
+    newest: Newest, detector: FaceDetector, screen: Screen, seen: list[Seen], wrong: Counter[str]
 ) -> None:
     """Say each prompt in its time and what is wrong with the pictures; `seen` and `wrong` get what was seen and told."""
-    adviser, begin, shown, end = Adviser(), None, -1, 0.0
+    adviser, begin, shown = Adviser(), None, -1
     while True:
         picture = newest.take()
         begin = picture.taken if begin is None else begin
         time = picture.taken - begin
-        if (number := prompt_at(time, scale)) == len(PROMPTS):
+        if (number := bisect_right(ENDS, time)) == len(PROMPTS):
             return
         if number != shown:
-            shown, end = number, scale * sum(prompt.seconds for prompt in PROMPTS[: number + 1])
+            shown = number
             screen.say(f"{number + 1:2} of {len(PROMPTS)} {PROMPTS[number].words}", bell="\a")
         face = next(iter(detector.find(picture.image)), None)
         if face is not None:
             seen.append(Seen(time, measures(face)))
         wrong[advice := adviser.hear(picture.image, face, time)] += 1
-        screen.rewrite(advice, f"{end - time:.0f} s")
+        screen.rewrite(advice, f"{ENDS[number] - time:.0f} s")
 
 
-def report(screen: Screen, film: Film, seen: list[Seen], scale: float, wrong: Counter[str]) -> None:
+def report(screen: Screen, film: Film, seen: list[Seen], wrong: Counter[str]) -> None:
     """The film's length and rate, what was wrong with the pictures, and what each prompt reached."""
     slow = "; more light: cameras slow down in the dark" if film.repeated > OFTEN * film.frames else ""
     screen.say(
-        f"{film.frames / film.rate:.1f} s at {film.rate:g} pictures a second; {film.repeated} that the camera missed are "
-        f"repeated, {film.left_out} that came too early left out{slow}"
+        f"         {film.frames / film.rate:.1f} s at {film.rate:g} pictures a second; {film.repeated} were missing and "
+        f"are repeated, {film.left_out} came too early and are left out{slow}"
     )
     for advice, count in wrong.most_common():
         if advice and count > OFTEN * wrong.total():
             screen.say(f"Picture  {100 * count / wrong.total():.0f} % of the time: {advice}")
-    for prompt, reached in zip(PROMPTS, reaches(seen, scale), strict=True):
+    for prompt, reached in zip(PROMPTS, reaches(seen), strict=True):
         got = {} if reached is None else reached
         told = ", ".join(f"{name} {got[name]:.2g} of {least:g}" for name, least in prompt.least.items() if name in got)
         is_enough = reached is not None and all(got[name] >= least for name, least in prompt.least.items())

@@ -46,7 +46,7 @@ PROMPTS = (
     Prompt("Lift the head slowly, and lower it.", 5, {"degrees up": 10, "degrees down": 10}),
     Prompt("Speak freely, and move as you do.", 9, {"mouth open": 0.15}),
 )
-SECONDS = sum(prompt.seconds for prompt in PROMPTS)
+ENDS = np.cumsum([prompt.seconds for prompt in PROMPTS]).tolist()  # seconds of the film
 
 
 def measures(face: Face) -> dict[str, float]:
@@ -78,21 +78,14 @@ class Seen(NamedTuple):
     values: dict[str, float]  # of `measures`
 
 
-def prompt_at(time: float, scale: float) -> int:
-    """Which prompt holds at this second of a film of `scale` x SECONDS; len(PROMPTS) after the last."""
-    return int(np.searchsorted(np.cumsum([prompt.seconds for prompt in PROMPTS]) * scale, time, side="right"))
-
-
-def reaches(seen: Sequence[Seen], scale: float) -> list[dict[str, float] | None]:
+def reaches(seen: Sequence[Seen]) -> list[dict[str, float] | None]:
     """For each prompt, what was held for `HELD` seconds beyond the median of the calm face; None where no face was seen."""
-    ends = np.cumsum([prompt.seconds for prompt in PROMPTS]) * scale
-    calm = [one.values for one in seen if one.time < ends[0]]
+    calm = [one.values for one in seen if one.time < ENDS[0]]
     rest = {name: float(np.median([values[name] for values in calm])) for name in (calm[0] if calm else ())}
     found: list[dict[str, float] | None] = []
-    for prompt, end in zip(PROMPTS, ends, strict=True):
-        begin = end - prompt.seconds * scale
-        during = [one.values for one in seen if begin <= one.time < end + GRACE]
-        share = 1 - min(HELD / (end + GRACE - begin), 0.5)
+    for prompt, end in zip(PROMPTS, ENDS, strict=True):
+        during = [one.values for one in seen if end - prompt.seconds <= one.time < end + GRACE]
+        share = 1 - HELD / (prompt.seconds + GRACE)
         reached = {
             name: float(np.quantile([values[name] for values in during], share)) - rest.get(name, 0.0)
             for name in (prompt.least if during else ())

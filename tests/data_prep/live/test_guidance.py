@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posing import picture, posed
 
-from data_prep.live.guidance import PATIENCE, PROMPTS, SECONDS, Adviser, Seen, measures, prompt_at, reaches
+from data_prep.live.guidance import ENDS, PATIENCE, PROMPTS, Adviser, Seen, measures, reaches
 from data_prep.track.faces.detect import Face
 
 PICTURE = picture()
@@ -63,12 +63,9 @@ def test_scores_are_of_both_sides() -> None:
     assert {name: values[name] for name in expected} == pytest.approx(expected)
 
 
-def test_prompts_follow_each_other() -> None:
-    assert SECONDS == 60 and prompt_at(0.0, 1.0) == 0 and prompt_at(59.9, 1.0) == len(PROMPTS) - 1
-    assert prompt_at(PROMPTS[0].seconds, 1.0) == 1 and prompt_at(60.0, 1.0) == prompt_at(30.0, 0.5) == len(PROMPTS)
-    assert {name for prompt in PROMPTS for name in prompt.least} == {*measures(posed())}, (
-        "all that is measured is asked"
-    )
+def test_prompts_take_a_minute_and_ask_for_all_that_is_measured() -> None:
+    assert len(ENDS) == len(PROMPTS) and ENDS[-1] == 60
+    assert {name for prompt in PROMPTS for name in prompt.least} == {*measures(posed())}
 
 
 SMILE = next(n for n, prompt in enumerate(PROMPTS) if "smile" in prompt.least)
@@ -82,7 +79,7 @@ def smiled(begin: float, seconds: float, rest: float = 0.0) -> float:
     seen = [
         Seen(time, measures(posed(mouthSmileLeft=s, mouthSmileRight=s))) for time, s in zip(times, scores, strict=True)
     ]
-    reached = reaches(seen, 1.0)
+    reached = reaches(seen)
     assert reached[0] == {} and reached[-1] is None
     found = reached[SMILE]
     assert found is not None
