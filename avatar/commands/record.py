@@ -108,8 +108,8 @@ def report(screen: Screen, film: Film, seen: list[Seen], wrong: Counter[str]) ->
     """The film's length and rate, what was wrong with the pictures, and what each prompt reached."""
     slow = "; more light: cameras slow down in the dark" if film.repeated > OFTEN * film.frames else ""
     screen.say(
-        f"         {film.frames / film.rate:.1f} s at {film.rate:g} pictures a second; {film.repeated} were missing and "
-        f"are repeated, {film.left_out} came too early and are left out{slow}"
+        f"         {film.frames / film.rate:.1f} s at {film.rate:g} pictures a second; missing ones repeated: "
+        f"{film.repeated}, early ones left out: {film.left_out}{slow}"
     )
     for advice, count in wrong.most_common():
         if advice and count > OFTEN * wrong.total():

@@ -15,7 +15,7 @@ from data_prep.track.faces.landmarks import BLENDSHAPES
 
 # Of the picture, for `advice`.
 LEAST_HEIGHT = 200.0  # pixels, of the face
-DARK = 80.0  # grey level that a tenth of the face exceeds; skin of every colour has highlights
+DARK = 100.0  # grey level that a tenth of the face exceeds; skin of every colour has highlights
 WHITE, MOST_WHITE = 250, 0.15  # grey level, and the share of the face that may have it
 LEAST_SHARP, SHARP_SHARE = 0.015, 0.3  # of `sharpness`: in focus, and of the sharpest pictures so far
 PATIENCE = 0.5  # seconds that something is wrong before it is said

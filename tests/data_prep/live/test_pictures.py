@@ -159,7 +159,7 @@ def test_a_camera_is_set_to_what_it_is_for() -> None:
         capture = Capture(3)
         Camera(0, lambda number, of=capture: of, settings)  # type: ignore[arg-type, return-value, misc]
         assert capture.settings == settings
-    assert list(FILMED)[0] == cv2.CAP_PROP_FOURCC, "sizes are those of the format"
+    assert next(iter(FILMED)) == cv2.CAP_PROP_FOURCC, "sizes are those of the format"
 
 
 def test_a_camera_that_is_missing() -> None:

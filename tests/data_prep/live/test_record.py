@@ -122,7 +122,8 @@ def test_prompts_advice_and_what_was_reached(on_stage: Callable[..., Stage], tmp
     film, *rest = lines[first + len(expected) :]
     assert film == f"Film     {out}"
     assert (
-        rest[0].startswith("         60.") and "at 5 pictures a second; 5 were missing and are repeated, 0 " in rest[0]
+        rest[0].startswith("         60.")
+        and "at 5 pictures a second; missing ones repeated: 5, early ones left out: 0" in rest[0]
     )
     assert rest[1].startswith("Picture  1") and rest[1].endswith(" % of the time: hold still")
     judged = {line[9:]: line.split()[0] for line in rest if line.startswith(("Reached", "Repeat"))}
