@@ -14,6 +14,7 @@ from avatar.config import load_config
 
 COMMANDS = (
     "create",
+    "record",
     "train",
     "eval",
     "refine",

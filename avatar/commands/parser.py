@@ -47,6 +47,10 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     add_create(commands.add_parser("create"))
 
+    record = commands.add_parser("record")
+    record.add_argument("out", type=Path, metavar="OUT.mp4", help="the video to write")
+    record.add_argument("--webcam", default="0", metavar="N|VIDEO", help="a camera's number (default: 0), or a video")
+
     track = commands.add_parser("track")
     track.add_argument(
         "video", type=Path, metavar="VIDEO", help="a video, or a folder of numbered PNG or JPEG pictures"

@@ -42,7 +42,7 @@ FACE_LANDMARKER = ThirdPartyFile(
     "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff",
     3.8,
     "Apache-2.0, Google",
-    "face landmarks (track, view --webcam, export --webcam)",
+    "face landmarks (track, record, view --webcam, export --webcam)",
 )
 SELFIE_SEGMENTATION = ThirdPartyFile(
     "selfie_segmentation.tflite",

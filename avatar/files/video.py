@@ -108,6 +108,7 @@ def _start_encoder(
         [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, *heard, str(path)],
         stdin=subprocess.PIPE,
         stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C in the terminal is for the caller: it may want the file completed
     )
 
 

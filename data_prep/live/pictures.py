@@ -6,7 +6,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -22,6 +22,13 @@ from data_prep.track.footage.source import Footage, Span, View, check_size, whol
 
 LONGEST = 1280  # pixels of a picture; the landmarks come from 256 pixels around the face
 SILENT_AFTER = 5.0  # seconds without a picture after which a camera is given up
+FOLLOWED = {cv2.CAP_PROP_BUFFERSIZE: 1}  # settings of a camera: old pictures are of no use
+FILMED = {  # a camera that does not have this takes what is nearest; without MJPEG many are slow at this size
+    cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*"MJPG"),
+    cv2.CAP_PROP_FRAME_WIDTH: 1280,
+    cv2.CAP_PROP_FRAME_HEIGHT: 720,
+    cv2.CAP_PROP_FPS: 30,
+}
 
 
 class LivePicture(NamedTuple):
@@ -62,12 +69,18 @@ class Camera:
     silent_after = SILENT_AFTER
     equivalent_focal = None
 
-    def __init__(self, number: int, open_camera: Callable[[int], cv2.VideoCapture] = cv2.VideoCapture) -> None:
+    def __init__(
+        self,
+        number: int,
+        open_camera: Callable[[int], cv2.VideoCapture] = cv2.VideoCapture,
+        settings: Mapping[int, float] = FOLLOWED,
+    ) -> None:
         """Raises UserError where there is no such camera, or it gives no picture."""
         self.name = f"camera {number}"
         with quiet():  # OpenCV's back ends write remarks of their own
             self._capture = open_camera(number)
-            self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old pictures are of no use
+            for setting, value in settings.items():
+                self._capture.set(setting, value)
             is_there, first = self._capture.read() if self._capture.isOpened() else (False, None)
         if not is_there or first is None:
             self._capture.release()
@@ -129,10 +142,10 @@ class Played:
         self._closed.set()
 
 
-def open_source(given: str) -> Source:
-    """A camera by its number, or a video. Raises UserError where neither is there."""
+def open_source(given: str, settings: Mapping[int, float] = FOLLOWED) -> Source:
+    """A camera by its number, with OpenCV's settings, or a video. Raises UserError where neither is there."""
     if re.fullmatch("[0-9]{1,3}", given) and not Path(given).exists():
-        return Camera(int(given))
+        return Camera(int(given), settings=settings)
     return Played(open_footage(Path(given)))
 
 

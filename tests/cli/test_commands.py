@@ -24,6 +24,7 @@ from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 def test_help_and_version_answer_for_every_command() -> None:
     overview = avatar("--help")
     for command in (
+        "record",
         "train",
         "eval",
         "reenact",

@@ -115,8 +115,15 @@ REFUSED: dict[str, list[tuple[str, str]]] = {
         ("{run}/eval", OF_RUN),
     ],
 }
-# The place is the only word of these.
+# The place is the last word of these.
 REFUSED_PLACES = {
+    "record": [
+        ("{video}", "{video} exists already; give another name, or remove it"),
+        ("{tmp}/folder.mp4", "exists already"),
+        ("{run}/eval/a.mp4", OF_RUN),
+        ("{run}/run.json", OF_RUN),
+    ],
+    "record --webcam {clip}": [("{clip}", IS_INPUT), ("{clip}/me.mp4", IN_INPUT)],
     "demo-data": [("{run}/eval/new", OF_RUN), ("{run}", "is not empty"), ("{motion}", "is not a folder")],
     "demo": [
         ("{run}/eval", OF_RUN),

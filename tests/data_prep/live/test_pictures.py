@@ -7,13 +7,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from videos import encode, spot
 from waiting import until
 
 from avatar.errors import UserError
-from data_prep.live.pictures import Camera, LivePicture, Newest, Played, open_source
+from data_prep.live.pictures import FILMED, FOLLOWED, Camera, LivePicture, Newest, Played, open_source
 from data_prep.track.footage.pictures import open_footage
 
 WIDTH, HEIGHT = 80, 64
@@ -52,11 +53,13 @@ class Capture:
 
     def __init__(self, count: int) -> None:
         self.left, self.is_released = count, False
+        self.settings: dict[int, float] = {}
 
     def isOpened(self) -> bool:
         return self.left > 0
 
     def set(self, what: int, value: float) -> bool:
+        self.settings[what] = value
         return True
 
     def read(self) -> tuple[bool, np.ndarray | None]:
@@ -149,6 +152,14 @@ def test_a_camera_that_dies() -> None:
     with pytest.raises(UserError, match="camera 2 gives no pictures any more"):
         next(pictures)
     assert capture.is_released
+
+
+def test_a_camera_is_set_to_what_it_is_for() -> None:
+    for settings in (FOLLOWED, FILMED):
+        capture = Capture(3)
+        Camera(0, lambda number, of=capture: of, settings)  # type: ignore[arg-type, return-value, misc]
+        assert capture.settings == settings
+    assert next(iter(FILMED)) == cv2.CAP_PROP_FOURCC, "sizes are those of the format"
 
 
 def test_a_camera_that_is_missing() -> None:
