@@ -66,6 +66,8 @@ def read_meshes(
             f"the tracking is fitted to the meshes, whose vertices it misses by {mean:.2g} mm in the mean frame and "
             f"{most:.2g} mm in the worst"
         )
+        if (moved := (clip.identity.weights < 0.5).mean()) > 0.01:
+            tracking.notes.append(f"{moved:.0%} of the meshes' vertices are not where the head model can have them")
     return tracking
 
 

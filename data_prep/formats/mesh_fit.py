@@ -5,9 +5,9 @@ Gauss-Newton minimises, over the meshes f and their vertices n,
     sum w_n |x_fn - R_f v_n(identity, pose_f) - t_f|^2
     + sigma^2 (|identity|^2 + sum |expression_f - prior_f|^2 + |eyelids_f|^2)
 
-with w_n = 1 / (1 + (r_n / scale)^2) of the vertex' usual residual r_n, where the scale is three times the median of these, so
-that vertices which somebody moved do not count, and with the root mean square residual sigma. The poses are eliminated from
-the equations of the identity (Schur complement).
+with w_n = 1 / (1 + (r_n / scale)^2) of the vertex' usual residual r_n, where the scale is three times the median of these,
+so that vertices which somebody moved do not count, and with the root mean square residual sigma. The poses are eliminated
+from the equations of the identity (Schur complement).
 """
 
 from __future__ import annotations
