@@ -4,19 +4,23 @@
     FOLDER/images/00000.png                   `file_path`; its transparency is the matte of head and neck
     FOLDER/matted/00000.png                   the matte of the whole person, used where the images have none
     FOLDER/seg_mask/00000.png                 `seg_mask_path`: face parsing, each class with its own red
-    FOLDER/checkpoint/00000.frame             metrical-tracker's result of the frame
+    FOLDER/checkpoint/00000.frame             metrical-tracker's result of the frame, or else
+    FOLDER/meshes/00000.obj                   `mesh_path`: the tracked head (see `insta_meshes`)
 
-The listing itself has the camera and nothing of jaw, eyes and identity, so `checkpoint/` has to be copied from the
-tracker's output (or be named with --tracking).
+The listing itself has the camera and nothing of jaw, eyes and identity.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.head.assets import HeadAssets
 from data_prep.formats.face_parsing import decode_reds
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
+from data_prep.formats.frame_track import Tracking
+from data_prep.formats.insta_meshes import CANONICAL, mesh_paths, read_meshes
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, numbered
 from data_prep.formats.transforms import ListedFrame, frame_rate
@@ -30,41 +34,40 @@ def recognise(frames: list[ListedFrame]) -> bool:
 
 
 def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None = None) -> TrackedFolder:
-    """Raises UserError for paths outside the folder and where the tracker's result is missing."""
+    """Raises UserError for paths outside the folder, and where there is neither the tracker's result nor a mesh."""
     listed = numbered(frames)
     images = {number: frame.image for number, frame in listed.items()}
-    result = _tracking_folder(folder, tracking)
+    result = _result_folder(folder, tracking)
+    meshes = {} if result is not None or tracking is not None else mesh_paths(listed)
+    if result is None and not meshes:
+        raise UserError(
+            f"{tracking or folder} holds no checkpoint/*.frame of metrical-tracker and none of the meshes that the listing "
+            "names; copy either there, or give --tracking"
+        )
     files = FrameFiles(
         folder=folder,
         images=images,
         alphas=_mattes(folder, images),
-        tracking={number: result / f"{path.stem}.frame" for number, path in images.items()},
+        tracking=meshes or {number: result / f"{path.stem}.frame" for number, path in images.items() if result},
         parsing=existing({number: frame.path("seg_mask_path") for number, frame in listed.items()}),
         decode_parsing=decode_reds,
-        listings=listings_of(frames),
-        names=NAMES,
+        listings=(*listings_of(frames), *([folder / CANONICAL] if meshes else [])),
+        names=NAMES._replace(tracking="meshes/") if meshes else NAMES,
     )
+
+    def read(head: HeadAssets, size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
+        if meshes:
+            return read_meshes(folder, listed, head, size, complain)
+        return read_tracking(files.tracking, complain, named_by_number=False)
+
     division = {number: frame.split for number, frame in listed.items()}
     fps, notes = frame_rate(frames)
-    return TrackedFolder(
-        NAME,
-        files,
-        lambda head, size, complain: read_tracking(files.tracking, complain, named_by_number=False),
-        division,
-        notes,
-        fps,
-    )
+    return TrackedFolder(NAME, files, read, division, notes, fps)
 
 
-def _tracking_folder(folder: Path, given: Path | None) -> Path:
+def _result_folder(folder: Path, given: Path | None) -> Path | None:
     candidates = (given, given / "checkpoint") if given else (folder / "checkpoint",)
-    for candidate in candidates:
-        if candidate.is_dir() and next(candidate.glob("*.frame"), None) is not None:
-            return candidate
-    raise UserError(
-        f"{candidates[-1]} holds no .frame files; INSTA's own files lack jaw, eyes and identity, so copy checkpoint/ "
-        "from the metrical-tracker result that the folder was made from, or give --tracking"
-    )
+    return next((place for place in candidates if place.is_dir() and next(place.glob("*.frame"), None)), None)
 
 
 def _mattes(folder: Path, images: dict[int, Path]) -> dict[int, Path]:

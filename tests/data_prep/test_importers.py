@@ -103,7 +103,7 @@ def test_insta(matted: bool, tracked: Path, original: Subject, tmp_path: Path) -
 
 def test_insta_with_its_tracking_elsewhere(tracked: Path, original: Subject, tmp_path: Path) -> None:
     folder = write_insta(tracked, tmp_path / "insta", checkpoint=False)
-    with pytest.raises(UserError, match=r"checkpoint holds no \.frame files; INSTA's own files lack jaw, eyes"):
+    with pytest.raises(UserError, match=r"holds no checkpoint/\*\.frame of metrical-tracker and none of the meshes"):
         import_folder(folder, tracked, tmp_path / "out")
     subject, _ = import_folder(folder, tracked, tmp_path / "out", tracking=tracked)
     assert_same_pictures(subject, original, tracked)

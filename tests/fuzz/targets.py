@@ -25,7 +25,7 @@ from avatar.config import load_config
 from avatar.data.images import decode_image, decode_mask, decode_transparency
 from avatar.data.source import Source
 from avatar.data.subject import Subject
-from avatar.errors import refuse
+from avatar.errors import UserError, refuse
 from avatar.evaluation.protocol import read_protocol
 from avatar.files.pickles import load_npz, load_pickle, load_torch_pickle
 from avatar.head.assets import load_head_assets
@@ -41,6 +41,7 @@ from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.frame_track import BadFrame
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras
+from data_prep.formats.obj_mesh import read_mesh
 from data_prep.formats.root_pose import Joint
 from data_prep.prepare.prepare import prepare
 
@@ -142,6 +143,12 @@ def make_targets(place: Path) -> dict[str, Target]:
             with contextlib.suppress(BadFrame):
                 tracking.frame(row, tracking.shape, neck, cameras[TRAINED])
 
+    def mesh(path: Path) -> object:
+        try:
+            return read_mesh(path)
+        except BadFrame as error:
+            raise UserError(str(error)) from None
+
     of_nha = write_nha(place / "nha", 6)
     nha_tracking, nha_split = next(of_nha.glob(nha.TRACKED)), of_nha / nha.SPLIT
 
@@ -172,6 +179,7 @@ def make_targets(place: Path) -> dict[str, Target]:
             1,
             lambda d: with_member(rotations, "frames.npy" if len(d) < 300 else "rotation_matrices.npy", d),
         ),
+        "INSTA mesh": Target([(model / "head_template.obj").read_bytes()], on_disk(place / "m.obj", mesh), 0.25),
         "NHA tracking": Target([nha_tracking.read_bytes()], of_copy(place, nha_tracking, of_nha, listed), 0.5),
         "NHA split": Target([nha_split.read_bytes()], of_copy(place, nha_split, of_nha, listed), 0.5),
         "manifest": Target([manifest.read_bytes()], of_copy(place, manifest, prepared, first_frame), 2),
