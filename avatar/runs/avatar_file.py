@@ -40,7 +40,7 @@ from avatar.runs.model_registry import MODELS, make_avatar
 from avatar.version import __version__
 
 AVATAR_FILE = "avatar.safetensors"
-AVATAR_FORMAT = 2
+AVATAR_FORMAT = 3
 MAX_BYTES = 2**32
 # How files begin that are taken for avatar files, and what they are for.
 OTHER_FILES = {

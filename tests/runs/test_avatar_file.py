@@ -129,7 +129,7 @@ def rewritten(source: Path, target: Path, change: Callable[[dict, dict[str, Tens
 
 
 DAMAGES: dict[str, tuple[Callable[[dict, dict[str, Tensor]], object], str]] = {
-    "another format": (lambda h, t: h.update(format=7), r"is not an avatar of this program \(format 7, expected 2\)"),
+    "another format": (lambda h, t: h.update(format=7), r"is not an avatar of this program \(format 7, expected 3\)"),
     "no configuration": (lambda h, t: h.pop("config"), r"is damaged \('config' is missing\)"),
     "impossible configuration": (
         lambda h, t: h["config"]["model"].update(latent_dim=0),
