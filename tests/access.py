@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,12 @@ def violations(page: Any, *kinds: str) -> list[str]:
 
 
 def audited(page: Any) -> list[str]:
-    """Violations of a page at both sizes, its parts that open closed and open."""
+    """Violations of a page in both themes at both sizes, its parts that open closed and open."""
     found = []
     for is_open in (False, True):
         page.evaluate(f"document.querySelectorAll('details').forEach(box => (box.open = {str(is_open).lower()}))")
-        for size in SIZES.values():
+        for theme, size in itertools.product(("light", "dark"), SIZES.values()):
+            page.emulate_media(color_scheme=theme)
             page.set_viewport_size(size)
             found += violations(page)
     return found

@@ -20,6 +20,11 @@ from avatar.report.pictures import frame_panels
 from avatar.runs.curves import read_curves
 from avatar.runs.run import Run, versions
 
+MAIN = {
+    "psnr": ("PSNR, dB", "\N{UPWARDS ARROW} higher"),
+    "ssim": ("SSIM", "\N{UPWARDS ARROW} higher"),
+    "lpips": ("LPIPS", "\N{DOWNWARDS ARROW} lower"),
+}
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
 BINNINGS = (  # key of results.json, what it is binned by, decimals of the edges and their column's name
     ("by_held_out", "what is held out", 0, "held out"),  # of several cameras, as the next
@@ -62,13 +67,27 @@ def render_report(run: Run) -> str:
     }
     parts = [
         element("header", element("h1", f"Run {run.path.name}"), element("p", str(run.path), class_="soft")),
-        section("Run", tiles(facts)),
+        section("Held-out frames", *_main_figures(results), *_frames(run)),
         section("Held-out figures", *_figures(run, results)),
-        section("Held-out frames", *_frames(run)),
-        section("Training", *_curves(run.path)),
-        section("Origin", *_origin(run, results)),
+        section("Training", fold("Loss and PSNR", *_curves(run.path))),
+        section("Run", tiles(facts), fold("Origin", *_origin(run, results))),
     ]
     return document(f"Run {run.path.name}", parts, SCRIPT)
+
+
+def _main_figures(results: Mapping[str, Any] | None) -> list[Markup]:
+    """Of the first protocol that has them, of the head where it measures that."""
+    for name, entry in (results or {}).get("protocols", {}).items():
+        means = next(iter(parts(entry).values())).figures.get("means", {})
+        what = "_head" if "psnr_head" in means else ""
+        shown = {column: value for column in MAIN if (value := means.get(f"{column}{what}")) is not None}
+        if shown:
+            labels = {f"{MAIN[c][0]}, {MAIN[c][1]} is better": _figure(c, value) for c, value in shown.items()}
+            return [
+                tiles(labels),
+                element("p", f"Means by the protocol {name}{what and ', of the head'}.", class_="soft"),
+            ]
+    return []
 
 
 def means_table(protocols: Mapping[str, Any], mark: str = "") -> Markup:
