@@ -80,7 +80,7 @@ class ViewRenderer:
         return tuple(name for name in OVERLAYS if name != "error" or self.truth is not None)
 
     def within(self, look: ViewOffset) -> tuple[ViewOffset, bool]:
-        """The nearest look that is allowed, and whether the training video shows the head from there."""
+        """The nearest offset that is allowed, and whether the training video shows the head from there."""
         (yaw_low, yaw_high), (pitch_low, pitch_high) = self.limits
         kept = ViewOffset(
             min(max(look.yaw, yaw_low - MARGIN), yaw_high + MARGIN),

@@ -140,7 +140,7 @@ def test_jitter_goes_by_the_frames_numbers(tmp_path: Path, subject: Subject) -> 
 def test_an_avatar_without_error_has_no_worst_frame(
     tmp_path: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Infinite PSNR is no figure: results stay valid JSON, and there is nothing to image_format at."""
+    """Infinite PSNR is no figure: results stay valid JSON, and there is nothing to look at."""
     monkeypatch.setattr(
         BlobRenderer,
         "draw",

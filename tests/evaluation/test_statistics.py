@@ -74,7 +74,7 @@ def test_jitter_counts_pixels_that_all_three_masks_hold() -> None:
 
 
 def camera_at(degrees: float) -> Camera:
-    """A camera half a metre from the head's origin that formats at it, `degrees` towards the head's own left."""
+    """A camera half a metre from the head's origin that looks at it, `degrees` towards the head's own left."""
     angle = math.radians(degrees)
     position = torch.tensor([0.5 * math.sin(angle), 0.1, 0.5 * math.cos(angle)])
     forward = -torch.tensor([math.sin(angle), 0.0, math.cos(angle)])

@@ -35,7 +35,7 @@ from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
 from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
-from avatar.view.view_renderer import Look, Setting, ViewRenderer
+from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 
 OVERFLOWS = r"drawing needs \d+ pairs of a tile and a splat, the GPU's buffers hold 3; a lower --size or model.uv_size"
 
@@ -96,7 +96,7 @@ def test_a_viewed_frame_fits_whatever_was_drawn_before(trained: TrainedAvatar, m
     for name, value in (("HEADROOM", 1), ("PER_SPLAT", 0), ("PER_TILE", 0)):
         monkeypatch.setattr(gpu_buffers, name, value)
     stage, frame = ViewRenderer(trained), (trained.rest_params(), trained.rest_camera(32))
-    settings = [Setting(Look(zoom=zoom)) for zoom in (0.5, 4.0)]
+    settings = [Setting(ViewOffset(zoom=zoom)) for zoom in (0.5, 4.0)]
     expected = [stage.draw(frame, setting, 64) for setting in settings]
     with as_on_a_gpu():
         for setting, wanted in zip(settings, expected, strict=True):

@@ -63,7 +63,7 @@ def test_noise_in_held_out_frames_changes_no_bit_of_a_trained_avatar(
 
 
 def test_training_opens_training_frames_and_one_preview(tracked_folder: Path, tmp_path: Path) -> None:
-    """For first colours, pruning and steps, which pass over all frames."""
+    """For first colours and steps, which pass over all frames."""
     _, subject, assets = open_small(tracked_folder, small_config())
     opened: list[int] = []
 

@@ -266,7 +266,7 @@ def test_closing_takes_no_time_whatever_clients_do(viewer: Viewer) -> None:
 
 
 def test_a_viser_that_listens_in_another_way_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the access it would listen for everybody."""
+    """Without the checks it would listen for everybody."""
     monkeypatch.setattr(viser_server.WebServer, "_serve", viser_server._original)
     with (
         socket.create_server(("127.0.0.1", 0)) as listening,

@@ -46,7 +46,7 @@ class Script:
     milliseconds: dict[str, float] = field(default_factory=lambda: {"landmarks": 9.4, "fit": 12.0})
 
     def calibrate(self, say: Callable[[str], object]) -> Calibrated:
-        say("ViewOffset into the camera.")
+        say("Look into the camera.")
         if isinstance(self.calibration, Exception):
             raise self.calibration
         return self.calibration
@@ -109,7 +109,7 @@ def test_expressions_depart_from_both_neutral_faces(
 ) -> None:
     awake: list[int] = []
     webcam.start(lambda: awake.append(shown(webcam).number))
-    until(lambda: said == ["ViewOffset into the camera.", "Calibrated: the avatar follows."])
+    until(lambda: said == ["Look into the camera.", "Calibrated: the avatar follows."])
     assert webcam.newest() is None
     script.found.put(rest)
     until(lambda: awake == [0])
