@@ -150,10 +150,11 @@ class Panel:
 
     def _add_face(self) -> None:
         renderer, sliders = self._viewer.renderer, []
-        parts = list(dict.fromkeys(control.part for control in renderer.controls))
+        moving = {n: control for n, control in enumerate(renderer.controls) if control.low < control.high}
+        parts = list(dict.fromkeys(control.part for control in moving.values()))
         for part in parts:
             with self._gui.add_folder(part, expand_by_default=part == parts[0]):
-                for number, control in enumerate(renderer.controls):
+                for number, control in moving.items():
                     if control.part == part:
                         sliders.append(self._slider(control.name, (control.low, control.high), "expressions", number))
         if renderer.joints:

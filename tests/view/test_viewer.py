@@ -5,6 +5,8 @@ from __future__ import annotations
 import http.client
 import json
 import socket
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,8 @@ from waiting import until
 from avatar.commands.view import address, checked_url
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.view_renderer import Setting, ViewOffset
+from avatar.view.player import Player
+from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 from avatar.view.viewer import LARGEST, Viewer, padded
 
 
@@ -103,6 +106,20 @@ def test_the_panel_has_no_empty_folder(viewer: Viewer) -> None:
     with Page(f"http://127.0.0.1:{viewer.port}/{TOKEN}/") as page:
         page.until(lambda: "Reset face" in page.controls)
         assert sorted(page.folders) == sorted(["Motion", "Picture", "Joints", *parts])
+
+
+def test_an_expression_that_training_hardly_shows_has_no_slider(shown_avatar: TrainedAvatar) -> None:
+    """In fewer than a hundredth of the frames: its range is empty."""
+    renderer = ViewRenderer(shown_avatar)
+    first, *others = renderer.controls
+    renderer.controls = [replace(first, low=0.0, high=0.0), *others]
+    viewer = Viewer(renderer, Player(shown_avatar, {}, time.monotonic), 96, "127.0.0.1", 0, TOKEN)
+    try:
+        with Page(f"http://127.0.0.1:{viewer.port}/{TOKEN}/") as page:
+            page.until(lambda: "Reset face" in page.controls)
+            assert first.name not in page.controls and {control.name for control in others} <= set(page.controls)
+    finally:
+        viewer.close()
 
 
 def test_the_panel_says_why_nothing_plays_and_there_is_no_truth(viewer: Viewer) -> None:
