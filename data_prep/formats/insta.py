@@ -51,7 +51,7 @@ def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None =
         tracking=meshes or {number: result / f"{path.stem}.frame" for number, path in images.items() if result},
         parsing=existing({number: frame.path("seg_mask_path") for number, frame in listed.items()}),
         decode_parsing=decode_reds,
-        listings=(*listings_of(frames), *([folder / CANONICAL] if meshes else [])),
+        listings=(*listings_of(frames), *(_beside(folder, listed) if meshes else [])),
         names=NAMES._replace(tracking="meshes/") if meshes else NAMES,
     )
 
@@ -68,6 +68,11 @@ def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None =
 def _result_folder(folder: Path, given: Path | None) -> Path | None:
     candidates = (given, given / "checkpoint") if given else (folder / "checkpoint",)
     return next((place for place in candidates if place.is_dir() and next(place.glob("*.frame"), None)), None)
+
+
+def _beside(folder: Path, listed: dict[int, ListedFrame]) -> list[Path]:
+    """What the fit to the meshes reads as well."""
+    return [folder / CANONICAL, *(path for frame in listed.values() if (path := frame.path("exp_path")) is not None)]
 
 
 def _mattes(folder: Path, images: dict[int, Path]) -> dict[int, Path]:

@@ -30,6 +30,7 @@ from data_prep.formats.insta_meshes import read_meshes
 from data_prep.formats.mesh_head import HeadRows, MeshPose
 from data_prep.formats.mesh_rows import increasing_rows
 from data_prep.formats.transforms import ListedFrame
+from data_prep.prepare.cache import input_hash
 
 MILLIMETRE, DEGREE = 1e-3, np.pi / 180
 KINDS = ("full", "faces", "vertices")
@@ -190,6 +191,12 @@ def test_a_bad_mesh_is_left_out_with_the_reason(name: str, copy: Path, tracked: 
     assert list(found.bad) == [6] and len(found.frames) == FRAMES - 1
     with pytest.raises(AssertionError, match=words):
         raise AssertionError(found.bad[6])
+
+
+def test_an_expected_expression_that_changes_is_noticed(copy: Path) -> None:
+    before = input_hash(open_tracked_folder(copy).files, {})
+    edit(sorted((copy / "flame" / "exp").iterdir())[3], lambda lines: [*lines, "1"])
+    assert input_hash(open_tracked_folder(copy).files, {}) != before
 
 
 def wrinkled(lines: list[str]) -> list[str]:
