@@ -114,7 +114,7 @@ class TrainerConfig:
     dssim_weight: Annotated[float, WEIGHT, "weight of D-SSIM in steps where it replaces LPIPS"] = 0.2
     dssim_early: Annotated[float, WEIGHT, "weight of D-SSIM before the perceptual loss begins"] = 0.1
     opposite_background_every: Annotated[
-        int | None, STEPS, "every so many-th step is over black where the background is light, else white; null: none"
+        int | None, STEPS, "every so many-th step is over the background's opposite, 0 or 1 in each channel; null: none"
     ] = 3
     pose_rate: Annotated[
         float, SHARE, "learning rate of the training frames' pose corrections, in half degrees and millimetres; 0: none"
