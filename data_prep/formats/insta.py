@@ -38,11 +38,13 @@ def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None =
     listed = numbered(frames)
     images = {number: frame.image for number, frame in listed.items()}
     result = _result_folder(folder, tracking)
-    meshes = {} if result is not None or tracking is not None else mesh_paths(listed)
+    if result is None and tracking is not None:
+        raise UserError(f"{tracking} holds no .frame files of metrical-tracker; give --tracking the folder that does")
+    meshes = {} if result is not None else mesh_paths(listed)
     if result is None and not meshes:
         raise UserError(
-            f"{tracking or folder} holds no checkpoint/*.frame of metrical-tracker and none of the meshes that the listing "
-            "names; copy either there, or give --tracking"
+            f"{folder} holds no checkpoint/*.frame of metrical-tracker and none of the meshes that the listing names; "
+            "copy either there, or give --tracking"
         )
     files = FrameFiles(
         folder=folder,

@@ -61,9 +61,7 @@ def increasing_rows(points: Float[np.ndarray, "N 3"], targets: Float[np.ndarray,
     Point n can only be at one of the rows n ... n + V - N.
     """
     room = len(targets) - len(points) + 1
-    is_least = np.empty(
-        (len(points), -(-room // 8)), np.uint8
-    )  # where the least sum of the rows so far is reached, bits
+    is_least = np.empty((len(points), -(-room // 8)), np.uint8)  # bits: the least sum of the rows so far is reached
     least = np.zeros(room)
     for n, point in enumerate(points):
         sums = least + np.linalg.norm(targets[n : n + room] - point, axis=1)

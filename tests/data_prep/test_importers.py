@@ -105,6 +105,8 @@ def test_insta_with_its_tracking_elsewhere(tracked: Path, original: Subject, tmp
     folder = write_insta(tracked, tmp_path / "insta", checkpoint=False)
     with pytest.raises(UserError, match=r"holds no checkpoint/\*\.frame of metrical-tracker and none of the meshes"):
         import_folder(folder, tracked, tmp_path / "out")
+    with pytest.raises(UserError, match=r"images holds no \.frame files of metrical-tracker; give --tracking"):
+        import_folder(folder, tracked, tmp_path / "out", tracking=folder / "images")
     subject, _ = import_folder(folder, tracked, tmp_path / "out", tracking=tracked)
     assert_same_pictures(subject, original, tracked)
 
