@@ -6,10 +6,12 @@ import sys
 from argparse import Namespace
 from bisect import bisect_right
 from collections import Counter
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 from avatar.commands.outputs import check_file, check_outputs
+from avatar.compute.interruption import interruption
 from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.pipeline import OK
@@ -47,17 +49,17 @@ def run_record(arguments: Namespace) -> int:
         raise UserError(f"{out} exists already; give another name, or remove it")
     check_file(out, SUFFIXES, "a film")
     screen, seen, wrong = Screen(), list[Seen](), Counter[str]()
-    with FaceDetector() as detector:
+    with interruption() as interrupted, FaceDetector() as detector:
         film = Film(open_source(arguments.webcam, FILMED))
         with closing(Newest(film)) as newest:
             screen.say(
                 f"Camera   {film.name}, {film.size[0]} x {film.size[1]} pixels. Ctrl-C ends, and keeps the film."
             )
-            rate = wait_for_face(newest, film, detector, screen)
+            rate = wait_for_face(newest, film, detector, screen, interrupted)
             with video_writer(out, rate, "veryfast") as add:
                 film.begin(add, rate)
                 try:
-                    follow_prompts(newest, detector, screen, seen, wrong)
+                    follow_prompts(newest, detector, screen, seen, wrong, interrupted)
                 except KeyboardInterrupt:
                     screen.say("Stopped.")
                 except UserError as error:
@@ -70,11 +72,20 @@ def run_record(arguments: Namespace) -> int:
     return OK
 
 
-def wait_for_face(newest: Newest, film: Film, detector: FaceDetector, screen: Screen) -> float:
+def between_pictures(interrupted: Callable[[], bool]) -> None:
+    """Raise KeyboardInterrupt here: within MediaPipe it can end the process."""
+    if interrupted():
+        raise KeyboardInterrupt
+
+
+def wait_for_face(
+    newest: Newest, film: Film, detector: FaceDetector, screen: Screen, interrupted: Callable[[], bool]
+) -> float:
     """The camera's rate, once that is known and a face there. Raises UserError when the pictures end before."""
     newest.start()
     try:
         while True:
+            between_pictures(interrupted)
             faces, rate = detector.find(newest.take().image), film.measured_rate()
             if faces and rate is not None:
                 return rate
@@ -84,11 +95,17 @@ def wait_for_face(newest: Newest, film: Film, detector: FaceDetector, screen: Sc
 
 
 def follow_prompts(
-    newest: Newest, detector: FaceDetector, screen: Screen, seen: list[Seen], wrong: Counter[str]
+    newest: Newest,
+    detector: FaceDetector,
+    screen: Screen,
+    seen: list[Seen],
+    wrong: Counter[str],
+    interrupted: Callable[[], bool],
 ) -> None:
     """Say each prompt in its time and what is wrong with the pictures; `seen` and `wrong` get what was seen and told."""
     adviser, begin, shown = Adviser(), None, -1
     while True:
+        between_pictures(interrupted)
         picture = newest.take()
         begin = picture.taken if begin is None else begin
         time = picture.taken - begin
