@@ -101,6 +101,10 @@ def _from_arkit(
             raise UserError(f"{path}: the columns {own[shape]} and {name} are the same blendshape")
         else:
             own[shape] = name
+    if not own:
+        raise UserError(
+            f"{path} has no column of a blendshape (its columns: {_some(table.header)}); see docs/reenact.md"
+        )
     values = {
         shape: table.column(name, LARGEST if _POSE.fullmatch(shape) else LARGEST_SHAPE) for shape, name in own.items()
     }

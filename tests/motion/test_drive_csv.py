@@ -202,6 +202,10 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     ),
     "a missing cell": (csv([["expression_0", "expression_1"], [], ["1"]]), "line 3: 1 values for 2 columns"),
     "an empty value": (csv([["expression_0", "expression_1"], ["1", ""]]), "line 2: expression_1 is ''"),
+    "no blendshape": (
+        csv([["Timecode", "BlendShapeCount", "sound"], [code(0), "61", "0"]]),
+        "no column of a blendshape",
+    ),
     "the same blendshape twice": (csv([["a.JawOpen", "b.jawOpen"], ["0", "0"]]), "a.JawOpen and b.jawOpen"),
 }
 
