@@ -6,7 +6,6 @@ import contextlib
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ import msgspec
 import numpy as np
 import viser
 import zstandard
+from command_line import running
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
@@ -189,23 +189,6 @@ class Started:
 @contextmanager
 def started(run: Path, *options: object, log: Path | None = None) -> Iterator[Started]:
     """`log` gets what goes to stderr."""
-    words = [sys.executable, "-m", "avatar.cli", "view", run, "--port", 0, *options]
-    with (log or Path("/dev/null")).open("w") as stderr:
-        process = subprocess.Popen(
-            list(map(str, words)),
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what runs behind
-        )
-        try:
-            assert process.stdout is not None
-            said = ""
-            while "Ctrl-C" not in said:
-                line = process.stdout.readline()
-                assert line, said
-                said += line
-            yield Started(process, said)
-        finally:
-            process.kill()
-            process.wait()
+    words = ["view", run, "--port", 0, *options]
+    with (log or Path("/dev/null")).open("w") as stderr, running(*words, until="Ctrl-C", stderr=stderr) as found:
+        yield Started(*found)

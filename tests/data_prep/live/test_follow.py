@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import running
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from small_runs import train_small
 from videos import encode
@@ -104,26 +105,12 @@ def test_the_command_follows_a_video_to_its_end(video: Path, head: Path, tmp_pat
     make_subject(tmp_path / "subject", frames=12, size=64, seed=2)
     train_small(tmp_path / "subject", tmp_path / "run", ["trainer.iterations=4", "model.uv_size=16"])
     words = ["view", tmp_path / "run", "--head", head, "--webcam", video, "--port", "0", "--size", "64"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "avatar.cli", *map(str, words)],
-        stdout=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what runs behind
-    )
-    try:
-        assert process.stdout is not None
-        said = ""
-        while "has ended" not in said:
-            line = process.stdout.readline()
-            assert line, said
-            said += line
+    with running(*words, until="has ended") as (process, said):
         assert f"Webcam   {video}, {SIZE} x {SIZE} pixels" in said and "Open     http://127.0.0.1:" in said
         assert "Webcam   Calibrated: the avatar follows." in said
         assert f"{video} has ended after {FRAMES} pictures" in said
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 130
-    finally:
-        process.kill()
 
 
 UNCLOSED = """

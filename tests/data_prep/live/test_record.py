@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +12,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from command_line import avatar
+from command_line import avatar, running
 from posing import HEIGHT, WIDTH, picture, posed
 from videos import encode
 
@@ -32,10 +30,10 @@ SHARP, DIM, BLURRED = picture(), picture(light=0.4), picture(blur=8.0)
 Play = Callable[[float], tuple[np.ndarray, Face | None]]
 
 
-class Stage:
+class StandIn:
     """A camera and what finds the faces: its next picture is taken when the last one has been looked at."""
 
-    name, size, equivalent_focal, silent_after = "a stage", (WIDTH, HEIGHT), None, 5.0
+    name, size, equivalent_focal, silent_after = "a stand-in", (WIDTH, HEIGHT), None, 5.0
 
     def __init__(self, play: Play, times: Sequence[float]) -> None:
         self._play, self._times = play, times
@@ -57,7 +55,7 @@ class Stage:
     def close(self) -> None:
         self._looked.release()
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> StandIn:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -65,14 +63,14 @@ class Stage:
 
 
 @pytest.fixture
-def on_stage(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stage]:
+def filming(monkeypatch: pytest.MonkeyPatch) -> Callable[..., StandIn]:
     """Puts a person before the camera of the command."""
 
-    def put(play: Play, seconds: float = 63.0, gone: slice = slice(0)) -> Stage:
-        stage = Stage(play, np.delete(np.arange(0, seconds, 1 / FPS), gone).tolist())
-        monkeypatch.setattr(record, "FaceDetector", lambda: stage)
-        monkeypatch.setattr(record, "open_source", lambda given, settings: stage)
-        return stage
+    def put(play: Play, seconds: float = 63.0, gone: slice = slice(0)) -> StandIn:
+        stand_in = StandIn(play, np.delete(np.arange(0, seconds, 1 / FPS), gone).tolist())
+        monkeypatch.setattr(record, "FaceDetector", lambda: stand_in)
+        monkeypatch.setattr(record, "open_source", lambda given, settings: stand_in)
+        return stand_in
 
     return put
 
@@ -100,7 +98,7 @@ def obedient(time: float) -> Face:
     return posed(**doing[bisect_right(ENDS, max(time, 0.0))])
 
 
-def test_prompts_advice_and_what_was_reached(on_stage: Callable[..., Stage], tmp_path: Path) -> None:
+def test_prompts_advice_and_what_was_reached(filming: Callable[..., StandIn], tmp_path: Path) -> None:
     def play(time: float) -> tuple[np.ndarray, Face | None]:
         prompt = bisect_right(ENDS, max(time, 0.0))
         if prompt == number_of("Speak"):
@@ -109,10 +107,10 @@ def test_prompts_advice_and_what_was_reached(on_stage: Callable[..., Stage], tmp
             return SHARP, posed(height=150.0, eyeBlinkLeft=0.6, eyeBlinkRight=0.6)
         return (DIM if prompt == number_of("brows") else SHARP), obedient(time)
 
-    on_stage(play, gone=slice(150, 155))
+    filming(play, gone=slice(150, 155))
     out = tmp_path / "me.mp4"
     lines = avatar("record", out).splitlines()
-    assert lines[0].startswith("Camera   a stage, 640 x 480 pixels. Ctrl-C")
+    assert lines[0].startswith("Camera   a stand-in, 640 x 480 pixels. Ctrl-C")
     first = lines.index(" 1 of 11 Look at the camera calmly, lips closed.")
     told = {4: "more light on the face", 5: "come closer", 11: "hold still"}
     expected = []
@@ -141,55 +139,57 @@ def test_prompts_advice_and_what_was_reached(on_stage: Callable[..., Stage], tmp
     assert [path.name for path in tmp_path.iterdir()] == ["me.mp4"]
 
 
-def test_a_camera_that_ends_leaves_the_film(on_stage: Callable[..., Stage], tmp_path: Path) -> None:
-    on_stage(lambda time: (SHARP, posed()), seconds=12.0)
+def test_a_camera_that_ends_leaves_the_film(filming: Callable[..., StandIn], tmp_path: Path) -> None:
+    filming(lambda time: (SHARP, posed()), seconds=12.0)
     lines = avatar("record", tmp_path / "me.mkv").splitlines()
-    assert "Stopped: a stage has ended after 60 pictures" in lines
+    assert "Stopped: a stand-in has ended after 60 pictures" in lines
     assert f"Repeat   {PROMPTS[-1].words}" in lines, "nobody saw it"
     assert len(iio.imread(tmp_path / "me.mkv")) == pytest.approx((12 - WAITED) * FPS, abs=1)
 
 
-def test_ctrl_c_leaves_the_film(on_stage: Callable[..., Stage], tmp_path: Path) -> None:
+def test_ctrl_c_leaves_the_film(filming: Callable[..., StandIn], tmp_path: Path) -> None:
     looked: list[float] = []
 
     def play(time: float) -> tuple[np.ndarray, Face | None]:
         looked.append(time)
         return SHARP, posed()
 
-    stage = on_stage(play)
-    find = stage.find
+    stand_in = filming(play)
+    find = stand_in.find
 
     def interrupted(image: np.ndarray) -> list[Face]:
         if looked[-1] > 7:
             raise KeyboardInterrupt
         return find(image)
 
-    stage.find = interrupted  # type: ignore[method-assign]
+    stand_in.find = interrupted  # type: ignore[method-assign]
     lines = avatar("record", tmp_path / "me.mp4").splitlines()
     assert "Stopped." in lines and lines[-1].startswith("Next     avatar create")
     assert len(iio.imread(tmp_path / "me.mp4")) == pytest.approx(7 * FPS, abs=2)
 
 
-def test_a_slow_camera_is_written_at_its_rate(on_stage: Callable[..., Stage], tmp_path: Path) -> None:
+def test_a_slow_camera_is_written_at_its_rate(filming: Callable[..., StandIn], tmp_path: Path) -> None:
     """That slows down in the dark: its pictures are repeated, and it is said why."""
-    on_stage(lambda time: (SHARP, posed()), seconds=22.0, gone=slice(30, 110, 2))
+    filming(lambda time: (SHARP, posed()), seconds=22.0, gone=slice(30, 110, 2))
     said = avatar("record", tmp_path / "me.mp4")
     assert "at 5 pictures a second" in said and "; more light: cameras slow down in the dark" in said
     assert len(iio.imread(tmp_path / "me.mp4")) == pytest.approx(20 * FPS, abs=2)
 
 
-def test_the_film_begins_with_a_face(on_stage: Callable[..., Stage], tmp_path: Path) -> None:
-    on_stage(lambda time: (SHARP, None), seconds=4.0)
+def test_the_film_begins_with_a_face(filming: Callable[..., StandIn], tmp_path: Path) -> None:
+    filming(lambda time: (SHARP, None), seconds=4.0)
     said = avatar("record", tmp_path / "me.mp4", status=1)
     assert "There is no face in the picture." in said
-    assert "avatar: a stage has ended after 20 pictures; nothing was filmed: that begins with a face, after 2 s" in said
+    assert (
+        "avatar: a stand-in has ended after 20 pictures; nothing was filmed: that begins with a face, after 2 s" in said
+    )
     assert not list(tmp_path.iterdir())
 
 
 def test_a_disk_that_is_full_is_a_sentence(
-    on_stage: Callable[..., Stage], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    filming: Callable[..., StandIn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    on_stage(lambda time: (SHARP, posed()), seconds=12.0)
+    filming(lambda time: (SHARP, posed()), seconds=12.0)
     monkeypatch.setattr("avatar.files.video._codec", lambda *of: ["-c:v", "libx264", "-fs", "10", "-f", "nonsense"])
     said = avatar("record", tmp_path / "me.mp4", status=1)
     assert said.splitlines()[-1].startswith(f"avatar: the video {tmp_path / 'me.mp4'} cannot be written (")
@@ -209,7 +209,7 @@ def test_what_cannot_be_filmed_is_a_sentence(
     words: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(record, "FaceDetector", lambda: Stage(lambda time: (SHARP, None), []))
+    monkeypatch.setattr(record, "FaceDetector", lambda: StandIn(lambda time: (SHARP, None), []))
     (tmp_path / "there.mp4").write_bytes(b"dear to somebody")
     assert f"avatar: {sentence}" in avatar("record", *words.split(), status=1).splitlines()[-1]
     assert (tmp_path / "there.mp4").read_bytes() == b"dear to somebody" and len(list(tmp_path.iterdir())) == 1
@@ -226,7 +226,7 @@ def test_without_models_nothing_is_filmed(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_camera_is_asked_for_large_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: list[object] = []
-    monkeypatch.setattr(record, "FaceDetector", lambda: Stage(lambda time: (SHARP, None), []))
+    monkeypatch.setattr(record, "FaceDetector", lambda: StandIn(lambda time: (SHARP, None), []))
 
     def refuse(given: str, settings: object) -> None:
         asked.extend((given, settings))
@@ -243,24 +243,10 @@ def test_a_video_is_filmed_until_ctrl_c(tracking_models: None, tmp_path: Path) -
     pictures = [*filmed(30, 288, 1)]
     film = encode(tmp_path / "camera.mp4", [*pictures, *pictures[::-1]] * 6, fps=10)
     out = tmp_path / "me.mp4"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "avatar.cli", "record", str(out), "--webcam", str(film)],
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what runs behind
-    )
-    try:
-        assert process.stdout is not None
-        said = ""
-        while "Say a sentence" not in said:
-            line = process.stdout.readline()
-            assert line, said
-            said += line
+    words = ["record", out, "--webcam", film]
+    with running(*words, until="Say a sentence", start_new_session=True) as (process, said):
         os.killpg(process.pid, signal.SIGINT)
         rest, _ = process.communicate(timeout=60)
-    finally:
-        process.kill()
     assert process.returncode == 0 and "Stopped." in rest
     assert "         come closer\n" in said
     assert 40 <= len(iio.imread(out)) <= 70 and iio.immeta(out)["fps"] == 10
