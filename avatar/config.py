@@ -113,6 +113,7 @@ class TrainerConfig:
     )
     dssim_weight: Annotated[float, WEIGHT, "weight of D-SSIM in steps where it replaces LPIPS"] = 0.2
     dssim_early: Annotated[float, WEIGHT, "weight of D-SSIM before the perceptual loss begins"] = 0.1
+    # Of no factor in common with SPARSE_EVERY, so that a sparse LPIPS sees both backgrounds.
     opposite_background_every: Annotated[
         int | None, STEPS, "every so many-th step is over the background's opposite, 0 or 1 in each channel; null: none"
     ] = 3

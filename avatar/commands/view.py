@@ -29,7 +29,7 @@ from avatar.runs.curves import read_curves
 from avatar.runs.run import RUN_FILE, Run, open_trained
 from avatar.runs.trained import TrainedAvatar, avatar_path
 from avatar.view.auth import LOCAL
-from avatar.view.newest import Newest, progress
+from avatar.view.newest import NewestAvatar, progress
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.view_renderer import ViewRenderer
@@ -48,7 +48,7 @@ POLL_SECONDS = 1.0
 
 
 def run_view(arguments: Namespace) -> int:
-    newest = Newest(avatar_path(arguments.run))
+    newest = NewestAvatar(avatar_path(arguments.run))
     run = open_with_video(arguments)
     trained = open_trained(arguments.run, arguments.head) if run is None else run.trained
     if arguments.size is not None and not WIDTHS[0] <= arguments.size <= WIDTHS[1]:
@@ -93,7 +93,7 @@ def run_view(arguments: Namespace) -> int:
     return OK
 
 
-def follow(viewer: Viewer, newest: Newest, arguments: Namespace) -> None:
+def follow(viewer: Viewer, newest: NewestAvatar, arguments: Namespace) -> None:
     """Show each newer avatar of a run and how far its training is, for ever."""
     shown = viewer.renderer.trained
     run = shown.source.parent

@@ -11,7 +11,7 @@ from avatar.files.lock import is_held
 from avatar.runs.trained import TrainedAvatar
 
 
-class Newest:
+class NewestAvatar:
     """Made before the avatar is opened, so that nothing that is written meanwhile is missed."""
 
     def __init__(self, path: Path) -> None:

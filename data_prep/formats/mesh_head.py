@@ -89,23 +89,23 @@ class HeadRows:
     def linearised(self, pose: MeshPose) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "M P"]]:
         """`vertices`, and the derivatives of their M = 3 N coordinates by the P = 17 + E values of rotation, translation,
         the three turns, eyelids and expression, in the head's own space."""
-        shape, arms, bent = self._shape(pose)
-        vertices, blended = self._posed(shape, arms, bent, pose), self._blended(bent)
+        shape, from_joints, bent = self._shape(pose)
+        vertices, blended = self._posed(shape, from_joints, bent, pose), self._blended(bent)
         by = np.empty((*vertices.shape, FIRST_EXPRESSION + len(pose.expression)))
         by[..., :3] = np.tensordot(vertices, _GENERATORS, (1, 2)).transpose(0, 2, 1)
         by[..., 3:6] = np.eye(3)
         for j, turn in enumerate(pose.turns):
             spin = _GENERATORS @ turn
-            swung = np.tensordot(self.weights[:, j, None] * arms[:, j], spin, (1, 2)).transpose(0, 2, 1)
-            bulged = (self.correctives[:, 9 * j : 9 * j + 9] @ spin.reshape(3, 9).T).reshape(swung.shape)
-            by[..., 6 + 3 * j : 9 + 3 * j] = swung + blended @ bulged
+            by_joint = np.tensordot(self.weights[:, j, None] * from_joints[:, j], spin, (1, 2)).transpose(0, 2, 1)
+            by_corrective = (self.correctives[:, 9 * j : 9 * j + 9] @ spin.reshape(3, 9).T).reshape(by_joint.shape)
+            by[..., 6 + 3 * j : 9 + 3 * j] = by_joint + blended @ by_corrective
         by = by.reshape(vertices.size, -1)
         by[:, FIRST_LID:FIRST_EXPRESSION] = self.eyelid_dirs
-        by[:, FIRST_EXPRESSION:] = self._carried(self.expression_dirs, self.joint_expression_dirs, bent)
+        by[:, FIRST_EXPRESSION:] = self._posed_directions(self.expression_dirs, self.joint_expression_dirs, bent)
         return vertices, by
 
     def identity_derivatives(self, pose: MeshPose) -> Float[np.ndarray, "M S"]:
-        return self._carried(self.identity_dirs, self.joint_identity_dirs, pose.turns - np.eye(3))
+        return self._posed_directions(self.identity_dirs, self.joint_identity_dirs, pose.turns - np.eye(3))
 
     def _shape(self, pose: MeshPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """s [N, 3], s - p_j [N, 3 joints, 3] and R_j - I [3 joints, 3, 3]."""
@@ -114,19 +114,19 @@ class HeadRows:
         joints = self.joints + self.joint_expression_dirs @ pose.expression
         return shape.reshape(-1, 3), shape.reshape(-1, 1, 3) - joints.reshape(-1, 3), bent
 
-    def _posed(self, shape: np.ndarray, arms: np.ndarray, bent: np.ndarray, pose: MeshPose) -> np.ndarray:
-        swung = sum(self.weights[:, j, None] * (arms[:, j] @ turn.T) for j, turn in enumerate(bent))
-        return shape + swung + (self.eyelid_dirs @ pose.eyelids).reshape(-1, 3)
+    def _posed(self, shape: np.ndarray, from_joints: np.ndarray, bent: np.ndarray, pose: MeshPose) -> np.ndarray:
+        by_joint = sum(self.weights[:, j, None] * (from_joints[:, j] @ turn.T) for j, turn in enumerate(bent))
+        return shape + by_joint + (self.eyelid_dirs @ pose.eyelids).reshape(-1, 3)
 
     def _blended(self, bent: np.ndarray) -> np.ndarray:
         """I + sum_j w_j (R_j - I), [N, 3, 3]."""
         return np.eye(3) + np.tensordot(self.weights, bent, 1)
 
-    def _carried(self, directions: np.ndarray, joint_directions: np.ndarray, bent: np.ndarray) -> np.ndarray:
+    def _posed_directions(self, directions: np.ndarray, joint_directions: np.ndarray, bent: np.ndarray) -> np.ndarray:
         """Directions [N * 3, D] of the shape, as they are after the joints' turns."""
-        carried = directions.reshape(-1, 3, directions.shape[1]).copy()
+        posed = directions.reshape(-1, 3, directions.shape[1]).copy()
         turned = self.weights.any(axis=1)
         moved = (bent @ joint_directions.reshape(len(bent), 3, -1)).reshape(len(bent), -1)
-        swung = (self.weights[turned] @ moved).reshape(-1, *carried.shape[1:])
-        carried[turned] = self._blended(bent)[turned] @ carried[turned] - swung
-        return carried.reshape(directions.shape)
+        by_joint = (self.weights[turned] @ moved).reshape(-1, *posed.shape[1:])
+        posed[turned] = self._blended(bent)[turned] @ posed[turned] - by_joint
+        return posed.reshape(directions.shape)

@@ -30,7 +30,7 @@ class Film:
         self.name, self.size = source.name, source.size
         self.equivalent_focal, self.silent_after = source.equivalent_focal, source.silent_after
         self._lock = threading.Lock()
-        self._waiting: deque[float] = deque(maxlen=300)  # times of the last pictures that were not filmed
+        self._waiting: deque[float] = deque()  # times of the last pictures that were not filmed
         self._add: Callable[[UInt8[np.ndarray, "H W C"]], None] | None = None
         self._first: float | None = None
         self.rate = 0.0
@@ -73,6 +73,8 @@ class Film:
     def _place(self, picture: LivePicture, last: LivePicture) -> None:
         if self._add is None:
             self._waiting.append(picture.taken)
+            while picture.taken - self._waiting[0] > 2 * WARM_UP:
+                self._waiting.popleft()
             return
         self._first = picture.taken if self._first is None else self._first
         late = (picture.taken - self._first) * self.rate - self.frames

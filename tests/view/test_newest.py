@@ -22,7 +22,7 @@ from avatar.files.lock import locked
 from avatar.runs.avatar_file import write_avatar
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.newest import Newest, progress
+from avatar.view.newest import NewestAvatar, progress
 from avatar.view.viewer import Viewer
 
 
@@ -44,12 +44,12 @@ def train_on(shown: TrainedAvatar, steps: int) -> bytes:
     return shown.source.read_bytes()
 
 
-def opened(shown: TrainedAvatar, newest: Newest) -> TrainedAvatar | None:
+def opened(shown: TrainedAvatar, newest: NewestAvatar) -> TrainedAvatar | None:
     return newest.poll(shown, lambda: open_trained(shown.source))
 
 
 def test_a_newer_avatar_is_opened_once_it_is_whole(shown: TrainedAvatar) -> None:
-    newest = Newest(shown.source)
+    newest = NewestAvatar(shown.source)
     assert opened(shown, newest) is None
     data = train_on(shown, 3)
     for part in (data[: len(data) // 2], b"", data[:-1]):
@@ -64,7 +64,7 @@ def test_a_newer_avatar_is_opened_once_it_is_whole(shown: TrainedAvatar) -> None
 
 
 def test_an_avatar_of_another_video_is_not_taken_for_a_newer_one(shown: TrainedAvatar) -> None:
-    newest = Newest(shown.source)
+    newest = NewestAvatar(shown.source)
     train_on(replace(shown, recording=replace(shown.recording, data_hash="0" * 64)), 3)
     assert opened(shown, newest) is None
 
@@ -93,7 +93,7 @@ def test_the_viewer_shows_what_training_writes(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("avatar.commands.view.time", Namespace(sleep=sleep))
-        follow(viewer, Newest(shown.source), arguments)
+        follow(viewer, NewestAvatar(shown.source), arguments)
     until(lambda: viewer.renderer is not before)
     now = viewer.player.now()
     picture, old = (r.draw((now.params, now.camera), viewer.setting, WIDTH) for r in (viewer.renderer, before))

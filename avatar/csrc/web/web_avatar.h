@@ -4,7 +4,7 @@
 
 #include "splat/splat.h"
 
-// A trained avatar that only draws, on one thread: skinning, the latent network, folded HyperGaussians, composing and
+// A trained avatar that only draws, on one thread: skinning, the latent network, folded HyperGaussians, offsets and
 // splatting in one call. The formulas are those of avatar/head/model.py, gaussians/*.py and render.py; the splatter is the
 // program's own.
 namespace avatar::web {
@@ -82,7 +82,7 @@ public:
     // False when an index lies outside of what it points into.
     bool is_sound() const;
 
-    // Poses the head by `parameters()` and composes the Gaussians.
+    // Poses the head by `parameters()` and makes the Gaussians.
     void pose();
 
     // Draws what was posed into 8-bit RGBA [height * width * 4]. False when a value is not
