@@ -9,6 +9,7 @@ from avatar.errors import UserError
 from avatar.files.third_party import (
     FETCHED_LPIPS,
     LPIPS_FILES,
+    MATTING_FILES,
     PAGE_FILES,
     TRACKING_FILES,
     ThirdPartyFile,
@@ -32,7 +33,7 @@ def run_models(arguments: Namespace, say: Callable[[str], object] = print) -> in
         fetch_missing(say)
     folders = ", ".join(map(str, search_folders()))
     say(f"Looked for in {folders}; LPIPS also in {lpips_folder()}")
-    states = [describe(file, say) for file in (*TRACKING_FILES, *PAGE_FILES)] + [
+    states = [describe(file, say) for file in (*TRACKING_FILES, *MATTING_FILES, *PAGE_FILES)] + [
         describe_lpips(net, say) for net in NETS
     ]
     return OK if all(states) else MISSING

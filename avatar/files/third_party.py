@@ -61,6 +61,26 @@ SELFIE_MULTICLASS = ThirdPartyFile(
     "better mattes (track)",
     is_optional=True,
 )
+MODNET = ThirdPartyFile(
+    "modnet.onnx",
+    "https://huggingface.co/Xenova/modnet/resolve/fa2fa546052fba4c08921230a26cc69a333fca12/onnx/model.onnx",
+    "07c308cf0fc7e6e8b2065a12ed7fc07e1de8febb7dc7839d7b7f15dd66584df9",
+    25.9,
+    "Apache-2.0, Z. Ke",
+    "soft mattes (track)",
+    is_optional=True,
+)
+ROBUST_VIDEO_MATTING = ThirdPartyFile(
+    "rvm_mobilenetv3_fp32.onnx",
+    "https://github.com/PeterL1n/RobustVideoMatting/releases/download/v1.0.0/rvm_mobilenetv3_fp32.onnx",
+    "88d4531297118f595bf2fd60f6f566aec2e559393802d1f436c380f0cbbd2828",
+    15.0,
+    "GPL-3.0, ByteDance",
+    "soft and steady mattes (track)",
+    is_optional=True,
+)
+MATTING_FILES = (ROBUST_VIDEO_MATTING, MODNET)
+"""The best first; never downloaded: who wants one puts it there."""
 TASKS_VISION_VERSION = "0.10.21"
 TASKS_VISION = ThirdPartyFile(
     f"mediapipe-tasks-vision-{TASKS_VISION_VERSION}.tgz",

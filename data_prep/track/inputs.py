@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from avatar.files.third_party import FACE_LANDMARKER, SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find, sha256_of
+from avatar.files.third_party import FACE_LANDMARKER, sha256_of
 from avatar.head.assets import HeadAssets
 from data_prep.track.faces.embedding import official_file
 from data_prep.track.faces.rendered_embedding import RECIPE
 from data_prep.track.footage.source import Footage
+from data_prep.track.segmentation import matte_network
 from data_prep.track.stage_folder import hash_of
 
 STAGES_VERSION = 13  # raised when what a stage makes changes
@@ -17,7 +18,7 @@ STAGES_VERSION = 13  # raised when what a stage makes changes
 
 def tracking_key(footage: Footage, choices: dict[str, Any], head_path: Path, head: HeadAssets) -> str:
     """Of the whole tracking; `choices` are those of `Choices.to_json`."""
-    return hash_of([look_inputs(footage), choices, head_inputs(head_path, head), matte_network()])
+    return hash_of([look_inputs(footage), choices, head_inputs(head_path, head), matte_network().sha256])
 
 
 def look_inputs(footage: Footage) -> dict[str, Any]:
@@ -30,8 +31,3 @@ def head_inputs(head_path: Path, head: HeadAssets) -> dict[str, Any]:
     official = official_file(head_path)
     embedding = sha256_of(official) if official.is_file() else [RECIPE, FACE_LANDMARKER.sha256]
     return {"head": head.fingerprint, "names": head.names.to_dict(), "embedding": embedding}
-
-
-def matte_network() -> str:
-    """The hash of the network that mattes are made with."""
-    return (SELFIE_MULTICLASS if find(SELFIE_MULTICLASS) is not None else SELFIE_SEGMENTATION).sha256

@@ -1,39 +1,25 @@
-"""Foreground mattes: the person against the background, by a small published network and the colours at its edge.
+"""Sharp mattes from those of a segmentation network and the colours at the person's edge.
 
-`selfie_segmentation` gives the probability of the foreground at 256x256, of the picture and of its mirror image;
-`selfie_multiclass` is taken instead where its file is. The network knows where the person ends to a pixel of its own; it
-fills gaps, which a camera that stands still shows (`background_plate.py`). Within that, around the head, closed-form
-matting says what the colours say (neither a guided filter nor GrabCut did).
+The network knows where the person ends to a pixel of its own; it fills gaps, which a camera that stands still shows
+(`background_plate.py`). Within that, around the head, closed-form matting says what the colours say (neither a guided
+filter nor GrabCut did).
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
-from avatar.errors import UserError
-from avatar.files.third_party import SELFIE_MULTICLASS, SELFIE_SEGMENTATION, find, require
 from data_prep.track.background_plate import Plate, shown
 from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
 
-SIDE = 256  # of the networks' pictures
 _SURE = 0.05  # probability below which, and below 1 minus which, a pixel off the edge is left to the network
 _STEEPER = 1.5  # times, about a half: closed-form matting spreads an edge over more pixels than it covers
 # How far hair, ears and neck reach beyond the landmarks' box, of its longer side: above, beside, below.
 _ABOVE, _BESIDE, _BELOW = 0.75, 0.5, 0.6
-_LOADING = threading.Lock()
-"""Two loads at once find operators unsupported, or crash: OpenCV's table of them is filled by the first."""
-Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
-
-
-def open_matter() -> Matter:
-    """The best network that is there, as a function from a picture to its matte (0 to 255)."""
-    return _with_mirrored(_segmentation() if find(SELFIE_MULTICLASS) is None else _multiclass())
 
 
 def sharpened(
@@ -76,53 +62,3 @@ def _about_head(points: np.ndarray, height: int, width: int) -> UInt8[np.ndarray
     columns = np.clip([left - _BESIDE * side, right + _BESIDE * side], 0, width).astype(int)
     inside[rows[0] : rows[1], columns[0] : columns[1]] = 255
     return inside
-
-
-def _with_mirrored(matter: Matter) -> Matter:
-    """The mean of a picture's matte and its mirror image's, which errs less than either."""
-
-    def matte(image: np.ndarray) -> np.ndarray:
-        mirrored = matter(np.ascontiguousarray(image[:, ::-1]))[:, ::-1]
-        return cv2.addWeighted(matter(image), 0.5, mirrored, 0.5, 0.0)
-
-    return matte
-
-
-def _segmentation() -> Matter:
-    file = require(SELFIE_SEGMENTATION)
-    try:
-        with _LOADING:
-            net = cv2.dnn.readNetFromTFLite(str(file))
-    except cv2.error as error:
-        raise UserError(f"OpenCV cannot load {file} ({error.err}); fetch {SELFIE_SEGMENTATION.url} again") from None
-
-    def matte(image: np.ndarray) -> np.ndarray:
-        small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-        net.setInput(cv2.dnn.blobFromImage(small, 1 / 255.0))
-        return enlarged(net.forward().reshape(SIDE, SIDE), image.shape[1], image.shape[0])
-
-    return matte
-
-
-def _multiclass() -> Matter:
-    """Through MediaPipe's own runner, which knows the file's normalisation. Class 0 is the background."""
-    file = require(SELFIE_MULTICLASS)
-    from data_prep.track.faces.detect import load_mediapipe, quiet
-
-    mediapipe, vision, options = load_mediapipe()
-    settings = vision.ImageSegmenterOptions(base_options=options(file), output_confidence_masks=True)
-    with quiet():
-        segmenter = vision.ImageSegmenter.create_from_options(settings)
-
-    def matte(image: np.ndarray) -> np.ndarray:
-        small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-        found = segmenter.segment(mediapipe.Image(image_format=mediapipe.ImageFormat.SRGB, data=small))
-        background = np.asarray(found.confidence_masks[0].numpy_view(), np.float32).reshape(SIDE, SIDE)
-        return enlarged(1.0 - background, image.shape[1], image.shape[0])
-
-    return matte
-
-
-def enlarged(probability: Float32[np.ndarray, "h w"], width: int, height: int) -> UInt8[np.ndarray, "H W"]:
-    large = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.rint(np.clip(large, 0.0, 1.0) * 255.0).astype(np.uint8)

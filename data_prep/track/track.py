@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.third_party import MATTING_FILES
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import (
     FRAMES,
@@ -39,8 +40,9 @@ from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, View, check_span
 from data_prep.track.frames import in_view
-from data_prep.track.inputs import look_inputs, matte_network, tracking_key
+from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.quality import judge
+from data_prep.track.segmentation import matte_network
 from data_prep.track.stage_folder import StageFolder, growing
 from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
 from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
@@ -89,6 +91,8 @@ def track(
     mattes = None if choices.matte is None else open_mattes(choices.matte, footage)
     for note in mattes.notes if mattes else ():
         say(f"note: {note}")
+    if mattes is None and network in MATTING_FILES:
+        say(f"mattes by {network.name}")
     with growing(out) as stages, _interruptible(out, say):
         seen |= {"matte": options["matte"], "rotate": choices.rotate}
         turn, look = _look(stages, choices, footage, mattes, seen, progress)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.data.images import read_image, read_mask
+from avatar.files.third_party import MATTING_FILES, ThirdPartyFile
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.progress import Progress
@@ -31,14 +32,17 @@ from data_prep.track.frames import (
     write_despilled,
     write_frames,
     write_given_mattes,
+    write_image,
     write_masks,
 )
 from data_prep.track.inputs import head_inputs
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
-from data_prep.track.matting import open_matter, sharpened
+from data_prep.track.matting import sharpened
 from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.outline import Outline, measure_outline
 from data_prep.track.overlay import FrameParts, write_overlay
+from data_prep.track.segmentation import open_segmentation
+from data_prep.track.soft_mattes import open_matting
 from data_prep.track.stage_folder import StageFolder
 from data_prep.track.torso import LEAST_FOLLOWED, Picture, TorsoTracker, neck_of, with_torso
 from data_prep.track.user_mattes import OwnMattes
@@ -101,7 +105,7 @@ class TrackingStages:
         look: FirstPass,
         view: View,
         given: OwnMattes | None,
-        network: str,
+        network: ThirdPartyFile,
         frames_key: str,
         options: dict[str, Any],
     ) -> tuple[list[int], str]:
@@ -112,12 +116,17 @@ class TrackingStages:
             if given is not None:
                 span = self._choices.span
                 return {"without_face": write_given_mattes(folder, given, view, span, look, self._progress)}
+            if network in MATTING_FILES:
+                matte = open_matting(network)
+                for number in self._progress(numbers, len(numbers), "making mattes"):
+                    write_image(mask_file(folder, number), matte(self._image(number)), [])
+                return {"without_face": []}
             points = in_view(look.landmarks, view).points[:, :, :2]
             own = threading.local()  # a network is for one thread
 
             def by_network(number: int) -> tuple[np.ndarray, np.ndarray]:
                 if not hasattr(own, "matter"):
-                    own.matter = open_matter()
+                    own.matter = open_segmentation(network)
                 image = self._image(number)
                 return image, own.matter(image)
 
@@ -131,7 +140,7 @@ class TrackingStages:
             write_masks(folder, numbers, one, self._progress, "making mattes")
             return {"without_face": []}
 
-        inputs = {"frames": frames_key, "network": network, "given": options["matte"]}
+        inputs = {"frames": frames_key, "network": network.sha256, "given": options["matte"]}
         result, key = self._stages.run(MATTE, inputs, make)
         return result["without_face"], key
 
