@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -15,8 +11,8 @@ from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import make_room
 from avatar.demo.render import Renderer
 from data_prep.track import closed_form_matting
-from data_prep.track import matting as mattes
 from data_prep.track.closed_form_matting import band_radius, closed_form, within_limits
+from data_prep.track.matting import sharpened
 
 NOISE, TRUST = 3e-3, 1e-3
 
@@ -133,7 +129,7 @@ def test_a_networks_matte_becomes_sharp_around_the_head_alone() -> None:
     points = np.stack((mouth.min(0), mouth.max(0))).astype(float) + np.array(
         [[-40, -90], [40, 30]]
     )  # about a face's box
-    made = mattes.sharpened(image, coarse, points)
+    made = sharpened(image, coarse, points)
     head = cv2.dilate(picture.head, np.ones((9, 9), np.uint8)) > 0
 
     def error(matte: np.ndarray) -> float:
@@ -146,35 +142,6 @@ def test_a_networks_matte_becomes_sharp_around_the_head_alone() -> None:
     near[: int(bottom + 0.6 * side) + 1, max(0, int(left - 0.5 * side)) : int(right + 0.5 * side) + 1] = True
     np.testing.assert_array_equal(made[~near], coarse[~near])
     assert not near.all()
-    np.testing.assert_array_equal(mattes.sharpened(image, coarse, points), made)
-    np.testing.assert_array_equal(mattes.sharpened(image, coarse, points * np.nan), coarse)
-    np.testing.assert_array_equal(mattes.sharpened(image, coarse, points + 1e6), coarse)
-
-
-def test_the_mirror_image_has_a_say() -> None:
-    image = np.zeros((4, 6, 3), np.uint8)
-    image[:, 0] = 200
-
-    def leans_left(picture: np.ndarray) -> np.ndarray:
-        answer = picture[..., 0].copy()
-        answer[:, 1] = 100
-        return answer
-
-    row = mattes._with_mirrored(leans_left)(image)[0]
-    np.testing.assert_array_equal(row, [200, 50, 0, 0, 50, 0])
-
-
-def test_networks_are_loaded_one_after_another(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Two at once made OpenCV 5.0 find operators unsupported, or end the process."""
-    loading = []
-
-    def load(_: str) -> None:
-        loading.append(1)
-        time.sleep(0.05)
-        assert len(loading) == 1
-        loading.pop()
-
-    monkeypatch.setattr(mattes.cv2.dnn, "readNetFromTFLite", load)
-    monkeypatch.setattr(mattes, "require", lambda _: tmp_path / "network.tflite")
-    with ThreadPoolExecutor(4) as pool:
-        assert len(list(pool.map(lambda _: mattes._segmentation(), range(4)))) == 4
+    np.testing.assert_array_equal(sharpened(image, coarse, points), made)
+    np.testing.assert_array_equal(sharpened(image, coarse, points * np.nan), coarse)
+    np.testing.assert_array_equal(sharpened(image, coarse, points + 1e6), coarse)
