@@ -17,10 +17,12 @@ import time
 from pathlib import Path
 
 import numpy as np
+from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from measure_webcam import Record
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
+from avatar.head.model import matrix_from_6d
 from avatar.runs.clips import own_clip
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
@@ -28,7 +30,6 @@ from avatar.types import HeadParams
 from avatar.view.packets import BLENDSHAPES, LIVE_LINK, LIVE_LINK_VERSION
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
-from avatar.view.sender import encode_line
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.viewer import Viewer
 
@@ -61,6 +62,15 @@ class Arrivals(Receiver):
     def _take(self, params: HeadParams, is_departure: bool) -> None:
         super()._take(params, is_departure)
         self.arrived.append(self._taken)
+
+
+def encode_line(params: HeadParams) -> bytes:
+    """A frame as a line of JSON."""
+    jaw = rotation_matrix_to_axis_angle(matrix_from_6d(params.jaw)[None])[0]
+    eyes = rotation_matrix_to_axis_angle(matrix_from_6d(params.eyes.reshape(2, 6))).reshape(-1)
+    arrays = {"expression": params.expression, "jaw": jaw, "eyes": eyes, "eyelids": params.eyelids}
+    values = {name: [round(value, 6) for value in array.tolist()] for name, array in arrays.items()}
+    return json.dumps(values, allow_nan=False).encode() + b"\n"
 
 
 def live_link(values: dict[str, float]) -> bytes:

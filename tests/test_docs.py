@@ -22,7 +22,6 @@ COMMANDS = (
     "reenact",
     "export",
     "view",
-    "send",
     "drive-file",
     "report",
     "check",

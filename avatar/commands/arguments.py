@@ -89,8 +89,7 @@ def sort_bench(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
     arguments.inputs = sort_words(arguments)
     given, inputs = len(arguments.inputs), PARTS[arguments.part].inputs
     most = len(inputs.split())
-    fits = given >= 1 if inputs.endswith("...") else most - inputs.count("[") <= given <= most
-    if not fits:
+    if not most - inputs.count("[") <= given <= most:
         parser.error(f"bench {arguments.part} takes {inputs or 'no folder'}, {given} given")
 
 

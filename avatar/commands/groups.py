@@ -17,7 +17,6 @@ GROUPS = {
         "reenact": ("drive an avatar with another person's motion", "runs/me other.mp4 --out reenacted.mp4"),
         "export": ("write an avatar as a file to take away", "runs/me --out me.html"),
         "drive-file": ("write a tracked folder's motion as a drive file", "other --out other.npz"),
-        "send": ("replay a drive file to avatar view --stream", "other.npz 7000 --head flame/"),
     },
     "Several runs": {
         "report": ("write a run as one HTML page: figures, frames, curves, configuration", "runs/me"),

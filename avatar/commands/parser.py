@@ -15,7 +15,6 @@ from avatar.commands.options import (
     add_reading,
     add_run,
     add_source,
-    add_token,
     add_tracking,
 )
 from avatar.commands.page_options import add_create, add_export, add_view
@@ -186,12 +185,6 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     add_export(commands.add_parser("export"))
 
     add_view(commands.add_parser("view"))
-
-    send = commands.add_parser("send")
-    send.add_argument("drive", type=Path, metavar="FILE", help="drive file (.npz, .csv, .json)")
-    send.add_argument("port", type=int, metavar="PORT", help="of avatar view --stream on this machine")
-    send.add_argument("--head", type=Path, metavar="PATH", required=True, help="the avatar's head model")
-    add_token(send, "that of avatar view (default: $AVATAR_TOKEN)")
 
     drive_file = commands.add_parser("drive-file")
     add_source(drive_file)

@@ -30,7 +30,6 @@ def test_help_and_version_answer_for_every_command() -> None:
         "reenact",
         "export",
         "view",
-        "send",
         "drive-file",
         "report",
         "check",

@@ -132,7 +132,7 @@ REFUSED_PLACES = {
     ],
 }
 # These write only under names of their own in the run that they are given, or nothing.
-WITHOUT_A_CHOICE = {"eval", "report", "doctor", "models", "view", "send", "completion"}
+WITHOUT_A_CHOICE = {"eval", "report", "doctor", "models", "view", "completion"}
 CASES = [
     *((f"{words} --out {out}", sentence) for words, outputs in REFUSED.items() for out, sentence in outputs),
     *((f"{words} {out}", sentence) for words, outputs in REFUSED_PLACES.items() for out, sentence in outputs),

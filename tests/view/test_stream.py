@@ -7,23 +7,17 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from pathlib import Path
 
 import pytest
 import torch
 from stream_packets import live_link
 from waiting import until
 
-from avatar.commands.arguments import parse
-from avatar.commands.send import run_send
 from avatar.errors import UserError
-from avatar.motion.drive import Drive
-from avatar.motion.drive_file import write_drive
 from avatar.runs.trained import TrainedAvatar
 from avatar.view import receiver as receiver_module
 from avatar.view.packets import MAX_LINE, FrameReader
 from avatar.view.receiver import MAX_SENDERS, SHARE, Receiver, Throttle
-from avatar.view.sender import encode_line, send
 
 
 @pytest.fixture
@@ -196,33 +190,6 @@ def test_departures_begin_at_the_avatars_own_neutral_face(receiver: Receiver, na
         later, params, *_ = receiver.newest()  # type: ignore[misc]
         torch.testing.assert_close(params.expression, expected)
         assert later > number
-
-
-def test_a_drive_file_is_replayed(
-    receiver: Receiver,
-    named_avatar: TrainedAvatar,
-    tracked_folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    recording = named_avatar.recording
-    motion = recording.motion(range(5))
-    drive = Drive("x", 50.0, tuple("abcde"), motion, None, recording.identity)
-    write_drive(tmp_path / "x.npz", drive, named_avatar.assets.fingerprint)
-    words = ["send", str(tmp_path / "x.npz"), str(receiver.port), "--head", str(tracked_folder / "head_model")]
-    receiver._token = "a-token-that-is-long"
-    words += ["--token", receiver._token]
-    begin = time.monotonic()
-    assert run_send(parse(words)) == 0 and "5 frames" in capsys.readouterr().out
-    assert time.monotonic() - begin > 4 / 50, "at its own rate"
-    until(lambda: receiver.counts.received == 5)
-    last = receiver.newest()[1]  # type: ignore[index]
-    for name in ("expression", "jaw", "eyes", "eyelids"):
-        torch.testing.assert_close(getattr(last, name), getattr(motion[-1], name), atol=1e-5, rtol=0)
-    receiver.close()
-    with pytest.raises(UserError, match="does not take any more"):
-        send(drive, "127.0.0.1", receiver.port)
-    assert encode_line(motion[0]).endswith(b"}\n")
 
 
 def test_a_port_that_is_taken(receiver: Receiver, named_avatar: TrainedAvatar) -> None:
