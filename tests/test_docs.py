@@ -10,28 +10,10 @@ from pathlib import Path
 import pytest
 
 from avatar.commands.arguments import parse
+from avatar.commands.groups import GROUPS
 from avatar.config import load_config
 
-COMMANDS = (
-    "create",
-    "record",
-    "train",
-    "eval",
-    "refine",
-    "compare",
-    "reenact",
-    "export",
-    "view",
-    "drive-file",
-    "report",
-    "check",
-    "prepare",
-    "demo-data",
-    "demo",
-    "bench",
-    "track",
-    "models",
-)
+COMMANDS = [name for group in GROUPS.values() for name in group]
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 LINKING = sorted([*PAGES, *(ROOT / "docs" / "bench").glob("*.md")])

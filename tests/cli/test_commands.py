@@ -18,26 +18,13 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
+from avatar.commands.groups import GROUPS
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 
 
 def test_help_and_version_answer_for_every_command() -> None:
     overview = avatar("--help")
-    for command in (
-        "record",
-        "train",
-        "eval",
-        "reenact",
-        "export",
-        "view",
-        "drive-file",
-        "report",
-        "check",
-        "prepare",
-        "demo-data",
-        "demo",
-        "doctor",
-    ):
+    for command in (name for group in GROUPS.values() for name in group):
         assert command in overview
         assert "usage: avatar" in avatar(command, "--help")
     assert avatar("--version").startswith("avatar ")
