@@ -60,7 +60,7 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
         if nodes <= SLOW_NODES
         else (
             f"its network is evaluated at {nodes:,} places for every picture, which is slow in a browser; models with a "
-            "latent grid (fast, balanced) are not"
+            "latent grid are not"
         )
     )
     return WebPage(out, len(data), len(encoded.data), note)

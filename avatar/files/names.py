@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
+from typing import Any
 
 MAX_NAME_BYTES = 100  # in UTF-8; file systems take 255, and suffixes follow
 _FORBIDDEN = frozenset('/\\:*?"<>|')  # separators, and what Windows refuses
@@ -23,3 +25,9 @@ def shortened(name: str) -> str:
     if len(data) <= MAX_NAME_BYTES:
         return name
     return f"{data[: MAX_NAME_BYTES - 9].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
+
+
+def natural_order(name: str) -> tuple[Any, ...]:
+    """A key that sorts number 10 after number 9, padded or not."""
+    parts = re.split(r"([0-9]+)", name)
+    return tuple((int(part[:300]), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts if part)

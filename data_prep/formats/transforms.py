@@ -21,6 +21,7 @@ from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS
 from avatar.errors import UserError
 from avatar.files import opening
+from avatar.files.names import natural_order
 from data_prep.formats.frame_track import BadFrame, rigid_motion, vector
 
 SPLITS = ("train", "val", "test")
@@ -135,7 +136,7 @@ def _in_order(frames: dict[Path, ListedFrame]) -> list[ListedFrame]:
     for path, frame in frames.items():
         if frame.split is not None:
             first_use[path.parent] = min(first_use[path.parent], SPLITS.index(frame.split))
-    order = sorted(frames, key=lambda path: (first_use[path.parent], _natural(path)))
+    order = sorted(frames, key=lambda path: (first_use[path.parent], natural_order(str(path))))
     return [frames[path] for path in order]
 
 
@@ -166,12 +167,6 @@ def read_json(file: Path) -> Any:
         return opening.read_json(file, MAX_BYTES)
     except UserError as error:
         raise UserError(f"{error}; copy or export it again") from None
-
-
-def _natural(path: Path) -> tuple[Any, ...]:
-    """Sorts frame 10 after frame 9, padded or not."""
-    parts = re.split(r"([0-9]+)", str(path))
-    return tuple((int(part[:300]), "") if part.isdigit() and part.isascii() else (-1, part) for part in parts if part)
 
 
 def frame_rate(frames: Sequence[ListedFrame]) -> tuple[float | None, tuple[str, ...]]:

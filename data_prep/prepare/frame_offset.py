@@ -22,7 +22,7 @@ from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.image_motion import motion_residuals
 from data_prep.prepare.masks import read_masks
 from data_prep.prepare.misfit import judge_sample
-from data_prep.prepare.projection import filled_lips, project_head, region_faces, silhouette
+from data_prep.prepare.projection import filled_lips, lip_faces, project_head, silhouette
 
 RADIUS = 4  # offsets tried on each side; the outermost ones only serve to see that the best is a minimum
 SAMPLED_FRAMES = 120
@@ -73,7 +73,7 @@ def detect_offset(
             f"there are too few frames to find the offset between images and tracking ({len(images)} images, {len(tracks)} "
             f"tracking frames; {MIN_FRAMES} of each are needed); {GIVE_OFFSET}"
         )
-    lips = region_faces(head, "lips")
+    lips = lip_faces(head)
     use_head, use_mouth = bool(files.head_masks or files.alphas), bool(files.mouth_masks) and len(lips) > 0
     candidates = _candidates(list(images), list(tracks))
     sampled = _frames_with_motion(tracks, use_mouth or not use_head)

@@ -9,7 +9,7 @@ import numpy as np
 
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_track import FrameTrack
-from data_prep.prepare.projection import filled_lips, project_head, region_faces, silhouette
+from data_prep.prepare.projection import filled_lips, lip_faces, project_head, silhouette
 
 MEASURED_WIDTH = 256  # pixels; larger frames are measured at this size, distances are given in the frame's own pixels
 _ON = 127
@@ -52,7 +52,7 @@ class MeshProjector:
         self._head = head
         self._faces = head.faces.numpy()
         self._skin = self._faces[~np.isin(self._faces, neck).any(axis=1)]
-        self._lips = region_faces(head, "lips")
+        self._lips = lip_faces(head)
         on_neck = head.assets.weights[:, 0].numpy() > _OF_THE_NECK
         on_neck[neck] = True
         self._vertices = np.flatnonzero(~on_neck)

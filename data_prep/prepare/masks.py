@@ -14,7 +14,7 @@ from data_prep.formats import frame_files
 from data_prep.formats.face_parsing import HEAD, MOUTH, mask_of
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.frame_track import Tracking
-from data_prep.prepare.projection import filled_lips, project_head, region_faces
+from data_prep.prepare.projection import filled_lips, lip_faces, project_head
 
 
 def read_masks(files: FrameFiles, number: int) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -44,7 +44,7 @@ def derive_masks(
         for path, kind in ((record.head_mask, manifest.head_masks), (record.mouth_mask, manifest.mouth_masks)):
             if kind == "derived":
                 (building / str(path)).parent.mkdir()
-    lips = region_faces(model, "lips")
+    lips = lip_faces(model)
     for record, (image, number) in zip(manifest.frames, pairs, strict=True):
         head, mouth = read_masks(files, image) if image in files.parsing else (None, None)
         if manifest.head_masks == "derived" and head is not None:

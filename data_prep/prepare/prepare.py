@@ -31,7 +31,7 @@ from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.masks import derive_masks
 from data_prep.prepare.misfit import judge_sample, refuse_misplaced_cameras
 from data_prep.prepare.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
-from data_prep.prepare.projection import region_faces
+from data_prep.prepare.projection import lip_faces
 from data_prep.prepare.rig import FoundRig, Pose, find_rig
 from data_prep.prepare.still_parts import still_parts
 from data_prep.prepare.write_prepared import is_current, write_prepared
@@ -107,7 +107,7 @@ def prepare(
     refuse_dark_cameras(files, pairing.pairs, tracked.shots)
     evidence = f"{evidence}: {judgement.evidence}"
     say(evidence)
-    has_lips = len(region_faces(model, "lips")) > 0
+    has_lips = len(lip_faces(model)) > 0
     frames_split, split_notes = divide(tracked, [number for _, number in pairing.pairs], test_frames, test_cameras)
     ignored = [f"{judgement.problem}: taken regardless, as --ignore-misfit says"] if judgement.problem else []
     parts = still_parts(_of_one_camera(tracks, pairing, tracked.shots), head)

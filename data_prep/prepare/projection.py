@@ -49,10 +49,10 @@ def filled(mask: np.ndarray) -> np.ndarray:
     return cv2.drawContours(canvas, outlines, -1, 1, thickness=cv2.FILLED) > 0
 
 
-def region_faces(head: HeadModel, region: str) -> np.ndarray:
-    """Faces [F', 3] whose three vertices belong to the region; empty where the model does not have it."""
+def lip_faces(head: HeadModel) -> np.ndarray:
+    """Faces [F', 3] whose three vertices belong to the lips; empty where the model does not name them."""
     faces = head.faces.numpy()
-    members = head.assets.regions.get(region)
+    members = head.assets.regions.get("lips")
     if members is None:
         return faces[:0]
     return faces[np.isin(faces, members.numpy()).all(axis=1)]

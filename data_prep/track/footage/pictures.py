@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES, has_transparency, read_bytes, read_image
 from avatar.errors import UserError
+from avatar.files.names import natural_order
 from data_prep.track.footage.source import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque, stride
 from data_prep.track.footage.timing import DEFAULT_FPS
 from data_prep.track.footage.video import open_video
@@ -99,7 +98,7 @@ def open_pictures(folder: Path) -> PictureFolder:
         found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     except OSError as error:
         raise UserError(f"{folder} cannot be read ({error.strerror})") from None
-    files = tuple(sorted((p for p in found if not p.is_dir()), key=_natural))
+    files = tuple(sorted((p for p in found if not p.is_dir()), key=lambda path: natural_order(path.name)))
     if not files:
         inside = next((name for name in ("imgs", "frames", "images") if (folder / name).is_dir()), None)
         hint = f"; it looks like a tracked folder: give {folder / inside} to track its pictures again" if inside else ""
@@ -115,12 +114,6 @@ def open_pictures(folder: Path) -> PictureFolder:
     note = f"a folder of pictures has no frame rate: {DEFAULT_FPS:g} a second are assumed"
     duration = len(files) / DEFAULT_FPS
     return PictureFolder(folder, width, height, DEFAULT_FPS, duration, _focal_of(files[0]), (note,), files)
-
-
-def _natural(path: Path) -> tuple[Any, ...]:
-    """Sorts picture 10 after picture 9, padded or not."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return tuple((int(part[:300]), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts if part)
 
 
 def _focal_of(file: Path) -> float | None:
