@@ -131,7 +131,7 @@ def make_learner(
         frames = list(loader.frames(chosen))
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
     objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
-    corrections = make_pose_corrections(avatar, train, config.trainer)
+    corrections = make_pose_corrections(avatar, subject.recording.times(train), config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     state = TrainState(avatar, optimizer, objective, corrections)
     judge = Guard(optimizer, device).judge if is_gpu else None
