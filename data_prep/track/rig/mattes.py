@@ -1,0 +1,55 @@
+"""The mattes of one camera of a rig: head and neck without clothes, as VHAP's export has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from avatar.data.images import read_mask
+from avatar.head.assets import HeadAssets
+from data_prep.progress import Progress
+from data_prep.track.clip_mattes import clip_matter
+from data_prep.track.clothes import CLIP_FRAMES, learn_colours
+from data_prep.track.faces.embedding import LandmarkEmbedding
+from data_prep.track.frames import Read, mask_file, write_masks
+from data_prep.track.masks import head_mask, neck_ring
+from data_prep.track.neck_zones import Zones, zones_of
+
+
+class MatteClip(NamedTuple):
+    numbers: Sequence[int]  # of the frames
+    image: Read
+    screen: Callable[[int], np.ndarray]  # of a frame's number: the posed vertices [V, 3], in pixels
+
+
+def write_head_mattes(
+    folder: Path, clip: MatteClip, head: HeadAssets, embedding: LandmarkEmbedding, progress: Progress
+) -> None:
+    """Mattes that lie in `folder` are cut to the head; where there are none they are made."""
+    numbers, image, screen = clip
+    faces = head.faces.numpy()
+    ring = neck_ring(head.template.numpy(), faces)
+
+    def points(number: int) -> np.ndarray:
+        return np.einsum("lk,lkc->lc", embedding.barycentric, screen(number)[embedding.corners, :2])
+
+    person: Read
+    if mask_file(folder, numbers[0]).is_file():
+        person = lambda number: read_mask(mask_file(folder, number))  # noqa: E731
+    else:
+        person = clip_matter(numbers, image, points, progress)
+
+    def zones(number: int) -> Zones:
+        return zones_of(image(number), person(number), screen(number), faces, ring)
+
+    colours = learn_colours(map(zones, numbers[:: -(-len(numbers) // CLIP_FRAMES)]))
+
+    def one(number: int) -> np.ndarray:
+        picture, matte = image(number), person(number)
+        made = head_mask(picture, matte, zones_of(picture, matte, screen(number), faces, ring), colours)
+        return np.minimum(matte, made.mask)
+
+    write_masks(folder, numbers, one, progress, "making mattes")
