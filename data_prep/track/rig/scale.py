@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +21,9 @@ from data_prep.formats.frame_track import FrameTrack
 
 _STEPS = 30
 _FACING = 0.35  # cosine between a point's normal and the direction to a camera: with less it is hidden or guessed
-_OUTLIER = 2.0  # medians of the errors, at which an error counts half
+_OUTLIER = 2.0  # medians of the errors, at which the square of one counts half
 _ODD = 3.0  # times the median camera's error: a camera with more is left out
+MAX_ERROR = 0.03  # of the face's height: the median error above which the calibration is called wrong
 _NEAREST = 1e-3  # metres before a camera
 
 
@@ -44,7 +46,7 @@ class Points(NamedTuple):
 class Placement(NamedTuple):
     scale: float  # metres for one unit of the calibration
     shifts: Float[np.ndarray, "T 3"]  # of the head, metres in the front camera's axes
-    before: float  # median distance of projected and found landmarks, pixels, as tracked and calibrated
+    before: float  # pixels between projected and found landmarks, as tracked and calibrated: the median camera's median
     after: float
     cameras: tuple[str, ...]  # that were used
 
@@ -62,13 +64,24 @@ def place_head(points: Points, views: Mapping[str, View]) -> Placement:
             "distance: give cameras that see it from the front"
         )
     start = Placement(1.0, np.zeros((len(points.positions), 3)), 0.0, 0.0, ())
-    before, start = _error(points, seen, start), start._replace(scale=_first_scale(points, seen))
+    before, start = _median(_errors(points, seen, start)), start._replace(scale=_first_scale(points, seen))
     fit = _fitted(points, seen, start)
-    errors = {name: _error(points, {name: view}, fit) for name, view in seen.items()}
-    kept = {name: seen[name] for name, error in errors.items() if error <= _ODD * np.median([*errors.values()])}
+    errors = _errors(points, seen, fit)
+    kept = {name: seen[name] for name, error in errors.items() if error <= _ODD * _median(errors)}
     if 2 <= len(kept) < len(seen):
-        seen, fit = kept, _fitted(points, kept, start)
-    return fit._replace(before=before, after=_error(points, seen, fit), cameras=tuple(seen))
+        fit = _fitted(points, kept, start)
+    return fit._replace(before=before, after=_median(_errors(points, seen, fit)), cameras=tuple(kept))
+
+
+def refuse_misfit(placed: Placement, views: Mapping[str, View], folder: Path) -> None:
+    """Raises UserError where the landmarks do not agree after the fit."""
+    heights = [np.nanmedian(np.ptp(views[name].found[..., 1], axis=1)) for name in placed.cameras]
+    if not placed.after <= MAX_ERROR * np.median(heights):
+        raise UserError(
+            f"the calibration of {folder} does not fit the pictures: landmarks of the face are off by {placed.after:.1f} "
+            f"pixels in the median, which is more than {MAX_ERROR:.0%} of the face's height ({np.median(heights):.0f} "
+            "pixels); give the calibration of these videos"
+        )
 
 
 def _first_scale(points: Points, views: Mapping[str, View]) -> float:
@@ -99,8 +112,10 @@ def _fitted(points: Points, views: Mapping[str, View], fit: Placement) -> Placem
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     for _ in range(_STEPS):
         A, B, g, S, h = np.full(len(way), 1e-9), 0.0, 0.0, 0.0, 0.0
+        usual = float(np.clip(_OUTLIER * _median(_errors(points, views, fit)), 1e-9, 1e9))
         for view in views.values():
-            at, off, weights = _projected(points, view, fit)
+            at, off, is_used = _projected(points, view, fit)
+            weights = is_used / (1.0 + (off**2).sum(-1) / usual**2)
             by_depth = _slope(view, at, (way @ view.R.T)[:, None])
             by_scale = _slope(view, at, view.t)
             A, B = A + _sum(weights, by_depth, by_depth), B + _sum(weights, by_depth, by_scale)
@@ -124,20 +139,23 @@ def _slope(view: View, at: Float[np.ndarray, "T L 3"], along: np.ndarray) -> Flo
 
 
 def _projected(points: Points, view: View, fit: Placement) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """In the camera's axes [T, L, 3], the errors in pixels [T, L, 2], and their weights [T, L]; zero where hidden."""
+    """In the camera's axes [T, L, 3], the errors in pixels [T, L, 2], and which points are seen [T, L]."""
     at = (points.positions + fit.shifts[:, None]) @ view.R.T + fit.scale * view.t
     z = np.maximum(at[..., 2:], _NEAREST)
     off = view.intrinsics[:2] * at[..., :2] / z + view.intrinsics[2:] - view.found
     facing = -(points.normals @ view.R.T * at).sum(-1) / np.linalg.norm(at, axis=-1)
-    distance = np.linalg.norm(off, axis=-1)
-    is_used = np.isfinite(distance) & (facing > _FACING) & (at[..., 2] > _NEAREST)
-    usual = _OUTLIER * float(np.median(distance[is_used])) if is_used.any() else 1.0
-    weights = is_used / (1.0 + (np.where(is_used, distance, 0.0) / max(usual, 1e-9)) ** 2)
-    return at, np.where(is_used[..., None], off, 0.0), weights
+    is_used = np.isfinite(off).all(-1) & (facing > _FACING) & (at[..., 2] > _NEAREST)
+    return at, np.where(is_used[..., None], off, 0.0), is_used
 
 
-def _error(points: Points, views: Mapping[str, View], fit: Placement) -> float:
-    """Median distance in pixels over all cameras; infinite where nothing can be compared."""
-    projected = [_projected(points, view, fit)[1:] for view in views.values()]
-    every = np.concatenate([np.linalg.norm(off, axis=-1)[weights > 0] for off, weights in projected])
-    return float(np.median(every)) if len(every) else float("inf")
+def _errors(points: Points, views: Mapping[str, View], fit: Placement) -> dict[str, float]:
+    """Each camera's median distance in pixels; infinite where nothing can be compared."""
+    errors = {}
+    for name, view in views.items():
+        _, off, is_used = _projected(points, view, fit)
+        errors[name] = float(np.median(np.linalg.norm(off, axis=-1)[is_used])) if is_used.any() else np.inf
+    return errors
+
+
+def _median(errors: Mapping[str, float]) -> float:
+    return float(np.median([*errors.values()]))

@@ -35,14 +35,13 @@ from data_prep.track.rig.listing import IMAGES, MATTES, lens_in, write_listing, 
 from data_prep.track.rig.look import Times, find_front, looked_at, write_mattes, write_pictures
 from data_prep.track.rig.mattes import MatteClip, write_head_mattes
 from data_prep.track.rig.recording import MAX_DIFFERENCE, Camera, Recording
-from data_prep.track.rig.scale import Placement, Points, View, place_head
+from data_prep.track.rig.scale import Points, View, place_head, refuse_misfit
 from data_prep.track.stage_folder import StageFolder, growing, hash_of
 from data_prep.track.track import track
 from data_prep.track.tracking_stages import Choices
 
 DEFAULT_SIZE = 802  # pixels of the longer side, as GaussianAvatars' data set has
 FRONT, WHOLE = "front", Span()
-MAX_ERROR = 0.03  # of the face's height: the median error of landmarks above which a calibration is called wrong
 _LANDMARKS = 120  # of which the scale is found; the others say the same
 
 
@@ -81,11 +80,13 @@ def track_rig(
         tracks = {n: track for n, track in tracks.items() if all(n in found for found, _ in looks.values())}
         views = {s: rig.view(s, [found[n] for n in tracks], len(embedding)) for s, (found, _) in looks.items()}
         placed = place_head(_points(_model(head, tracks), tracks, embedding), views)
+        unused = ", ".join(serial for serial in views if serial not in placed.cameras)
         say(
             f"the calibration is scaled by {placed.scale:.4g}, by landmarks in {len(placed.cameras)} of {len(views)} "
-            f"cameras; their median error falls from {placed.before:.1f} to {placed.after:.1f} pixels"
+            f"cameras{f' (not {unused})' if unused else ''}; their median error falls from "
+            f"{placed.before:.1f} to {placed.after:.1f} pixels"
         )
-        _refuse_calibration(placed, {s: views[s] for s in placed.cameras}, folder)
+        refuse_misfit(placed, views, folder)
         tracks = {n: placed.moved(row, track) for row, (n, track) in enumerate(tracks.items())}
         times = times._replace(numbers=list(tracks))
         for serial in opened.cameras:
@@ -206,16 +207,6 @@ def _refuse_gaps(opened: Recording, counts: Mapping[str, int], wanted: int) -> N
     short = min(counts, key=counts.__getitem__)
     if counts[short] < wanted - MAX_DIFFERENCE:
         raise UserError(
-            f"{opened.cameras[short].footage.path} has pictures at {counts[short]} of the {wanted} times of the front camera: "
-            "it is damaged or has another rate; copy it again, or convert all cameras to one rate"
-        )
-
-
-def _refuse_calibration(placed: Placement, views: Mapping[str, View], folder: Path) -> None:
-    height = float(np.median([np.nanmedian(np.ptp(view.found[..., 1], axis=1)) for view in views.values()]))
-    if not placed.after < MAX_ERROR * height:
-        raise UserError(
-            f"the calibration of {folder} does not fit the pictures: landmarks of the face are off by {placed.after:.1f} "
-            f"pixels in the median, and more than {MAX_ERROR:.0%} of the face's height ({height:.0f} pixels) are not "
-            "accepted; give the calibration of these videos"
+            f"{opened.cameras[short].footage.path} has pictures at {counts[short]} of the {wanted} times of the front "
+            "camera: it is damaged or has another rate; copy it again, or convert all cameras to one rate"
         )

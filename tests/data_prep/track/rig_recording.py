@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,7 +23,12 @@ def entries(truth: Path) -> list[Entry]:
 
 
 def serial(entry: Entry) -> str:
-    return f"2222000{entry['camera_index']:02d}"
+    return serial_of(entry["camera_id"])
+
+
+def serial_of(camera: str) -> str:
+    """cam_03 -> 222200003"""
+    return f"2222000{camera[-2:]}"
 
 
 def world_to_camera(entry: Entry, unit: float) -> np.ndarray:
@@ -76,4 +81,52 @@ def write_gha(truth: Path, folder: Path, unit: float, times: int | None = None) 
         np.savez(
             folder / "cameras" / f"{time:04d}" / f"camera_{serial(entry)}.npz", extrinsic=pose, intrinsic=lens(entry)
         )
+    return folder
+
+
+class Filmed(NamedTuple):
+    pose: np.ndarray  # [4, 4] world to camera
+    K: np.ndarray
+    greys: list[int]  # of its pictures
+
+
+def _filmed(index: int) -> Filmed:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.array([0.1, 0.3 * index, 0.0]))[0], (0.1 * index, 0.2, 1.0)
+    K = np.array([[150.0 + index, 0, 30], [0, 151.0, 34], [0, 0, 1]])
+    return Filmed(pose, K, [40 * n + 10 * index + 30 for n in range(4)])
+
+
+FILMED = {name: _filmed(index) for index, name in enumerate(("220700191", "222200037", "222200046"))}
+"""Cameras whose pictures are of one grey each."""
+
+
+def _plain(grey: int) -> np.ndarray:
+    return np.full((64, 64, 3), grey, np.uint8)
+
+
+def write_plain_raw(root: Path, frames: int = 4) -> Path:
+    sequence = root / "person" / "sequences" / "EXP-1"
+    (sequence / "images").mkdir(parents=True)
+    for name, one in FILMED.items():
+        encode(sequence / "images" / f"cam_{name}.mp4", [_plain(grey) for grey in one.greys[:frames]])
+    (root / "person" / "calibration").mkdir()
+    calibration = {
+        "world_2_cam": {name: one.pose.tolist() for name, one in FILMED.items()},
+        "intrinsics": {name: one.K.tolist() for name, one in FILMED.items()},
+    }
+    (root / "person" / "calibration" / "camera_params.json").write_text(json.dumps(calibration))
+    return sequence
+
+
+def write_plain_gha(folder: Path) -> Path:
+    for time in range(4):
+        images, cameras = (folder / kind / f"{time:04d}" for kind in ("images", "cameras"))
+        images.mkdir(parents=True)
+        cameras.mkdir(parents=True)
+        for name, one in FILMED.items():
+            assert cv2.imwrite(str(images / f"image_{name}.jpg"), _plain(one.greys[time]))
+            assert cv2.imwrite(str(images / f"image_lowres_{name}.jpg"), _plain(0))
+            assert cv2.imwrite(str(images / f"mask_{name}.jpg"), _plain(255))
+            np.savez(cameras / f"camera_{name}.npz", extrinsic=one.pose[:3], intrinsic=one.K)
     return folder
