@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import read_mask
+from avatar.data.images import read_image, read_mask
 from avatar.head.assets import HeadAssets
+from avatar.head.model import HeadModel
+from data_prep.formats.avatar_track import FRAMES, MATTE
+from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.projection import project_head
 from data_prep.progress import Progress
 from data_prep.track.clip_mattes import clip_matter
-from data_prep.track.clothes import CLIP_FRAMES, learn_colours
+from data_prep.track.clothes import CLIP_FRAMES, Colours, learn_colours
 from data_prep.track.faces.embedding import LandmarkEmbedding
-from data_prep.track.frames import Read, mask_file, write_masks
+from data_prep.track.frames import Read, frame_file, mask_file, write_masks
 from data_prep.track.masks import head_mask, neck_ring
 from data_prep.track.neck_zones import Zones, zones_of
 
@@ -25,8 +29,27 @@ class MatteClip(NamedTuple):
     screen: Callable[[int], np.ndarray]  # of a frame's number: the posed vertices [V, 3], in pixels
 
 
+def front_colours(folder: Path, tracks: Mapping[int, FrameTrack], model: HeadModel) -> Colours | None:
+    """The colours of clothes, skin and hair, in the front camera's tracked folder: from aside less of them is sure."""
+    faces = model.faces.numpy()
+    ring = neck_ring(model.assets.template.numpy(), faces)
+
+    def zones(number: int) -> Zones:
+        image, track = read_image(frame_file(folder / FRAMES, number)), tracks[number]
+        screen = project_head(model, track, track.intrinsics, *track.size)
+        return zones_of(image, read_mask(mask_file(folder / MATTE, number)), screen, faces, ring)
+
+    numbers = list(tracks)
+    return learn_colours(map(zones, numbers[:: -(-len(numbers) // CLIP_FRAMES)]))
+
+
 def write_head_mattes(
-    folder: Path, clip: MatteClip, head: HeadAssets, embedding: LandmarkEmbedding, progress: Progress
+    folder: Path,
+    clip: MatteClip,
+    head: HeadAssets,
+    colours: Colours | None,
+    embedding: LandmarkEmbedding,
+    progress: Progress,
 ) -> None:
     """Mattes that lie in `folder` are cut to the head; where there are none they are made."""
     numbers, image, screen = clip
@@ -41,11 +64,6 @@ def write_head_mattes(
         person = lambda number: read_mask(mask_file(folder, number))  # noqa: E731
     else:
         person = clip_matter(numbers, image, points, progress)
-
-    def zones(number: int) -> Zones:
-        return zones_of(image(number), person(number), screen(number), faces, ring)
-
-    colours = learn_colours(map(zones, numbers[:: -(-len(numbers) // CLIP_FRAMES)]))
 
     def one(number: int) -> np.ndarray:
         picture, matte = image(number), person(number)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from avatar.data.images import read_image
 from avatar.errors import UserError
@@ -25,6 +26,7 @@ from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.projection import head_params, project_head
 from data_prep.prepare.rig import Pose
 from data_prep.progress import Progress, silent
+from data_prep.track.clothes import Colours
 from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.fit.fitting import find_embedding
 from data_prep.track.footage.source import MIN_SIDE, Span, whole
@@ -33,7 +35,7 @@ from data_prep.track.inputs import look_inputs, matte_network, tracking_key
 from data_prep.track.rig import gha_folder, recording
 from data_prep.track.rig.listing import IMAGES, MATTES, lens_in, write_listing, write_parameters
 from data_prep.track.rig.look import Times, find_front, looked_at, write_mattes, write_pictures
-from data_prep.track.rig.mattes import MatteClip, write_head_mattes
+from data_prep.track.rig.mattes import MatteClip, front_colours, write_head_mattes
 from data_prep.track.rig.recording import MAX_DIFFERENCE, Camera, Recording
 from data_prep.track.rig.scale import Points, View, place_head, refuse_misfit
 from data_prep.track.stage_folder import StageFolder, growing, hash_of
@@ -79,7 +81,9 @@ def track_rig(
         _refuse_gaps(opened, {serial: len(found) for serial, (found, _) in looks.items()}, len(tracks))
         tracks = {n: track for n, track in tracks.items() if all(n in found for found, _ in looks.values())}
         views = {s: rig.view(s, [found[n] for n in tracks], len(embedding)) for s, (found, _) in looks.items()}
-        placed = place_head(_points(_model(head, tracks), tracks, embedding), views)
+        model = _model(head, tracks)
+        points = _points(model, tracks, embedding)
+        placed = place_head(points, views)
         unused = ", ".join(serial for serial in views if serial not in placed.cameras)
         say(
             f"the calibration is scaled by {placed.scale:.4g}, by landmarks in {len(placed.cameras)} of {len(views)} "
@@ -87,10 +91,11 @@ def track_rig(
             f"{placed.before:.1f} to {placed.after:.1f} pixels"
         )
         refuse_misfit(placed, views, folder)
-        tracks = {n: placed.moved(row, track) for row, (n, track) in enumerate(tracks.items())}
+        colours = front_colours(stages.path / FRONT, tracks, model)
+        tracks = {n: placed.moved(row, track, points.centres[row]) for row, (n, track) in enumerate(tracks.items())}
         times = times._replace(numbers=list(tracks))
         for serial in opened.cameras:
-            rig.mattes(serial, tracks, placed.scale, times, embedding, looks[serial][1], progress)
+            rig.mattes(serial, tracks, placed.scale, times, colours, embedding, looks[serial][1], progress)
         rig.write(tracks, placed.scale, times.fps)
         stages.finish(out, ())
     say(f"tracked {len(tracks)} times of {len(opened.cameras)} cameras in {out}")
@@ -148,8 +153,8 @@ class _Rig:
         return View(away.R, away.t, lens_in(self._cameras[serial], self._views[serial]), points)
 
     def mattes(
-        self, serial: str, tracks: Mapping[int, FrameTrack], scale: float, times: Times, embedding: LandmarkEmbedding,
-        key: str, progress: Progress,
+        self, serial: str, tracks: Mapping[int, FrameTrack], scale: float, times: Times, colours: Colours | None,
+        embedding: LandmarkEmbedding, key: str, progress: Progress,
     ) -> None:  # fmt: skip
         camera, view, model = self._cameras[serial], self._views[serial], _model(self._head, tracks)
         lens, images = lens_in(camera, view), self._stages.path / IMAGES / serial
@@ -165,7 +170,7 @@ class _Rig:
             if camera.mattes is not None:
                 write_mattes(folder, camera.mattes, view, times)
             clip = MatteClip(times.numbers, lambda n: read_image(frame_file(images, n)), screen)
-            write_head_mattes(folder, clip, self._head, embedding, progress)
+            write_head_mattes(folder, clip, self._head, colours, embedding, progress)
             return {}
 
         given = camera.mattes and camera.mattes.content_hash
@@ -193,14 +198,15 @@ def _model(head: HeadAssets, tracks: Mapping[int, FrameTrack]) -> HeadModel:
 
 
 def _points(model: HeadModel, tracks: Mapping[int, FrameTrack], embedding: LandmarkEmbedding) -> Points:
-    positions, normals = [], []
-    for one in tracks.values():
-        vertices = model.vertices(head_params(one))
-        for values, into in ((vertices, positions), (vertex_normals(vertices, model.faces), normals)):
-            corners = values.double().numpy()[embedding.corners]
-            into.append(np.einsum("lk,lkc->lc", embedding.barycentric, corners) @ one.R.T)
-        positions[-1] += one.t
-    return Points(np.stack(positions), np.stack(normals))
+    def on(values: Tensor) -> np.ndarray:
+        return np.einsum("lk,lkc->lc", embedding.barycentric, values.double().numpy()[embedding.corners])
+
+    posed = [model.vertices(head_params(one)) for one in tracks.values()]
+    positions = np.stack([on(vertices) for vertices in posed])
+    normals = np.stack([on(vertex_normals(vertices, model.faces)) for vertices in posed])
+    turns, means = np.stack([one.R for one in tracks.values()]), positions.mean(1)
+    centres = np.stack([R @ mean + one.t for R, mean, one in zip(turns, means, tracks.values(), strict=True)])
+    return Points(positions - means[:, None], normals, turns, centres)
 
 
 def _refuse_gaps(opened: Recording, counts: Mapping[str, int], wanted: int) -> None:

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from avatar.errors import UserError
+from data_prep.formats.frame_track import FrameTrack
 from data_prep.track.rig.scale import Points, View, place_head, refuse_misfit
 
 T, L = 5, 60
 LENS = np.array([900.0, 910.0, 250.0, 240.0])
 CENTRE = np.array([0.0, 0.0, 1.0])  # metres before the front camera
 DEPTHS = np.array([0.03, -0.02, 0.0, 0.04, -0.05])  # by which the tracking is wrong
+TURN = cv2.Rodrigues(np.array([0.06, -0.02, 0.01]))[0]  # by which it is wrong at all times
 AZIMUTHS = {"front": 0.0, "left": -40.0, "right": 30.0, "far": 55.0}
 
 
@@ -25,8 +27,14 @@ def head() -> Points:
     normals[:, 2] = -np.abs(normals[:, 2])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     turns = np.stack([cv2.Rodrigues(np.array([0.1 * n, 0.2 - 0.1 * n, 0.05]))[0] for n in range(T)])
-    turned = normals @ turns.transpose(0, 2, 1)
-    return Points(0.09 * turned + CENTRE + 0.02 * rng.normal(size=(T, 1, 3)), turned)
+    own = 0.09 * (normals - normals.mean(0))
+    centres = CENTRE + 0.02 * rng.normal(size=(T, 3))
+    return Points(np.tile(own, (T, 1, 1)), np.tile(normals, (T, 1, 1)), turns, centres)
+
+
+def before_front(points: Points) -> np.ndarray:
+    """[T, L, 3] in the front camera's axes."""
+    return points.positions @ points.turns.transpose(0, 2, 1) + points.centres[:, None]
 
 
 def filmed(points: Points, unit: float, names: tuple[str, ...] = tuple(AZIMUTHS)) -> dict[str, View]:
@@ -35,16 +43,16 @@ def filmed(points: Points, unit: float, names: tuple[str, ...] = tuple(AZIMUTHS)
     for name in names:
         R = cv2.Rodrigues(np.array([0.05, np.radians(AZIMUTHS[name]), 0.1]) * (name != "front"))[0]
         t = CENTRE - R @ CENTRE
-        at = points.positions @ R.T + t
+        at = before_front(points) @ R.T + t
         views[name] = View(R, t / unit, LENS, LENS[:2] * at[..., :2] / at[..., 2:] + LENS[2:])
     return views
 
 
-def tracked(points: Points, larger: float = 1.0) -> Points:
-    """As one camera places them: at wrong depths, and of the wrong size, which it cannot see."""
-    way = points.positions.mean(1)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    return points._replace(positions=larger * points.positions + (DEPTHS[:, None] * way)[:, None])
+def tracked(points: Points, larger: float = 1.0, turn: np.ndarray = TURN) -> Points:
+    """As one camera places them: at wrong depths, turned, and of the wrong size, which it cannot see."""
+    way = points.centres / np.linalg.norm(points.centres, axis=1, keepdims=True)
+    moved = larger * points.centres + DEPTHS[:, None] * way
+    return Points(larger * points.positions, points.normals, points.turns @ turn, moved)
 
 
 @pytest.mark.parametrize(("unit", "larger"), [(1.0, 1.0), (0.001, 1.0), (1.07, 0.97)])
@@ -52,8 +60,13 @@ def test_scale_and_depths_come_back(unit: float, larger: float) -> None:
     truth = head()
     found = place_head(tracked(truth, larger), filmed(truth, unit))
     assert found.scale == pytest.approx(unit * larger, rel=1e-4)
-    given = tracked(truth, larger).positions + found.shifts[:, None]
-    assert np.abs(given - larger * truth.positions).max() < 1e-4
+    given = tracked(truth, larger)
+    poses = {name: np.zeros(2) for name in ("expression", "jaw", "eyes", "eyelids", "neck", "shape", "intrinsics")}
+    for row in range(T):
+        track = FrameTrack(**poses, R=given.turns[row], t=given.centres[row], size=(1, 1))
+        moved = found.moved(row, track, given.centres[row])
+        assert np.allclose(moved.R, truth.turns[row], atol=1e-4)
+        assert np.allclose(moved.t, larger * truth.centres[row], atol=1e-4)
     assert found.before > 5 and found.after < 0.05 and found.cameras == tuple(AZIMUTHS)
 
 
