@@ -52,7 +52,10 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     track = commands.add_parser("track")
     track.add_argument(
-        "video", type=Path, metavar="VIDEO", help="a video, or a folder of numbered PNG or JPEG pictures"
+        "video",
+        type=Path,
+        metavar="VIDEO",
+        help="a video, a folder of numbered PNG or JPEG pictures, or several calibrated cameras",
     )
     add_head(track)
     track.add_argument("--out", type=Path, required=True, metavar="SUBJECT", help="the tracked folder to write")
@@ -73,7 +76,12 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
         metavar="auto|none|X,Y,W,H",
         help="what is kept of the turned picture (default: the head)",
     )
-    track.add_argument("--size", type=int, metavar="S", help="longer side of the frames in pixels (default: 512)")
+    track.add_argument(
+        "--size",
+        type=int,
+        metavar="S",
+        help="longer side of the frames in pixels (default: 512; of several cameras 802)",
+    )
     track.add_argument("--start", type=float, metavar="S", help="seconds, of the part of the video that is used")
     track.add_argument("--end", type=float, metavar="S", help="seconds")
     track.add_argument(

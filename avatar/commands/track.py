@@ -1,15 +1,18 @@
-"""avatar track: a video in, a tracked folder out."""
+"""avatar track: a video in, or a recording by several cameras, and a tracked folder out."""
 
 from __future__ import annotations
 
 from argparse import Namespace
+from pathlib import Path
 
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.track import bar, head_for_video
 from data_prep.track.crop import parse_crop
 from data_prep.track.footage.source import Span
+from data_prep.track.rig import track_rig
 from data_prep.track.track import Choices, track
 
 
@@ -17,10 +20,13 @@ def run_track(arguments: Namespace) -> int:
     check_folder_output(arguments.out)
     check_outputs([arguments.out], [arguments.video, arguments.matte, arguments.head])
     head = head_for_video(arguments.video, arguments.head)
+    span = Span(arguments.start or 0.0, arguments.end)
+    if track_rig.recognise(arguments.video):
+        return _track_rig(arguments, head, span)
     choices = Choices(
         crop=parse_crop(arguments.crop),
         size=arguments.size,
-        span=Span(arguments.start or 0.0, arguments.end),
+        span=span,
         focal=arguments.focal,
         field_of_view=arguments.fov,
         matte=arguments.matte,
@@ -29,4 +35,19 @@ def run_track(arguments: Namespace) -> int:
     track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=bar)
     print(f"Look at  {arguments.out / 'overlay'}")
     print(f"Next     avatar train {arguments.out}")
+    return OK
+
+
+def _track_rig(arguments: Namespace, head: Path, span: Span) -> int:
+    given = arguments.focal, arguments.fov, arguments.rotate, arguments.matte
+    if any(value is not None for value in given) or arguments.crop != "auto":
+        raise UserError(
+            f"{arguments.video} is a recording by several calibrated cameras, whose whole pictures are taken as they are: "
+            "leave out --focal, --fov, --rotate, --crop and --matte"
+        )
+    track_rig.track_rig(
+        arguments.video, arguments.out, head, load_head_assets(head), arguments.size, span, progress=bar
+    )
+    print(f"Look at  {arguments.out / 'front' / 'overlay'}")
+    print(f"Next     avatar train {arguments.out} --head {head}")
     return OK

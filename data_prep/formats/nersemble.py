@@ -99,17 +99,17 @@ def _read_sequences(folder: Path) -> tuple[list[Sequence], list[str]]:
     found: list[Sequence] = []
     untracked, unfilmed = [], []
     for place in sorted(path for path in (folder / SEQUENCES).iterdir() if path.is_dir()):
-        tracking, videos = find_tracking(place), _videos(place / "images")
+        tracking, videos = find_tracking(place), camera_videos(place / "images")
         if tracking is None:
             untracked.append(place.name)
         elif not videos:
             unfilmed.append(place.name)
         else:
-            found.append(Sequence(place, read_tracking(tracking), videos, _videos(place / "alpha_maps")))
+            found.append(Sequence(place, read_tracking(tracking), videos, camera_videos(place / "alpha_maps")))
     if not found:
         raise UserError(
-            f"no sequence in {folder / SEQUENCES} has images/cam_SERIAL.mp4 and tracking/{FILES[0]}; NeRSemble's "
-            "recordings themselves have no tracking by FLAME: download the benchmark's mono_flame_avatar"
+            f"no sequence in {folder / SEQUENCES} has images/cam_SERIAL.mp4 and tracking/{FILES[0]}; track a "
+            "sequence first (avatar track ID/sequences/SEQ), or download the benchmark's mono_flame_avatar"
         )
     notes = [
         f"sequences without {what} are left out: {', '.join(names)}"
@@ -121,7 +121,7 @@ def _read_sequences(folder: Path) -> tuple[list[Sequence], list[str]]:
     return found, notes
 
 
-def _videos(folder: Path) -> dict[str, Path]:
+def camera_videos(folder: Path) -> dict[str, Path]:
     """cam_SERIAL.mp4 by serial. Raises UserError for an .mp4 file of another name, as of a repeated download."""
     videos: dict[str, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:

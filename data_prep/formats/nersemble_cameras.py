@@ -30,10 +30,7 @@ def read_cameras(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str
     Raises UserError for a serial that is not calibrated, and for values that no camera has.
     """
     path = folder / CALIBRATION
-    raw = _read(path)
-    poses, lenses = (raw.get(key) for key in ("world_2_cam", "intrinsics")) if isinstance(raw, dict) else (None, None)
-    if not isinstance(poses, dict) or lenses is None:
-        raise UserError(f"{path} lacks world_2_cam or intrinsics; download it again")
+    poses, lenses = _poses_and_lenses(path)
     cameras: dict[str, CalibratedCamera] = {}
     for serial, (width, height) in sizes.items():
         lens = lenses.get(serial) if isinstance(lenses, dict) else lenses  # one for all
@@ -57,6 +54,19 @@ def read_cameras(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str
             )
         cameras[serial] = camera
     return cameras
+
+
+def read_serials(folder: Path) -> set[str]:
+    """Of the cameras that are calibrated."""
+    return set(_poses_and_lenses(folder / CALIBRATION)[0])
+
+
+def _poses_and_lenses(path: Path) -> tuple[dict[str, Any], Any]:
+    raw = _read(path)
+    poses, lenses = (raw.get(key) for key in ("world_2_cam", "intrinsics")) if isinstance(raw, dict) else (None, None)
+    if not isinstance(poses, dict) or lenses is None:
+        raise UserError(f"{path} lacks world_2_cam or intrinsics; download it again")
+    return poses, lenses
 
 
 def _read(path: Path) -> Any:

@@ -9,7 +9,8 @@ An entry has `transform_matrix` (the camera in the world, OpenGL axes) and intri
 `cx`, `cy`, `w`, `h`, or `camera_angle_x`); `cy` is counted from the bottom of the picture. `camera_id` or `camera_index`
 says which camera. A parameter file has `translation`, `rotation`, `neck_pose`, `jaw_pose` [3], `eyes_pose` [6] as rotation
 vectors, `expr`, `shape` and perhaps `static_offset` [V, 3], whatever further axes of length 1. There are no eyelids: they
-are zero. The static offset moves the root joint; else it is not used: the Gaussians learn where they belong.
+are zero, except where `avatar track` adds `eyelids` [2]. The static offset moves the root joint; else it is not used: the
+Gaussians learn where they belong.
 
 A UNION folder holds listings alone, of frames in the sequences' folders beside it (`../SEQUENCE/images/...`). Each of these
 has a world of its own and may have an identity of its own; that of the first frame is used for all.
@@ -127,7 +128,7 @@ def _read_frame(
         expression=expression,
         jaw=six_d(values("jaw_pose", 3)),
         eyes=six_d(values("eyes_pose", 6)),
-        eyelids=np.zeros(2),
+        eyelids=values("eyelids", 2) if "eyelids" in raw else np.zeros(2),
         neck=six_d(neck_pose),
         R=R,
         t=t,

@@ -71,7 +71,7 @@ class StageFolder:
             for name, other in (better or {}).items():
                 shutil.rmtree(self.path / other)
                 (self.path / name).rename(self.path / other)
-            for record in self.path.glob(f"*/{RECORD}"):
+            for record in self.path.rglob(RECORD):
                 record.unlink()
             (self.path / LOCK_FILE).unlink(missing_ok=True)
             seal(self.path)
@@ -90,9 +90,9 @@ def growing(target: Path) -> Iterator[StageFolder]:
         try:
             yield StageFolder(folder)
         except BaseException:
-            for unfinished in folder.glob("*.partial"):
+            for unfinished in [*folder.rglob("*.partial")]:
                 shutil.rmtree(unfinished, ignore_errors=True)
-            if next(folder.glob(f"*/{RECORD}"), None) is None:  # there is nothing to go on from
+            if next(folder.rglob(RECORD), None) is None:  # there is nothing to go on from
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 

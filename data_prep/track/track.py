@@ -57,7 +57,7 @@ LYING, GIVEN = "since the head lies in them (--rotate 0 leaves them)", "as --rot
 
 
 def track(
-    video: Path,
+    video: Path | Footage,
     out: Path,
     head_path: Path,
     head: HeadAssets,
@@ -74,8 +74,8 @@ def track(
     its name.
     """
     choices = choices or Choices()
-    footage = open_footage(video)
-    say(f"{video}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
+    footage = video if isinstance(video, Footage) else open_footage(video)
+    say(f"{footage.path}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
     for note in footage.notes:
         say(f"note: {note}")
     for note in head.notes:
@@ -113,7 +113,7 @@ def track(
         for note in outline_notes:
             say(f"note: {note}")
         notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
-        fit = work.fit(landmarks, _camera(focal, view, footage), head_path, [frames_key, matte_key])
+        fit = work.fit(landmarks, _camera(focal, view, footage, choices), head_path, [frames_key, matte_key])
         overlaps, outline = work.masks(landmarks, fit)
         fit = work.torso(fit)
         work.overlay(fit, look)
@@ -125,13 +125,13 @@ def track(
             fps=look.landmarks.fps,
             width=view.width,
             height=view.height,
-            intrinsics=_camera(focal, view, footage),
+            intrinsics=_camera(focal, view, footage, choices),
             focal=focal.source,
             focal_is_assumed=focal.is_assumed,
             head_path=str(head_path.resolve()),
             head_fingerprint=head.fingerprint,
             source={
-                "video": video.name,
+                "video": footage.path.name,
                 "sha256": footage.content_hash,
                 "key": key,
                 "turned": turn,
@@ -182,10 +182,10 @@ def _look(
     return raw["turn"], from_json(raw, load_landmarks(stages.path / "look" / LANDMARKS_FILE))
 
 
-def _camera(focal: Focal, view: View, footage: Footage) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of the view; the principal point is the middle of the source picture."""
-    centre = view.to_view(footage.width / 2, footage.height / 2)
-    return focal.pixels * view.width / view.box.width, focal.pixels * view.height / view.box.height, *centre
+def _camera(focal: Focal, view: View, footage: Footage, choices: Choices) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of the view; the principal point is the middle of the source picture, or calibrated."""
+    fx, fy, *centre = choices.camera or (focal.pixels, focal.pixels, footage.width / 2, footage.height / 2)
+    return fx * view.width / view.box.width, fy * view.height / view.box.height, *view.to_view(*centre)
 
 
 def _left_out(look: FirstPass) -> dict[int, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -10,11 +9,12 @@ from typing import Any, Literal
 import numpy as np
 
 from avatar.data.images import read_image, read_mask
-from avatar.files.third_party import MATTING_FILES, ThirdPartyFile
+from avatar.files.third_party import ThirdPartyFile
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.progress import Progress
-from data_prep.track import background_plate, despill
+from data_prep.track import despill
+from data_prep.track.clip_mattes import write_mattes
 from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
@@ -32,17 +32,13 @@ from data_prep.track.frames import (
     write_despilled,
     write_frames,
     write_given_mattes,
-    write_image,
     write_masks,
 )
 from data_prep.track.inputs import head_inputs
 from data_prep.track.masks import head_mask, mouth_mask, neck_ring
-from data_prep.track.matting import sharpened
 from data_prep.track.neck_zones import Zones, zones_of
 from data_prep.track.outline import Outline, measure_outline
 from data_prep.track.overlay import FrameParts, write_overlay
-from data_prep.track.segmentation import open_segmentation
-from data_prep.track.soft_mattes import open_matting
 from data_prep.track.stage_folder import StageFolder
 from data_prep.track.torso import LEAST_FOLLOWED, Picture, TorsoTracker, neck_of, with_torso
 from data_prep.track.user_mattes import OwnMattes
@@ -61,12 +57,14 @@ class Choices:
     field_of_view: float | None = None  # degrees across the video's width
     matte: Path | None = None  # the user's own: a folder or a video of all pictures
     rotate: int | None = None  # degrees clockwise by which the pictures are turned first; None: as the faces ask for
+    camera: tuple[float, float, float, float] | None = None  # calibrated fx, fy, cx, cy in pixels of the video
 
     def to_json(self) -> dict[str, Any]:
         crop = self.crop if isinstance(self.crop, str) else list(self.crop)
         matte = None if self.matte is None else open_footage(self.matte).content_hash
         return {"crop": crop, "size": self.size, "span": list(self.span), "focal": self.focal,
-                "field_of_view": self.field_of_view, "matte": matte, "rotate": self.rotate}  # fmt: skip
+                "field_of_view": self.field_of_view, "matte": matte, "rotate": self.rotate,
+                "camera": self.camera and list(self.camera)}  # fmt: skip
 
 
 class TrackingStages:
@@ -90,6 +88,8 @@ class TrackingStages:
         points = look.landmarks.points[look.landmarks.detected]
         size = self._footage.width, self._footage.height
         view = choose_view(self._choices.crop, self._choices.size, *size, points)
+        if self._choices.camera is not None:
+            return view, Focal(self._choices.camera[0], "from the calibration", False)
         given = self._choices.focal, self._choices.field_of_view, self._footage.equivalent_focal
         return view, choose_focal(*size, points, *given)
 
@@ -116,28 +116,8 @@ class TrackingStages:
             if given is not None:
                 span = self._choices.span
                 return {"without_face": write_given_mattes(folder, given, view, span, look, self._progress)}
-            if network in MATTING_FILES:
-                matte = open_matting(network)
-                for number in self._progress(numbers, len(numbers), "making mattes"):
-                    write_image(mask_file(folder, number), matte(self._image(number)), [])
-                return {"without_face": []}
             points = in_view(look.landmarks, view).points[:, :, :2]
-            own = threading.local()  # a network is for one thread
-
-            def by_network(number: int) -> tuple[np.ndarray, np.ndarray]:
-                if not hasattr(own, "matter"):
-                    own.matter = open_segmentation(network)
-                image = self._image(number)
-                return image, own.matter(image)
-
-            of_clip = numbers[:: -(-len(numbers) // background_plate.CLIP_FRAMES)]
-            seen = ahead(of_clip, by_network, self._progress, "looking at the background")
-            behind = background_plate.learn_plate(pair for _, pair in seen)
-
-            def one(number: int) -> np.ndarray:
-                return sharpened(*by_network(number), points[number], behind)
-
-            write_masks(folder, numbers, one, self._progress, "making mattes")
+            write_mattes(folder, numbers, self._image, points.__getitem__, network, self._progress)
             return {"without_face": []}
 
         inputs = {"frames": frames_key, "network": network.sha256, "given": options["matte"]}

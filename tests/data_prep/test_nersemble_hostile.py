@@ -136,7 +136,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a recording without tracking": (
         lambda f: [shutil.rmtree(path) for path in f.glob("sequences/*/tracking")],
-        "no tracking by FLAME: download the benchmark's mono_flame_avatar",
+        "track a sequence first .*, or download the benchmark's mono_flame_avatar",
     ),
 }
 

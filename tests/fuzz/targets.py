@@ -16,6 +16,7 @@ from exports import write_imavatar, write_insta, write_vhap
 from nersemble_folder import HEIGHT, TRAINED, WIDTH, write_person
 from nha_folder import write_nha
 from own_targets import make_own_targets
+from rig_recording import write_plain_gha
 from scipy import sparse
 from small_runs import run_info
 from target import Reader, Target, member, of_copy, on_disk, with_member
@@ -44,6 +45,7 @@ from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras
 from data_prep.formats.obj_mesh import read_mesh
 from data_prep.formats.root_pose import Joint
 from data_prep.prepare.prepare import prepare
+from data_prep.track.rig.gha_folder import read_calibration
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
 
@@ -152,6 +154,8 @@ def make_targets(place: Path) -> dict[str, Target]:
     of_nha = write_nha(place / "nha", 6)
     nha_tracking, nha_split = next(of_nha.glob(nha.TRACKED)), of_nha / nha.SPLIT
 
+    of_gha = next(write_plain_gha(place / "gha").rglob("camera_*.npz")).read_bytes()
+
     own = place / "own"
     own.mkdir()
     return {
@@ -181,6 +185,12 @@ def make_targets(place: Path) -> dict[str, Target]:
         ),
         "INSTA mesh": Target([(model / "head_template.obj").read_bytes()], on_disk(place / "m.obj", mesh), 0.25),
         "NHA tracking": Target([nha_tracking.read_bytes()], of_copy(place, nha_tracking, of_nha, listed), 0.5),
+        "GaussianHeadAvatar camera": Target(
+            [member(of_gha, "extrinsic.npy"), member(of_gha, "intrinsic.npy")],
+            on_disk(place / "camera.npz", read_calibration),
+            0.5,
+            lambda d: with_member(of_gha, "intrinsic.npy" if len(d) < 210 else "extrinsic.npy", d),
+        ),
         "NHA split": Target([nha_split.read_bytes()], of_copy(place, nha_split, of_nha, listed), 0.5),
         "manifest": Target([manifest.read_bytes()], of_copy(place, manifest, prepared, first_frame), 2),
         "tracks": Target([tracks.read_bytes()], of_copy(place, tracks, prepared, first_frame)),

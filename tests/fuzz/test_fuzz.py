@@ -40,7 +40,8 @@ SECONDS = 5.0  # for one file of a few kilobytes, on a busy machine
 NAMES = (
     "pickle", "torch", "torch, checksums right", ".frame", "npz", "npz, checksums right", "VHAP listing",
     "INSTA listing", "IMavatar listing", "NeRSemble calibration", "NeRSemble tracking",
-    "NeRSemble tracking, checksums right", "INSTA mesh", "NHA tracking", "NHA split",
+    "NeRSemble tracking, checksums right", "INSTA mesh", "NHA tracking", "GaussianHeadAvatar camera",
+    "NHA split",
     "manifest", "tracks", "checkpoint", "run.json", "UV obj", "head model",
     "regions", "eyelid", "image", "protocol", "drive .npz", "drive .npz, checksums right",
     "drive .csv", "Live Link Face", "drive .json", "override", "avatar file", "avatar file, its text",

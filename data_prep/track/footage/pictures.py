@@ -108,12 +108,17 @@ def open_pictures(folder: Path) -> PictureFolder:
         raise UserError(f"{folder} holds no PNG or JPEG pictures{hint or ' and is not a video'}")
     if len(files) > _MAX_PICTURES:
         raise UserError(f"{folder} holds {len(files)} pictures; more than {_MAX_PICTURES} are not read")
+    return footage_of(folder, files)
+
+
+def footage_of(path: Path, files: tuple[Path, ...]) -> PictureFolder:
+    """Pictures in the order of their times; `path` names them."""
     first = read_image(files[0])
     height, width = first.shape[:2]
     check_size(files[0], width, height)
     note = f"a folder of pictures has no frame rate: {DEFAULT_FPS:g} a second are assumed"
     duration = len(files) / DEFAULT_FPS
-    return PictureFolder(folder, width, height, DEFAULT_FPS, duration, _focal_of(files[0]), (note,), files)
+    return PictureFolder(path, width, height, DEFAULT_FPS, duration, _focal_of(files[0]), (note,), files)
 
 
 def _focal_of(file: Path) -> float | None:

@@ -1,0 +1,82 @@
+"""A recording by several calibrated cameras without any tracking, and the two layouts that are read.
+
+NeRSemble's own, of one sequence; the calibration lies two folders above it:
+
+    ID/calibration/camera_params.json         poses (world to camera, OpenCV's axes); intrinsics, for all or by serial
+    ID/sequences/SEQ/images/cam_SERIAL.mp4    FOLDER is ID/sequences/SEQ
+
+What GaussianHeadAvatar's preprocessing makes (`gha_folder.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from avatar.errors import UserError
+from data_prep.ffmpeg import count_pictures
+from data_prep.formats.nersemble import TRAINED_CAMERA, camera_videos
+from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras, read_serials
+from data_prep.track.footage.source import Footage
+from data_prep.track.footage.video import open_video
+
+MAX_DIFFERENCE = 2  # pictures, in length; of more, one is not whole
+
+
+@dataclass(frozen=True)
+class Camera:
+    footage: Footage
+    R: np.ndarray  # [3, 3] from the world to the camera, OpenCV's axes
+    t: np.ndarray  # [3] in the calibration's unit
+    intrinsics: np.ndarray  # [4] = fx, fy, cx, cy in pixels of the pictures
+    mattes: Footage | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    folder: Path
+    cameras: dict[str, Camera]  # by serial
+    front: str | None  # the camera before the face, where that is known
+
+
+def recognise(folder: Path) -> bool:
+    return next((folder / "images").glob("cam_*.mp4"), None) is not None
+
+
+def open_recording(folder: Path) -> Recording:
+    """Raises UserError without a calibration, and where videos and calibration do not belong together."""
+    videos = camera_videos(folder / "images")
+    person = folder.resolve().parent.parent
+    if not (person / CALIBRATION).is_file():
+        raise UserError(
+            f"{folder} has videos of {len(videos)} cameras, but there is no {person / CALIBRATION}; give "
+            "ID/sequences/SEQUENCE of a folder ID that has its calibration"
+        )
+    refuse_unpaired(set(videos), read_serials(person), person / CALIBRATION)
+    footage = {serial: open_video(path) for serial, path in videos.items()}
+    counts = {serial: count_pictures(path, "v:0") for serial, path in videos.items()}
+    refuse_lengths({videos[serial]: count for serial, count in counts.items()})
+    calibrated = read_cameras(person, {serial: (one.width, one.height) for serial, one in footage.items()})
+    cameras = {serial: Camera(footage[serial], *calibrated[serial][:3]) for serial in videos}
+    return Recording(folder, cameras, TRAINED_CAMERA if TRAINED_CAMERA in cameras else None)
+
+
+def refuse_unpaired(filmed: set[str], calibrated: set[str], calibration: Path) -> None:
+    for serials, what in (
+        (filmed - calibrated, "has pictures, but nothing in {}; calibrate it, or remove its pictures"),
+        (calibrated - filmed, "is in {}, but has no pictures; copy them, or remove it from there"),
+    ):
+        if serials:
+            raise UserError(f"camera {min(serials)} {what.format(calibration)}")
+
+
+def refuse_lengths(counts: dict[Path, int]) -> None:
+    """Raises UserError where the numbers of pictures differ by more than MAX_DIFFERENCE; else the common ones are used."""
+    short, long = min(counts, key=counts.__getitem__), max(counts, key=counts.__getitem__)
+    if counts[long] - counts[short] > MAX_DIFFERENCE:
+        raise UserError(
+            f"{short} has {counts[short]} pictures, but {long} has {counts[long]}; copy the shorter one again, or cut all "
+            "cameras alike"
+        )

@@ -1,0 +1,206 @@
+"""Recordings by several cameras: what is read of the two layouts, and one sentence for each thing that is wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rig_recording import FILMED, write_plain_gha, write_plain_raw
+
+from avatar.cli import main
+from avatar.errors import UserError
+from data_prep.track.footage.source import Span, whole
+from data_prep.track.rig import gha_folder, recording, track_rig
+from data_prep.track.rig.recording import Recording
+
+SERIALS = list(FILMED)
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_plain_raw(tmp_path_factory.mktemp("raw"))
+
+
+@pytest.fixture(scope="module")
+def gha(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_plain_gha(tmp_path_factory.mktemp("gha") / "someone")
+
+
+def same(opened: Recording) -> None:
+    """The cameras of FILMED, and their four pictures."""
+    assert list(opened.cameras) == SERIALS
+    for serial, camera in opened.cameras.items():
+        wanted = FILMED[serial]
+        assert np.allclose(camera.R, wanted.pose[:3, :3], atol=1e-6) and np.allclose(camera.t, wanted.pose[:3, 3])
+        assert np.allclose(camera.intrinsics, [wanted.K[0, 0], wanted.K[1, 1], wanted.K[0, 2], wanted.K[1, 2]])
+        footage = camera.footage
+        grey = [p.image.mean() for p in footage.read(whole(footage.width, footage.height), Span(), lambda _: None)]
+        assert np.abs(np.array(grey) - wanted.greys).max() < 3
+
+
+def test_nersemble(raw: Path, tmp_path: Path) -> None:
+    assert track_rig.recognise(raw) and not track_rig.recognise(raw.parent)
+    same(recording.open_recording(raw))
+    assert recording.open_recording(raw).front == "222200037"
+
+
+def test_nersemble_with_one_lens_for_all(raw: Path, tmp_path: Path) -> None:
+    K = FILMED[SERIALS[0]].K.tolist()
+    folder = changed(raw, tmp_path, lambda content: content.update(intrinsics=K))
+    assert {camera.intrinsics[0] for camera in recording.open_recording(folder).cameras.values()} == {K[0][0]}
+
+
+def test_gaussian_head_avatar(gha: Path) -> None:
+    assert track_rig.recognise(gha)
+    opened = gha_folder.open_recording(gha)
+    same(opened)
+    mattes = opened.cameras[SERIALS[0]].mattes
+    assert opened.front is None and mattes is not None
+    first = next(mattes.read(whole(mattes.width, mattes.height), Span(), lambda _: None))
+    assert first.image.min() > 250
+
+
+def test_gaussian_head_avatar_without_all_masks(gha: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(gha, tmp_path / "someone"))
+    (folder / "images" / "0001" / f"mask_{SERIALS[0]}.jpg").unlink()
+    assert [c.mattes is None for c in gha_folder.open_recording(folder).cameras.values()] == [True, False, False]
+
+
+def test_a_picture_less_is_let_pass(gha: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(gha, tmp_path / "someone"))
+    (folder / "images" / "0001" / f"image_{SERIALS[0]}.jpg").unlink()
+    cameras = gha_folder.open_recording(folder).cameras.values()
+    assert {camera.footage.duration for camera in cameras} == {3 / 25}
+
+
+def changed(raw: Path, root: Path, edit: Callable[[dict[str, Any]], object]) -> Path:
+    """A copy with another calibration."""
+    shutil.copytree(raw.parent.parent, root / "person")
+    path = root / "person" / "calibration" / "camera_params.json"
+    content = json.loads(path.read_text())
+    edit(content)
+    path.write_text(json.dumps(content))
+    return root / "person" / "sequences" / raw.name
+
+
+def without_calibration(folder: Path) -> None:
+    shutil.rmtree(folder.parent.parent / "calibration")
+
+
+def without_video(folder: Path) -> None:
+    (folder / "images" / f"cam_{SERIALS[0]}.mp4").unlink()
+
+
+def shorter(folder: Path) -> None:
+    write_plain_raw(folder.parent / "short", frames=1)
+    short = next((folder.parent / "short").rglob(f"cam_{SERIALS[1]}.mp4"))
+    shutil.copy(short, folder / "images")
+
+
+def damaged(folder: Path) -> None:
+    path = folder / "images" / f"cam_{SERIALS[1]}.mp4"
+    path.write_bytes(path.read_bytes()[:-300])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (
+            without_calibration,
+            "has videos of 3 cameras, but there is no .*camera_params.json; give ID/sequences/SEQUENCE",
+        ),
+        (without_video, f"camera {SERIALS[0]} is in .*camera_params.json, but has no pictures"),
+        (shorter, f"cam_{SERIALS[1]}.mp4 has 1 pictures, but .*.mp4 has 4"),
+        (damaged, f"cam_{SERIALS[1]}.mp4 is cut short"),
+    ],
+)
+def test_folders_of_nersemble_that_are_refused(
+    raw: Path, tmp_path: Path, spoil: Callable[[Path], None], said: str
+) -> None:
+    folder = changed(raw, tmp_path, lambda _: None)
+    spoil(folder)
+    with pytest.raises(UserError, match=said):
+        recording.open_recording(folder)
+
+
+def drop(content: dict[str, Any]) -> None:
+    del content["world_2_cam"][SERIALS[2]]
+
+
+def mirror(content: dict[str, Any]) -> None:
+    content["world_2_cam"][SERIALS[1]][0] = [-x for x in content["world_2_cam"][SERIALS[1]][0]]
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (drop, f"camera {SERIALS[2]} has pictures, but nothing in .*camera_params.json"),
+        (mirror, f"camera {SERIALS[1]}: world_2_cam is not a rotation"),
+        (lambda content: content["intrinsics"].pop(SERIALS[0]), f"has nothing on camera {SERIALS[0]}"),
+        (lambda content: content.clear(), "lacks world_2_cam or intrinsics"),
+    ],
+)
+def test_calibrations_that_are_refused(
+    raw: Path, tmp_path: Path, edit: Callable[[dict[str, Any]], object], said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        recording.open_recording(changed(raw, tmp_path, edit))
+
+
+def write_camera(folder: Path, time: str = "0000", **arrays: np.ndarray) -> None:
+    wanted = FILMED[SERIALS[0]]
+    values: dict[str, Any] = {"extrinsic": wanted.pose[:3], "intrinsic": wanted.K} | arrays
+    np.savez(folder / "cameras" / time / f"camera_{SERIALS[0]}.npz", **values)
+
+
+def thin_out(folder: Path) -> None:
+    for time in ("0000", "0001", "0002"):
+        (folder / "images" / time / f"image_{SERIALS[0]}.jpg").unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: shutil.rmtree(folder / "cameras"), "has pictures of several cameras, but no cameras/0000/"),
+        (
+            lambda folder: (folder / "cameras" / "0000" / f"camera_{SERIALS[0]}.npz").unlink(),
+            f"camera {SERIALS[0]} has pictures, but nothing in .*cameras/0000",
+        ),
+        (thin_out, f"image_{SERIALS[0]}.jpg has 1 pictures, but .* has 4"),
+        (lambda folder: write_camera(folder, extrinsic=np.eye(3)), "npz: extrinsic has 9 values, not 12"),
+        (lambda folder: write_camera(folder, intrinsic=-np.eye(3)), "npz: intrinsic is not of the form"),
+        (lambda folder: write_camera(folder, "0003", extrinsic=np.eye(4)[:3]), "moves between"),
+        (
+            lambda folder: (folder / "images" / "0002" / f"image_{SERIALS[0]}.jpg").write_bytes(b"no picture"),
+            "is neither a JPEG nor a PNG",
+        ),
+    ],
+)
+def test_folders_of_gaussian_head_avatar_that_are_refused(
+    gha: Path, tmp_path: Path, spoil: Callable[[Path], object], said: str
+) -> None:
+    folder = Path(shutil.copytree(gha, tmp_path / "someone"))
+    spoil(folder)
+    with pytest.raises(UserError, match=said):
+        for camera in gha_folder.open_recording(folder).cameras.values():
+            list(camera.footage.read(whole(64, 64), Span(), lambda _: None))
+
+
+def test_the_command_refuses_what_is_for_one_camera(
+    raw: Path, tmp_path: Path, demo_head_model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["track", str(raw), "--out", str(tmp_path / "out"), "--head", str(demo_head_model)]
+    for more, said in (
+        (["--focal", "900"], "leave out --focal"),
+        (["--crop", "none"], "leave out --focal"),
+        (["--size", "8"], "--size must be from 64 to 4096"),
+    ):
+        assert main([*given, *more]) != 0 and said in capsys.readouterr().err
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a").touch()
+    assert main(given) != 0 and "is not empty" in capsys.readouterr().err
