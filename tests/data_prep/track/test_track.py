@@ -119,7 +119,7 @@ def test_an_interrupted_run_goes_on(
     assert [path.name for path in tmp_path.iterdir()] == [".me.partial"]
     with monkeypatch.context() as patch:
         patch.setattr("data_prep.track.track.look_at", never)
-        for stage in ("write_frames", "open_matter", "fit_tracks"):
+        for stage in ("write_frames", "write_mattes", "fit_tracks"):
             patch.setattr(tracking_stages, stage, never)
         assert main(command) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["me"]
