@@ -30,7 +30,7 @@ from avatar.files.third_party import (
     ThirdPartyFile,
     sha256_of,
 )
-from data_prep.track import segmentation, tracking_stages
+from data_prep.track import clip_mattes, segmentation
 from data_prep.track import track as tracking
 from data_prep.track.segmentation import matte_network
 from data_prep.track.soft_mattes import open_matting
@@ -149,7 +149,7 @@ def test_the_command_lists_them_and_fetches_none(
 def test_tracking_gives_the_frames_in_order(
     rvm: ThirdPartyFile, with_marks: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (tracking, tracking_stages, segmentation):
+    for module in (tracking, clip_mattes, segmentation):
         monkeypatch.setattr(module, "MATTING_FILES", (rvm,))
     frames = [picture(n % 5) + np.uint8(4 * n) * (picture(n % 5) == 90) for n in range(12)]
     video = encode(tmp_path / "v.mkv", frames, options=LOSSLESS)
