@@ -27,7 +27,7 @@ from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
-from avatar.pipeline.refine_plan import WITH_REFINEMENT, round_steps
+from avatar.pipeline.refine_plan import round_steps
 from avatar.pose_refinement.refine import refine_subject
 from avatar.runs.model_registry import make_avatar
 from avatar.train.objective import choose_perceptual
@@ -52,9 +52,7 @@ class Row:
 
 def run(request: Request) -> None:
     (folder,) = request.inputs
-    config = load_config(
-        [*WITH_REFINEMENT, *(QUICK if request.quick else ()), "trainer.checkpoint_every=1000000", *request.overrides]
-    )
+    config = load_config([*(QUICK if request.quick else ()), "trainer.checkpoint_every=1000000", *request.overrides])
     source = Source(folder, find_head(folder, request.head), request.tracking, request.frame_offset)
     rows = measure(source, config, request.out)
     content = {

@@ -32,7 +32,6 @@ from avatar.demo.subject import make_subject
 from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
-from avatar.pipeline.refine_plan import WITH_REFINEMENT
 from avatar.pipeline.track import bar
 from avatar.train.order import planned_steps
 from data_prep.formats.avatar_track import LANDMARKS_FILE
@@ -83,7 +82,6 @@ def run(request: Request) -> None:
     of_demo = (f"data.size={scale.size}", f"trainer.iterations={scale.iterations}")
     config = load_config(
         [
-            *WITH_REFINEMENT,
             *(() if request.inputs and not request.quick else of_demo),
             "trainer.checkpoint_every=1000000",
             *(("model.uv_size=24", "model.mlp_width=24") if request.quick else ()),

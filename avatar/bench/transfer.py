@@ -38,7 +38,6 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
-from avatar.pipeline.refine_plan import WITH_REFINEMENT
 from avatar.types import Camera, HeadParams
 from data_prep.prepare.open import open_subject
 
@@ -91,7 +90,6 @@ def measure(scale: Scale, out: Path, overrides: Sequence[str] = (), full: bool =
     config = load_config(
         [
             "experiment=demo",
-            *WITH_REFINEMENT,
             f"data.size={scale.size}",
             f"trainer.iterations={scale.iterations}",
             *overrides,

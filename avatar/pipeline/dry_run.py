@@ -11,7 +11,7 @@ from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.refine_plan import WITH_REFINEMENT, round_steps
+from avatar.pipeline.refine_plan import round_steps
 from avatar.pipeline.train import new_avatar, on_subject
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.runs.checkpoint import KEPT
@@ -28,7 +28,7 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
 
     Raises UserError as training does, before its first step.
     """
-    config = load_config([*(WITH_REFINEMENT if rounds else ()), *overrides])
+    config = load_config(overrides)
     chosen = choose_device(device or config.device, print)
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
     check_divided(subject.split)

@@ -25,8 +25,6 @@ from avatar.train.order import within_epochs
 from data_prep.prepare.open import open_subject
 
 ROUNDS_FOLDER = "rounds"
-# Training between rounds of refinement, which moves every frame and farther; before the user's own overrides.
-WITH_REFINEMENT = ("trainer.pose_rate=0", "trainer.condition_noise=0")
 PLAN_FORMAT = 1
 LEAST_STEPS = 500  # fewer make no avatar
 # A round trains for a few passes over the training frames: with more, the avatar overfits the errors of each frame's
@@ -95,11 +93,11 @@ class Plan:
         """Of the run itself."""
         asked = load_config(self.overrides).trainer.iterations
         limit = [] if self.iterations == asked else [f"trainer.iterations={self.iterations}"]
-        return [*WITH_REFINEMENT, *self.overrides, *limit]
+        return [*self.overrides, *limit]
 
     def round_overrides(self) -> list[str]:
         """Of the avatars that are only refined through."""
-        return [*WITH_REFINEMENT, *self.overrides, f"trainer.iterations={self.round_iterations}"]
+        return [*self.overrides, f"trainer.iterations={self.round_iterations}"]
 
 
 def _whole(value: object) -> int:
@@ -141,7 +139,7 @@ def steps_in_time(
 
     Raises UserError where they allow too few.
     """
-    config = load_config([*WITH_REFINEMENT, *overrides])
+    config = load_config(overrides)
     subject, assets = open_subject(source, config.data.test_frames, print)
     subject.refuse_several_cameras("--refine")
     frames = len(subject.split.train)
