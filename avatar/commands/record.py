@@ -49,7 +49,7 @@ def run_record(arguments: Namespace) -> int:
         raise UserError(f"{out} exists already; give another name, or remove it")
     check_file(out, SUFFIXES, "a film")
     screen, seen, wrong = Screen(), list[Seen](), Counter[str]()
-    with interruption() as interrupted, FaceDetector() as detector:
+    with interruption(second_acts=False) as interrupted, FaceDetector() as detector:
         film = Film(open_source(arguments.webcam, FILMED))
         with closing(Newest(film)) as newest:
             screen.say(

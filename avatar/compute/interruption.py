@@ -11,8 +11,10 @@ from typing import Any
 
 
 @contextmanager
-def interruption() -> Iterator[Callable[[], bool]]:
+def interruption(second_acts: bool = True) -> Iterator[Callable[[], bool]]:
     """Turn the first Ctrl-C or SIGTERM into a flag that the loop reads between steps; a second one acts at once.
+
+    Without `second_acts` it sets the flag again: for work that takes no more than moments to complete.
 
     A signal that is ignored (a job in the background of a shell, nohup) stays ignored, and outside the main thread the
     signals are somebody else's.
@@ -23,7 +25,8 @@ def interruption() -> Iterator[Callable[[], bool]]:
     def note(number: int, _: FrameType | None) -> None:
         nonlocal caught
         caught = True
-        signal.signal(number, previous[number])
+        if second_acts:
+            signal.signal(number, previous[number])
 
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -182,6 +182,14 @@ def test_a_second_interruption_acts_at_once() -> None:
 
 
 @pytest.mark.usefixtures("ctrl_c_works")
+def test_a_second_interruption_need_not_act() -> None:
+    with interruption(second_acts=False) as interrupted:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert interrupted()
+
+
+@pytest.mark.usefixtures("ctrl_c_works")
 def test_a_signal_that_is_ignored_stays_ignored() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with interruption() as interrupted:
