@@ -13,8 +13,8 @@ An .npz holds, for T frames (only `expression` is required; what is missing is a
     names           [T] text                  of the frames
     head            [] text                   fingerprint of the head model that the coefficients belong to
 
-VHAP's tracked_flame_params*.npz is read by its own names (`FLAME_KEYS`), without the head's pose. Nothing in a drive file
-can execute code.
+VHAP's tracked_flame_params*.npz and SMIRK's outputs are read by their own names (`FLAME_KEYS`), without the head's pose.
+Nothing in a drive file can execute code.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ from avatar.types import IDENTITY_6D, Camera, HeadParams
 
 MAX_FRAMES = 1_000_000
 CAMERA_KEYS = ("R", "t", "K", "size")
-FLAME_KEYS = {"expr": "expression", "jaw_pose": "jaw", "eyes_pose": "eyes", "neck_pose": "neck"}
+FLAME_KEYS = {
+    **{"expr": "expression", "jaw_pose": "jaw", "eyes_pose": "eyes", "neck_pose": "neck"},
+    **{"expression_params": "expression", "jaw_params": "jaw", "eyelid_params": "eyelids"},
+}
 KEYS = ("expression", "jaw", "eyes", "eyelids", "neck", "fps", *CAMERA_KEYS, "shape", "names", "head")
 
 
@@ -52,7 +55,7 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     path = Path(path)
     read_arkit = {".csv": read_drive_csv, ".json": read_drive_json}.get(path.suffix.lower())
     arrays = read_arkit(path, assets.num_expressions, assets.names, say) if read_arkit else load_npz(path)
-    if "expr" in arrays and "expression" not in arrays:
+    if "expression" not in arrays:
         arrays = {FLAME_KEYS.get(key, key): a.ravel() if key == "shape" else a for key, a in arrays.items()}
     unknown = sorted(set(arrays) - set(KEYS))
     if "expression" not in arrays:

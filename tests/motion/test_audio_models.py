@@ -1,4 +1,4 @@
-"""What models of speech and other trackers write, as drive files: Audio2Face, LAM_Audio2Expression, VHAP."""
+"""What models of speech and other trackers write, as drive files: Audio2Face, LAM_Audio2Expression, VHAP, SMIRK."""
 
 from __future__ import annotations
 
@@ -101,3 +101,20 @@ def test_vhaps_parameters(tmp_path: Path) -> None:
         turns = matrix_from_6d(getattr(drive.params[1], joint).reshape(-1, 6))
         torch.testing.assert_close(turns[:, 2, 1], torch.full((len(turns),), math.sin(sine)))
     assert "also holds rotation, static_offset, timestep_id, translation" in said
+
+
+def test_smirks_parameters(tmp_path: Path) -> None:
+    T = 2
+    np.savez(
+        tmp_path / "smirk.npz",
+        pose_params=np.zeros((T, 3), np.float32),
+        cam=np.zeros((T, 3), np.float32),
+        shape_params=np.zeros((T, 300), np.float32),
+        expression_params=np.full((T, 5), 0.5, np.float32),
+        eyelid_params=np.tile(np.array([0.25, 0.75], np.float32), (T, 1)),
+        jaw_params=np.tile(np.array([0.2, 0.0, 0.0], np.float32), (T, 1)),
+    )
+    drive, said = read(tmp_path / "smirk.npz")
+    assert drive.params[1].expression.tolist() == [0.5] * 5 and drive.params[1].eyelids.tolist() == [0.25, 0.75]
+    assert float(matrix_from_6d(drive.params[1].jaw)[2, 1]) == pytest.approx(math.sin(0.2), abs=1e-6)
+    assert "also holds cam, pose_params, shape_params" in said
