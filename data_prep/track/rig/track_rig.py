@@ -7,6 +7,7 @@ fg_masks   head and neck in each of them
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -33,13 +34,13 @@ from data_prep.track.footage.source import MIN_SIDE, Span, whole
 from data_prep.track.frames import frame_file
 from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.rig import gha_folder, recording
-from data_prep.track.rig.listing import IMAGES, MATTES, lens_in, write_listing, write_parameters
+from data_prep.track.rig.listing import IMAGES, MATTES, PARAMETERS, lens_in, write_listing, write_parameters
 from data_prep.track.rig.look import Times, copy_mattes, find_front, looked_at, write_pictures
 from data_prep.track.rig.mattes import MatteClip, front_colours, write_head_mattes
 from data_prep.track.rig.recording import MAX_DIFFERENCE, Camera, Recording
 from data_prep.track.rig.scale import Points, View, place_head, refuse_misfit
 from data_prep.track.segmentation import matte_network
-from data_prep.track.stage_folder import StageFolder, growing, hash_of
+from data_prep.track.stage_folder import StageFolder, growing, hash_of, writing
 from data_prep.track.track import track
 from data_prep.track.tracking_stages import Choices
 
@@ -176,12 +177,24 @@ class _Rig:
 
         network, given = matte_network(), camera.mattes and camera.mattes.content_hash
         poses = hash_of([[*track.moving_values()] for track in tracks.values()])
-        inputs = {"images": key, "network": network.sha256, "given": given, "poses": poses, "scale": scale}
+        seen = [*away.R.ravel().tolist(), *away.t.tolist(), *lens.tolist()]
+        inputs = {"images": key, "network": network.sha256, "given": given, "poses": poses, "camera": seen}
         self._stages.run(f"{MATTES}/{serial}", inputs, make)
 
     def write(self, tracks: Mapping[int, FrameTrack], scale: float, fps: float) -> None:
-        write_parameters(self._stages.path, tracks, _pose(self._cameras[self._front], scale).inverse(), self._head)
-        write_listing(self._stages.path, self._cameras, self._views, list(tracks), scale, fps)
+        out, to_world = self._stages.path, _pose(self._cameras[self._front], scale).inverse()
+        with writing(out):
+            self._remove_others()
+            write_parameters(out, tracks, to_world, self._head)
+            write_listing(out, self._cameras, self._views, list(tracks), scale, fps)
+
+    def _remove_others(self) -> None:
+        """What earlier calls made of cameras that are not there now, and the heads that they wrote."""
+        for kind in (IMAGES, MATTES):
+            for path in (self._stages.path / kind).iterdir():
+                if path.name not in self._cameras:
+                    shutil.rmtree(path)
+        shutil.rmtree(self._stages.path / PARAMETERS, ignore_errors=True)
 
 
 def _pose(camera: Camera, scale: float = 1.0) -> Pose:
