@@ -30,7 +30,7 @@ from data_prep.progress import Progress, silent
 from data_prep.track.clothes import Colours
 from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.fit.fitting import find_embedding
-from data_prep.track.footage.source import MIN_SIDE, Span, whole
+from data_prep.track.footage.source import MIN_SIDE, Span, check_span, whole
 from data_prep.track.frames import frame_file
 from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.rig import gha_folder, recording
@@ -73,6 +73,14 @@ def track_rig(
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out} is not empty: choose another --out, or remove it first")
     opened = (recording if recording.recognise(folder) else gha_folder).open_recording(folder)
+    if len(opened.cameras) < 2:
+        raise UserError(
+            f"{folder} has pictures of one calibrated camera; two at least tell the head's size from its distance: copy "
+            "the others, or track a video of this one alone"
+        )
+    check_span(span, min((d for c in opened.cameras.values() if (d := c.footage.duration) is not None), default=None))
+    if opened.unused:
+        say(f"note: calibrated cameras without pictures are left out: {', '.join(opened.unused)}")
     front = find_front(opened, span)
     say(f"{folder}: {len(opened.cameras)} cameras; the front one is {front}")
     with growing(out) as stages:
