@@ -70,7 +70,9 @@ def _refuse_twins(folder: Path, names: set[str]) -> None:
     known: dict[int, str] = {}
     for name in sorted(names):
         if not re.fullmatch(r"[0-9]{1,20}", name):
-            raise UserError(f"{folder} has pictures image_{name}.jpg: a camera's serial is a number; rename or remove them")
+            raise UserError(
+                f"{folder} has pictures image_{name}.jpg: a camera's serial is a number; rename or remove them"
+            )
         if (other := known.setdefault(int(name), name)) != name:
             raise UserError(f"{folder} has pictures of {other} and of {name}, which are one number; remove one of them")
 

@@ -138,7 +138,7 @@ class _Rig:
         _, key = self._stages.run(FRONT, inputs, make)
         info = read_info(self._stages.path / FRONT)
         tracks = read_tracks(self._stages.path / FRONT, TRACKS_FILE, say).frames
-        return tracks, Times(list(tracks), float(info.source["begins"]), info.fps, span), key
+        return tracks, Times(list(tracks), float(info.source["begins"]), info.fps), key
 
     def look(
         self, serial: str, times: Times, landmarks: np.ndarray, front_key: str, progress: Progress

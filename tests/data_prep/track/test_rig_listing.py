@@ -18,7 +18,7 @@ from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.rig import Pose
 from data_prep.progress import silent
 from data_prep.track.footage.pictures import PictureFolder
-from data_prep.track.footage.source import Box, Span, View
+from data_prep.track.footage.source import Box, View
 from data_prep.track.rig import track_rig
 from data_prep.track.rig.listing import write_listing, write_parameters
 from data_prep.track.rig.look import Times
@@ -115,7 +115,7 @@ def test_mattes_are_made_again_for_another_calibration(rig: _Rig, monkeypatch: p
     side, tracks = next(iter(FILMED)), {3: a_track(3)}
 
     def mattes() -> int:
-        rig.mattes(side, tracks, SCALE, Times([3], 0.0, 25.0, Span()), None, None, "key", silent)  # type: ignore[arg-type]
+        rig.mattes(side, tracks, SCALE, Times([3], 0.0, 25.0), None, None, "key", silent)  # type: ignore[arg-type]
         return len(made)
 
     assert mattes() == mattes() == 1

@@ -15,8 +15,10 @@ from rig_recording import FILMED, write_plain_gha, write_plain_raw
 from avatar.cli import main
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
-from data_prep.track.footage.source import Span, whole
+from data_prep.track.footage.pictures import PictureFolder
+from data_prep.track.footage.source import Span, stride, whole
 from data_prep.track.rig import gha_folder, recording, track_rig
+from data_prep.track.rig.look import Times
 from data_prep.track.rig.recording import Recording
 
 SERIALS = list(FILMED)
@@ -209,6 +211,19 @@ def test_folders_of_gaussian_head_avatar_that_are_refused(
     with pytest.raises(UserError, match=said):
         for camera in gha_folder.open_recording(folder).cameras.values():
             list(camera.footage.read(whole(64, 64), Span(), lambda _: None))
+
+
+@pytest.mark.parametrize(
+    ("rate", "late", "wanted"), [(60.0, 1.0, [1, 3, 7]), (60.0, 0.8, [1, 3, 7]), (96.0, 1.2, [1, 4, 10])]
+)
+def test_a_camera_that_begins_at_another_time_loses_no_picture(rate: float, late: float, wanted: list[int]) -> None:
+    """The nearest pictures are taken of all, though the front camera's tracking took every second or third."""
+    fps, files = rate / stride(rate), tuple(Path(str(n)) for n in range(12))
+    footage = PictureFolder(
+        Path("side"), 64, 64, rate, 1.0, None, (), files, lambda path: (np.full((64, 64, 3), int(path.name)), False)
+    )
+    picked = Times([0, 1, 3], late / rate, fps).pick(footage, whole(64, 64))
+    assert [(number, image[0, 0, 0]) for number, image in picked] == [*zip([0, 1, 3], wanted, strict=True)]
 
 
 def test_the_command_refuses_what_is_for_one_camera(
