@@ -89,7 +89,7 @@ def sort_bench(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
     arguments.inputs = sort_words(arguments)
     given, inputs = len(arguments.inputs), PARTS[arguments.part].inputs
     most = len(inputs.split())
-    if not most - inputs.count("[") <= given <= most:
+    if given < most - inputs.count("[") or (given > most and "..." not in inputs):
         parser.error(f"bench {arguments.part} takes {inputs or 'no folder'}, {given} given")
 
 

@@ -21,6 +21,8 @@ from data_prep.progress import Item
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.inputs import tracking_key
+from data_prep.track.segmentation import matte_network
+from data_prep.track.soft_mattes import check_matting
 from data_prep.track.track import Choices, track
 
 
@@ -63,7 +65,7 @@ def tracking_lacks(*others: Callable[[], object]) -> list[str]:
     UserError for what is missing."""
     needed = [partial(require, file) for file in TRACKING_FILES if not file.is_optional]
     missing = []
-    for check in (*others, load_mediapipe, *needed):
+    for check in (*others, load_mediapipe, *needed, lambda: check_matting(matte_network())):
         try:
             check()
         except UserError as error:

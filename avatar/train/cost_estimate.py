@@ -53,7 +53,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     """
     torch.manual_seed(config.trainer.seed)
     avatar = make_avatar(assets, identity, config.model)
-    corrections = make_pose_corrections(avatar, [frame.index], config.trainer)
+    corrections = make_pose_corrections(avatar, [frame.time], config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     size = frame.camera.width, frame.camera.height
     term = choose_perceptual(config.trainer, lambda _: None, size=size)

@@ -8,6 +8,7 @@ Sources: Lin et al., Robust High-Resolution Video Matting with Temporal Guidance
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,7 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from avatar.compute.native import thread_count
 from avatar.errors import UserError, check_installed
-from avatar.files.third_party import MODNET, ThirdPartyFile, require
+from avatar.files.third_party import MATTING_FILES, MODNET, ThirdPartyFile, require
 from data_prep.track.segmentation import Matter, enlarged
 
 _MODNET_SIDE, _MODNET_MULTIPLE = 512, 32  # of its pictures' shorter side, and of both
@@ -38,22 +39,28 @@ def open_matting(network: ThirdPartyFile) -> Matter:
         session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's have no common base
         raise UserError(f"onnxruntime cannot load {file} ({error}); fetch {network.url} again, or remove it") from None
-    return _modnet(session) if network.name == MODNET.name else _robust_video_matting(session)
+    return (_modnet if network.name == MODNET.name else _robust_video_matting)(session, file)
 
 
-def _modnet(session: Any) -> Matter:
+def check_matting(network: ThirdPartyFile) -> None:
+    """Raises UserError where it is one of MATTING_FILES and makes no matte of a picture."""
+    if network in MATTING_FILES:
+        open_matting(network)(np.zeros((_MODNET_SIDE, _MODNET_SIDE, 3), np.uint8))
+
+
+def _modnet(session: Any, file: Path) -> Matter:
     def matte(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
         height, width = image.shape[:2]
         scale = _MODNET_SIDE / min(height, width)
         size = tuple(max(1, round(side * scale / _MODNET_MULTIPLE)) * _MODNET_MULTIPLE for side in (width, height))
         resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR)
-        (alpha,) = session.run(["output"], {"input": 2.0 * _planes(resized) - 1.0})
-        return enlarged(alpha[0, 0], width, height)
+        alpha, _ = _outputs(session, file, ["output"], {"input": 2.0 * _planes(resized) - 1.0})
+        return enlarged(alpha, width, height)
 
     return matte
 
 
-def _robust_video_matting(session: Any) -> Matter:
+def _robust_video_matting(session: Any, file: Path) -> Matter:
     states = [np.zeros((1, 1, 1, 1), np.float32)] * len(_STATES)
 
     def matte(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
@@ -61,10 +68,23 @@ def _robust_video_matting(session: Any) -> Matter:
         ratio = np.array([min(1.0, _RVM_SIDE / max(image.shape[:2]))], np.float32)
         given = {f"{name}i": state for name, state in zip(_STATES, states, strict=True)}
         inputs = {"src": _planes(image), "downsample_ratio": ratio} | given
-        alpha, *states = session.run(["pha", *(f"{name}o" for name in _STATES)], inputs)
-        return enlarged(alpha[0, 0], image.shape[1], image.shape[0])
+        alpha, states = _outputs(session, file, ["pha", *(f"{name}o" for name in _STATES)], inputs)
+        return enlarged(alpha, image.shape[1], image.shape[0])
 
     return matte
+
+
+def _outputs(
+    session: Any, file: Path, names: list[str], inputs: dict[str, np.ndarray]
+) -> tuple[Float32[np.ndarray, "h w"], list[np.ndarray]]:
+    """The matte of the first input, and the other outputs. Raises UserError for a network of other inputs or outputs."""
+    try:
+        alpha, *others = session.run(names, inputs)
+        return alpha.reshape(next(iter(inputs.values())).shape[2:]), others
+    except Exception as error:  # onnxruntime's have no common base
+        raise UserError(
+            f"{file} makes no matte of a picture ({error}); put the published file there, or remove it"
+        ) from None
 
 
 def _planes(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "1 3 H W"]:

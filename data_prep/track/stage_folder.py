@@ -43,17 +43,13 @@ class StageFolder:
         if known is not None and known.get("key") == key:
             return known["result"], key
         partial = self.path / f"{name}.partial"
-        try:
+        with writing(place):
             for stale in (place, partial):
                 shutil.rmtree(stale, ignore_errors=True)
             partial.mkdir(parents=True)
             result = json.loads(json.dumps(make(partial), allow_nan=False))
             (partial / RECORD).write_text(json.dumps({"key": key, "result": result}, allow_nan=False), encoding="utf-8")
             partial.rename(place)
-        except OSError as error:
-            raise UserError(
-                f"{place} cannot be written ({error.strerror or error}); free some space, or choose another --out"
-            ) from None
         return result, key
 
     def finish(
@@ -90,11 +86,21 @@ def growing(target: Path) -> Iterator[StageFolder]:
         try:
             yield StageFolder(folder)
         except BaseException:
-            for unfinished in [*folder.rglob("*.partial")]:
-                shutil.rmtree(unfinished, ignore_errors=True)
-            if next(folder.rglob(RECORD), None) is None:  # there is nothing to go on from
-                shutil.rmtree(folder, ignore_errors=True)
+            for unfinished in (*folder.rglob("*.partial"), folder):
+                if next(unfinished.rglob(RECORD), None) is None:  # there is nothing to go on from
+                    shutil.rmtree(unfinished, ignore_errors=True)
             raise
+
+
+@contextlib.contextmanager
+def writing(place: Path) -> Iterator[None]:
+    """Raises UserError when the disk refuses."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{place} cannot be written ({error.strerror or error}); free some space, or choose another --out"
+        ) from None
 
 
 def hash_of(values: Any) -> str:

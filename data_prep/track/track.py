@@ -43,6 +43,7 @@ from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.quality import judge
 from data_prep.track.segmentation import matte_network
+from data_prep.track.soft_mattes import check_matting
 from data_prep.track.stage_folder import StageFolder, growing
 from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
 from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
@@ -92,6 +93,7 @@ def track(
     for note in mattes.notes if mattes else ():
         say(f"note: {note}")
     if mattes is None and network in MATTING_FILES:
+        check_matting(network)
         say(f"mattes by {network.name}")
     with growing(out) as stages, _interruptible(out, say):
         seen |= {"matte": options["matte"], "rotate": choices.rotate}

@@ -79,6 +79,15 @@ def test_a_driver_needs_no_option() -> None:
         )
 
 
+def test_a_part_of_the_benchmark_takes_its_own_number_of_folders(capsys: pytest.CaptureFixture[str]) -> None:
+    assert parse(["bench", "quality", "a", "b", "c"]).inputs == [Path("a"), Path("b"), Path("c")]
+    assert [len(parse(["bench", "track", *words]).inputs) for words in ([], ["a"])] == [0, 1]
+    for words, said in ((["quality"], "RUN..., 0 given"), (["render", "a", "b"], "RUN, 2 given")):
+        with pytest.raises(SystemExit):
+            parse(["bench", *words])
+        assert f"bench {words[0]} takes {said}" in capsys.readouterr().err
+
+
 @pytest.fixture
 def begun(trained: Path, tmp_path: Path) -> Path:
     """A run of 16 steps that was interrupted at 12."""

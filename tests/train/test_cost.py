@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,9 +28,11 @@ def test_steps_are_counted_by_what_their_loss_takes(
     assert found == Counter(term.at(step, begin) for step in range(iterations))
 
 
-def test_any_frame_shows_what_training_takes(tracked_folder: Path) -> None:
-    """Where the first frames are held out, the first training frame is not frame 0."""
+@pytest.mark.parametrize("time", [None, 2])
+def test_any_frame_shows_what_training_takes(tracked_folder: Path, time: int | None) -> None:
+    """Where the first frames are held out, the first training frame is not frame 0; cameras of a rig share times."""
     config = small_config()
     _, subject, assets = open_small(tracked_folder, config)
-    cost = measure_cost(subject.frame(5), assets, subject.identity, len(subject), config)
+    frame = replace(subject.frame(5), shared_time=time)
+    cost = measure_cost(frame, assets, subject.identity, len(subject), config)
     assert cost.step_seconds > 0 and cost.iterations == config.trainer.iterations

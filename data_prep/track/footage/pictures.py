@@ -44,12 +44,14 @@ class PictureFolder(Footage):
     files: tuple[Path, ...]
     decode: Callable[[Path], tuple[np.ndarray, bool]] = read_picture
 
-    def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
+    def read(
+        self, view: View, span: Span, complain: Callable[[str], object], every: int | None = None
+    ) -> Iterator[TimedPicture]:
         """Raises UserError for pictures of another size and for files that cannot be decoded."""
         was_transparent = False
         times = [(n / self.rate, file) for n, file in enumerate(self.files)]
         inside = [(t, f) for t, f in times if t >= span.start - 1e-6 and (span.end is None or t < span.end)]
-        for time, file in inside[:: stride(self.rate)]:
+        for time, file in inside[:: every or stride(self.rate)]:
             image, is_transparent = self.decode(file)
             was_transparent |= is_transparent
             if image.shape[:2] != (self.height, self.width):

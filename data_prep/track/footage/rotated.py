@@ -22,8 +22,10 @@ class Turned(Footage):
     footage: Footage
     degrees: int  # of TURNS, not 0
 
-    def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
-        for picture in self.footage.read(self._before(view), span, complain):
+    def read(
+        self, view: View, span: Span, complain: Callable[[str], object], every: int | None = None
+    ) -> Iterator[TimedPicture]:
+        for picture in self.footage.read(self._before(view), span, complain, every):
             yield TimedPicture(picture.time, turn_image(picture.image, self.degrees))
 
     @cached_property

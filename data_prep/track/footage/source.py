@@ -69,8 +69,11 @@ class Footage(ABC):
     notes: tuple[str, ...]
 
     @abstractmethod
-    def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
-        """The pictures in the order of their times; `complain` hears at the end what was wrong with them."""
+    def read(
+        self, view: View, span: Span, complain: Callable[[str], object], every: int | None = None
+    ) -> Iterator[TimedPicture]:
+        """The pictures in the order of their times, each `every`-th (None: `stride`); `complain` hears at the end what was
+        wrong with them."""
 
     @cached_property
     @abstractmethod

@@ -44,7 +44,9 @@ class Video(Footage):
     colour: tuple[str, ...]  # range, matrix, primaries, transfer
     decoder: tuple[str, ...] = ()  # ffmpeg's option, where its own choice loses something
 
-    def read(self, view: View, span: Span, complain: Callable[[str], object]) -> Iterator[TimedPicture]:
+    def read(
+        self, view: View, span: Span, complain: Callable[[str], object], every: int | None = None
+    ) -> Iterator[TimedPicture]:
         """Raises UserError when the pictures change their size, or when decoding does not get on."""
         is_transparent = bool(_TRANSPARENT.match(self.first.pixel_format)) or bool(self.decoder)
         # Without a known length the file may have no index to seek by; then the pictures before are decoded and left.
@@ -60,7 +62,7 @@ class Video(Footage):
             seek=[*(("-ss", f"{span.start:.6f}") if can_seek else ()), *self.decoder],
         )
         offset = span.start if can_seek else 0.0
-        every, last, was_transparent = stride(self.rate), -1.0, False
+        every, last, was_transparent = every or stride(self.rate), -1.0, False
         for n, (shown, pixels) in enumerate(decoder):
             if (shown.width, shown.height) != (self.first.width, self.first.height):
                 raise UserError(

@@ -19,9 +19,9 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from data_prep.formats.frame_track import BadFrame, pinhole_of, rigid_motion, vector
 from data_prep.track.footage.pictures import footage_of
-from data_prep.track.rig.recording import Camera, Recording, refuse_lengths, refuse_unpaired
+from data_prep.track.rig.recording import Camera, Recording, refuse_lengths, without_pictures
 
-_IMAGE = re.compile(r"image_([0-9]{1,20})\.jpg")
+_IMAGE = re.compile(r"image_((?!lowres_).+)\.jpg")
 _CAMERA = re.compile(r"camera_([0-9]{1,20})\.npz")
 
 
@@ -39,18 +39,25 @@ def open_recording(folder: Path) -> Recording:
         )
     filmed = {time: _serials(time, _IMAGE) for time in times}
     serials = set().union(*filmed.values())
-    refuse_unpaired(serials, _serials(poses[0], _CAMERA), poses[0])
+    _refuse_twins(folder / "images", serials)
+    whole = [time for time in times if filmed[time] == serials]
+    if not (serials and whole):
+        raise UserError(f"{folder} has no time of which every camera has a picture; copy it again")
+    unused = without_pictures(serials, _serials(poses[0], _CAMERA), poses[0])
     refuse_lengths(
         {folder / "images" / "*" / f"image_{s}.jpg": sum(s in own for own in filmed.values()) for s in serials}
     )
-    whole = [time for time in times if filmed[time] == serials]
-    return Recording(
-        folder, {serial: _camera(whole, (poses[0], poses[-1]), serial) for serial in sorted(serials)}, None
-    )
+    masks = {time / f"mask_{serial}.jpg" for time in whole for serial in serials}
+    missing = {path for path in masks if not path.is_file()}
+    if missing and missing != masks:
+        raise UserError(f"{min(missing)} is missing, while other pictures have masks; copy it, or remove all masks")
+    cameras = {serial: _camera(whole, (poses[0], poses[-1]), serial, not missing) for serial in sorted(serials)}
+    return Recording(folder, cameras, None, unused)
 
 
 def _numbered(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if re.fullmatch(r"[0-9]{1,9}", path.name) and path.is_dir()]
+    _refuse_twins(folder, {path.name for path in found})
     return sorted(found, key=lambda path: int(path.name))
 
 
@@ -58,13 +65,23 @@ def _serials(folder: Path, pattern: re.Pattern[str]) -> set[str]:
     return {found[1] for path in folder.iterdir() if (found := pattern.fullmatch(path.name))}
 
 
-def _camera(times: list[Path], poses: tuple[Path, Path], serial: str) -> Camera:
+def _refuse_twins(folder: Path, names: set[str]) -> None:
+    """Raises UserError for names that are no number, and for 007 beside 7."""
+    known: dict[int, str] = {}
+    for name in sorted(names):
+        if not re.fullmatch(r"[0-9]{1,20}", name):
+            raise UserError(
+                f"{folder} has pictures image_{name}.jpg: a camera's serial is a number; rename or remove them"
+            )
+        if (other := known.setdefault(int(name), name)) != name:
+            raise UserError(f"{folder} has pictures of {other} and of {name}, which are one number; remove one of them")
+
+
+def _camera(times: list[Path], poses: tuple[Path, Path], serial: str, has_masks: bool) -> Camera:
     files = tuple(time / f"image_{serial}.jpg" for time in times)
-    if not files:
-        raise UserError(f"{poses[0].parent.parent} has no time of which every camera has a picture; copy it again")
     footage = footage_of(files[0], files)
     masks = tuple(path.with_name(f"mask_{serial}.jpg") for path in files)
-    mattes = replace(footage, files=masks, decode=_read_mask) if all(path.is_file() for path in masks) else None
+    mattes = replace(footage, files=masks, decode=_read_mask) if has_masks else None
     first, last = (read_calibration(folder / f"camera_{serial}.npz") for folder in poses)
     if any(np.abs(a - b).max() > 1e-6 * np.abs(a).max() for a, b in zip(first, last, strict=True)):
         raise UserError(f"camera {serial} moves between {poses[0]} and {poses[1]}; cameras have to stand still")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,18 +29,18 @@ class Times(NamedTuple):
     numbers: Sequence[int]
     begins: float
     fps: float
-    span: Span
 
     def pick(self, footage: Footage, view: View) -> Iterator[tuple[int, np.ndarray]]:
-        left = set(self.numbers)
-        for time, image in footage.read(view, self.span, lambda _: None):
-            place = (time - self.begins) * self.fps
-            number = round(place)
-            if number in left and abs(place - number) < _OFF:
-                left.remove(number)
+        """The nearest picture of each time, of all that the camera has: it need not have begun with the others."""
+        span = Span(max(0.0, self.begins - 1 / self.fps), self.begins + (max(self.numbers) + 1) / self.fps)
+        timed = (
+            ((time - self.begins) * self.fps, image) for time, image in footage.read(view, span, lambda _: None, 1)
+        )
+        wanted = set(self.numbers)
+        for number, near in groupby(timed, lambda one: round(one[0])):
+            place, image = min(near, key=lambda one: abs(one[0] - number))
+            if number in wanted and abs(place - number) < _OFF:
                 yield number, image
-            if not left:
-                return
 
 
 def find_front(recording: Recording, span: Span) -> str:

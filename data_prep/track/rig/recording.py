@@ -39,6 +39,7 @@ class Recording:
     folder: Path
     cameras: dict[str, Camera]  # by serial
     front: str | None  # the camera before the face, where that is known
+    unused: tuple[str, ...] = ()  # cameras that are calibrated and have no pictures
 
 
 def recognise(folder: Path) -> bool:
@@ -54,22 +55,22 @@ def open_recording(folder: Path) -> Recording:
             f"{folder} has videos of {len(videos)} cameras, but there is no {person / CALIBRATION}; give "
             "ID/sequences/SEQUENCE of a folder ID that has its calibration"
         )
-    refuse_unpaired(set(videos), read_serials(person), person / CALIBRATION)
+    unused = without_pictures(set(videos), read_serials(person), person / CALIBRATION)
     footage = {serial: open_video(path) for serial, path in videos.items()}
     counts = {serial: count_pictures(path, "v:0") for serial, path in videos.items()}
     refuse_lengths({videos[serial]: count for serial, count in counts.items()})
     calibrated = read_cameras(person, {serial: (one.width, one.height) for serial, one in footage.items()})
     cameras = {serial: Camera(footage[serial], *calibrated[serial][:3]) for serial in videos}
-    return Recording(folder, cameras, TRAINED_CAMERA if TRAINED_CAMERA in cameras else None)
+    return Recording(folder, cameras, TRAINED_CAMERA if TRAINED_CAMERA in cameras else None, unused)
 
 
-def refuse_unpaired(filmed: set[str], calibrated: set[str], calibration: Path) -> None:
-    for serials, what in (
-        (filmed - calibrated, "has pictures, but nothing in {}; calibrate it, or remove its pictures"),
-        (calibrated - filmed, "is in {}, but has no pictures; copy them, or remove it from there"),
-    ):
-        if serials:
-            raise UserError(f"camera {min(serials)} {what.format(calibration)}")
+def without_pictures(filmed: set[str], calibrated: set[str], calibration: Path) -> tuple[str, ...]:
+    """The calibrated cameras that did not film. Raises UserError for one that filmed and is not calibrated."""
+    if unknown := filmed - calibrated:
+        raise UserError(
+            f"camera {min(unknown)} has pictures, but nothing in {calibration}; calibrate it, or remove its pictures"
+        )
+    return tuple(sorted(calibrated - filmed))
 
 
 def refuse_lengths(counts: dict[Path, int]) -> None:

@@ -29,6 +29,7 @@ _ODD = 3.0  # times the median camera's error: a camera with more is left out,
 _FINE = 1.0  # pixels, if that is more than this
 MAX_ERROR = 0.03  # of the face's height: the median error above which the calibration is called wrong
 _NEAREST = 1e-3  # metres before a camera
+_SAME_PLACE = 0.02  # of the head's distance: a camera so close to the front one says nothing of the scale
 
 
 class View(NamedTuple):
@@ -72,13 +73,16 @@ def place_head(points: Points, views: Mapping[str, View]) -> Placement:
             "distance: give cameras that see it from the front"
         )
     start = Placement(1.0, np.eye(3), np.zeros_like(points.centres), 0.0, 0.0, ())
-    before, start = _median(_errors(points, seen, start)), start._replace(scale=_first_scale(points, seen))
+    before = _median(_errors(points, seen, start))
+    unit = max(float(np.linalg.norm(view.t)) for view in seen.values()) or 1.0  # so that steps are of one size
+    seen = {name: view._replace(t=view.t / unit) for name, view in seen.items()}
     fit = _fitted(points, seen, start)
     errors = _errors(points, seen, fit)
     kept = {name: seen[name] for name, error in errors.items() if error <= max(_ODD * _median(errors), _FINE)}
     if 2 <= len(kept) < len(seen):
         fit = _fitted(points, kept, start)
-    return fit._replace(before=before, after=_median(_errors(points, seen, fit)), cameras=tuple(kept))
+    after = _median(_errors(points, seen, fit))
+    return fit._replace(scale=fit.scale / unit, before=before, after=after, cameras=tuple(kept))
 
 
 def refuse_misfit(placed: Placement, views: Mapping[str, View], folder: Path) -> None:
@@ -95,19 +99,24 @@ def refuse_misfit(placed: Placement, views: Mapping[str, View], folder: Path) ->
 def _first_scale(points: Points, views: Mapping[str, View]) -> float:
     """The median of the scales at which each picture's ray through the face passes the head.
 
-    Raises UserError where it is not positive: then the cameras look elsewhere.
+    Raises UserError where cameras stand at one place, and where it is not positive: then they look elsewhere.
     """
-    scales = [np.zeros(0)]
+    scales, near = [np.zeros(0)], _SAME_PLACE * np.linalg.norm(points.centres, axis=1)
     for view in views.values():
         fx, fy, cx, cy = view.intrinsics
         x, y = view.found.mean(1).T  # not finite where there is no face
         ray = np.stack(((x - cx) / fx, (y - cy) / fy, np.ones_like(x)), axis=-1)
         across, moved = np.cross(ray, view.t), np.cross(ray, points.centres @ view.R.T)
-        if view.t.any():
-            scales.append(-(across * moved).sum(1) / np.maximum((across**2).sum(1), 1e-300))
+        own = -(across * moved).sum(1) / np.maximum((across**2).sum(1), 1e-300)
+        scales.append(own[np.abs(own) * np.linalg.norm(view.t) > near])
     every = np.concatenate(scales)
-    scale = float(np.median(every[np.isfinite(every)])) if np.isfinite(every).any() else 0.0
-    if not 1e-6 < scale < 1e6:
+    if not len(every):
+        raise UserError(
+            "the cameras that see the face stand at one place, which does not tell its size from its distance; give one "
+            "that sees it from aside"
+        )
+    scale = float(np.median(every))
+    if not 0 < scale < np.inf:
         raise UserError(
             "the calibration does not fit the pictures: by it, the cameras do not look at the face that they show; give "
             "the calibration of these videos"
@@ -116,6 +125,7 @@ def _first_scale(points: Points, views: Mapping[str, View]) -> float:
 
 
 def _fitted(points: Points, views: Mapping[str, View], fit: Placement) -> Placement:
+    fit = fit._replace(scale=_first_scale(points, views))
     way = points.centres / np.linalg.norm(points.centres, axis=1, keepdims=True)
     for _ in range(_STEPS):
         H, g = np.zeros((len(way), 5, 5)), np.zeros((len(way), 5))  # depth, scale, turn

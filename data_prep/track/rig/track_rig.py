@@ -7,6 +7,7 @@ fg_masks   head and neck in each of them
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,17 +30,17 @@ from data_prep.progress import Progress, silent
 from data_prep.track.clothes import Colours
 from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.fit.fitting import find_embedding
-from data_prep.track.footage.source import MIN_SIDE, Span, whole
+from data_prep.track.footage.source import MIN_SIDE, Span, check_span, whole
 from data_prep.track.frames import frame_file
 from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.rig import gha_folder, recording
-from data_prep.track.rig.listing import IMAGES, MATTES, lens_in, write_listing, write_parameters
+from data_prep.track.rig.listing import IMAGES, MATTES, PARAMETERS, lens_in, write_listing, write_parameters
 from data_prep.track.rig.look import Times, copy_mattes, find_front, looked_at, write_pictures
 from data_prep.track.rig.mattes import MatteClip, front_colours, write_head_mattes
 from data_prep.track.rig.recording import MAX_DIFFERENCE, Camera, Recording
 from data_prep.track.rig.scale import Points, View, place_head, refuse_misfit
 from data_prep.track.segmentation import matte_network
-from data_prep.track.stage_folder import StageFolder, growing, hash_of
+from data_prep.track.stage_folder import StageFolder, growing, hash_of, writing
 from data_prep.track.track import track
 from data_prep.track.tracking_stages import Choices
 
@@ -72,6 +73,14 @@ def track_rig(
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out} is not empty: choose another --out, or remove it first")
     opened = (recording if recording.recognise(folder) else gha_folder).open_recording(folder)
+    if len(opened.cameras) < 2:
+        raise UserError(
+            f"{folder} has pictures of one calibrated camera; two at least tell the head's size from its distance: copy "
+            "the others, or track a video of this one alone"
+        )
+    check_span(span, min((d for c in opened.cameras.values() if (d := c.footage.duration) is not None), default=None))
+    if opened.unused:
+        say(f"note: calibrated cameras without pictures are left out: {', '.join(opened.unused)}")
     front = find_front(opened, span)
     say(f"{folder}: {len(opened.cameras)} cameras; the front one is {front}")
     with growing(out) as stages:
@@ -129,7 +138,7 @@ class _Rig:
         _, key = self._stages.run(FRONT, inputs, make)
         info = read_info(self._stages.path / FRONT)
         tracks = read_tracks(self._stages.path / FRONT, TRACKS_FILE, say).frames
-        return tracks, Times(list(tracks), float(info.source["begins"]), info.fps, span), key
+        return tracks, Times(list(tracks), float(info.source["begins"]), info.fps), key
 
     def look(
         self, serial: str, times: Times, landmarks: np.ndarray, front_key: str, progress: Progress
@@ -176,12 +185,24 @@ class _Rig:
 
         network, given = matte_network(), camera.mattes and camera.mattes.content_hash
         poses = hash_of([[*track.moving_values()] for track in tracks.values()])
-        inputs = {"images": key, "network": network.sha256, "given": given, "poses": poses, "scale": scale}
+        seen = [*away.R.ravel().tolist(), *away.t.tolist(), *lens.tolist()]
+        inputs = {"images": key, "network": network.sha256, "given": given, "poses": poses, "camera": seen}
         self._stages.run(f"{MATTES}/{serial}", inputs, make)
 
     def write(self, tracks: Mapping[int, FrameTrack], scale: float, fps: float) -> None:
-        write_parameters(self._stages.path, tracks, _pose(self._cameras[self._front], scale).inverse(), self._head)
-        write_listing(self._stages.path, self._cameras, self._views, list(tracks), scale, fps)
+        out, to_world = self._stages.path, _pose(self._cameras[self._front], scale).inverse()
+        with writing(out):
+            self._remove_others()
+            write_parameters(out, tracks, to_world, self._head)
+            write_listing(out, self._cameras, self._views, list(tracks), scale, fps)
+
+    def _remove_others(self) -> None:
+        """What earlier calls made of cameras that are not there now, and the heads that they wrote."""
+        for kind in (IMAGES, MATTES):
+            for path in (self._stages.path / kind).iterdir():
+                if path.name not in self._cameras:
+                    shutil.rmtree(path)
+        shutil.rmtree(self._stages.path / PARAMETERS, ignore_errors=True)
 
 
 def _pose(camera: Camera, scale: float = 1.0) -> Pose:

@@ -1,7 +1,8 @@
-"""What is written of a rig is what the reader of VHAP's layout finds."""
+"""What is written of a rig is what the reader of VHAP's layout finds, and nothing else."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,21 @@ import pytest
 import torch
 from rig_recording import FILMED
 
+from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import matrix_from_6d
 from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.rig import Pose
+from data_prep.progress import silent
 from data_prep.track.footage.pictures import PictureFolder
 from data_prep.track.footage.source import Box, View
+from data_prep.track.rig import track_rig
 from data_prep.track.rig.listing import write_listing, write_parameters
-from data_prep.track.rig.recording import Camera
+from data_prep.track.rig.look import Times
+from data_prep.track.rig.recording import Camera, Recording
+from data_prep.track.rig.track_rig import _Rig
+from data_prep.track.stage_folder import StageFolder
 
 WIDTH, HEIGHT, SCALE, FRONT = 80, 60, 1.07, "222200037"
 
@@ -43,14 +50,15 @@ def a_track(seed: int) -> FrameTrack:
     )
 
 
+def filmed() -> dict[str, Camera]:
+    footage = PictureFolder(Path("images"), 2 * WIDTH, 2 * HEIGHT, 25.0, 1.0, None, (), ())
+    poses = {serial: (one.pose[:3, :3], one.pose[:3, 3]) for serial, one in FILMED.items()}
+    return {s: Camera(footage, *poses[s], one.K[[0, 1, 0, 1], [0, 1, 2, 2]]) for s, one in FILMED.items()}
+
+
 def test_the_reader_finds_what_was_written(tmp_path: Path, demo_head_model: Path) -> None:
-    head = load_head_assets(demo_head_model)
+    head, cameras = load_head_assets(demo_head_model), filmed()
     tracks = {n: a_track(n) for n in (3, 4, 6)}
-    cameras: dict[str, Camera] = {}
-    for serial, one in FILMED.items():
-        footage = PictureFolder(tmp_path, 2 * WIDTH, 2 * HEIGHT, 25.0, 1.0, None, (), ())
-        lens = np.array([one.K[0, 0], one.K[1, 1], one.K[0, 2], one.K[1, 2]])
-        cameras[serial] = Camera(footage, one.pose[:3, :3], one.pose[:3, 3], lens)
     views = dict.fromkeys(cameras, View(Box(0, 0, 2 * WIDTH, 2 * HEIGHT), WIDTH, HEIGHT))
     front = Pose(cameras[FRONT].R, SCALE * cameras[FRONT].t)
     write_parameters(tmp_path, tracks, front.inverse(), head)
@@ -68,3 +76,49 @@ def test_the_reader_finds_what_was_written(tmp_path: Path, demo_head_model: Path
         assert np.allclose(track.intrinsics, own.intrinsics / 2) and track.size == (WIDTH, HEIGHT)
         for name in ("jaw", "eyes", "eyelids", "neck", "expression", "shape"):
             assert np.allclose(getattr(track, name), getattr(wanted, name), atol=1e-5), name
+
+
+@pytest.fixture
+def rig(tmp_path: Path, demo_head_model: Path) -> _Rig:
+    stages = StageFolder(tmp_path / ".out.partial")
+    opened = Recording(tmp_path, filmed(), FRONT)
+    return _Rig(stages, opened, FRONT, demo_head_model, load_head_assets(demo_head_model), WIDTH)
+
+
+def test_nothing_is_left_of_cameras_and_heads_of_an_earlier_call(rig: _Rig, tmp_path: Path) -> None:
+    for kind in ("images", "fg_masks"):
+        for serial in (*FILMED, "222200099", "222200099.partial"):
+            (tmp_path / ".out.partial" / kind / serial).mkdir(parents=True)
+    for numbers in ((3, 4, 6), (3, 4)):
+        rig.write({n: a_track(n) for n in numbers}, SCALE, 25.0)
+    for kind in ("images", "fg_masks"):
+        assert {path.name for path in (tmp_path / ".out.partial" / kind).iterdir()} == set(FILMED)
+    assert len([*(tmp_path / ".out.partial" / "flame_param").iterdir()]) == 2
+
+
+def test_a_full_disk_is_refused(rig: _Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in ("images", "fg_masks"):
+        (tmp_path / ".out.partial" / kind).mkdir(parents=True)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(UserError, match=r"\.out\.partial cannot be written \(No space left on device\)"):
+        rig.write({3: a_track(3)}, SCALE, 25.0)
+
+
+@pytest.mark.parametrize("name", ["R", "t", "intrinsics"])
+def test_mattes_are_made_again_for_another_calibration(rig: _Rig, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(track_rig, "write_head_mattes", lambda *_: made.append(1))
+    side, tracks = next(iter(FILMED)), {3: a_track(3)}
+
+    def mattes() -> int:
+        rig.mattes(side, tracks, SCALE, Times([3], 0.0, 25.0), None, None, "key", silent)  # type: ignore[arg-type]
+        return len(made)
+
+    assert mattes() == mattes() == 1
+    camera = rig._cameras[side]
+    rig._cameras[side] = replace(camera, **{name: 1.01 * getattr(camera, name)})
+    assert mattes() == 2

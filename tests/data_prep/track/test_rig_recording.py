@@ -14,8 +14,11 @@ from rig_recording import FILMED, write_plain_gha, write_plain_raw
 
 from avatar.cli import main
 from avatar.errors import UserError
-from data_prep.track.footage.source import Span, whole
+from avatar.head.assets import load_head_assets
+from data_prep.track.footage.pictures import PictureFolder
+from data_prep.track.footage.source import Span, stride, whole
 from data_prep.track.rig import gha_folder, recording, track_rig
+from data_prep.track.rig.look import Times
 from data_prep.track.rig.recording import Recording
 
 SERIALS = list(FILMED)
@@ -65,10 +68,19 @@ def test_gaussian_head_avatar(gha: Path) -> None:
     assert first.image.min() > 250
 
 
-def test_gaussian_head_avatar_without_all_masks(gha: Path, tmp_path: Path) -> None:
+def test_gaussian_head_avatar_without_masks(gha: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(gha, tmp_path / "someone"))
-    (folder / "images" / "0001" / f"mask_{SERIALS[0]}.jpg").unlink()
-    assert [c.mattes is None for c in gha_folder.open_recording(folder).cameras.values()] == [True, False, False]
+    for mask in folder.rglob("mask_*.jpg"):
+        mask.unlink()
+    assert {camera.mattes for camera in gha_folder.open_recording(folder).cameras.values()} == {None}
+
+
+def test_cameras_without_pictures_are_left_out(raw: Path, gha: Path, tmp_path: Path) -> None:
+    folder, images = changed(raw, tmp_path, lambda _: None), Path(shutil.copytree(gha, tmp_path / "someone"))
+    for path in (*folder.rglob(f"cam_{SERIALS[0]}.mp4"), *images.rglob(f"*_{SERIALS[0]}.jpg")):
+        path.unlink()
+    for opened in (recording.open_recording(folder), gha_folder.open_recording(images)):
+        assert list(opened.cameras) == SERIALS[1:] and opened.unused == (SERIALS[0],)
 
 
 def test_a_picture_less_is_let_pass(gha: Path, tmp_path: Path) -> None:
@@ -92,10 +104,6 @@ def without_calibration(folder: Path) -> None:
     shutil.rmtree(folder.parent.parent / "calibration")
 
 
-def without_video(folder: Path) -> None:
-    (folder / "images" / f"cam_{SERIALS[0]}.mp4").unlink()
-
-
 def shorter(folder: Path) -> None:
     write_plain_raw(folder.parent / "short", frames=1)
     short = next((folder.parent / "short").rglob(f"cam_{SERIALS[1]}.mp4"))
@@ -114,7 +122,6 @@ def damaged(folder: Path) -> None:
             without_calibration,
             "has videos of 3 cameras, but there is no .*camera_params.json; give ID/sequences/SEQUENCE",
         ),
-        (without_video, f"camera {SERIALS[0]} is in .*camera_params.json, but has no pictures"),
         (shorter, f"cam_{SERIALS[1]}.mp4 has 1 pictures, but .*.mp4 has 4"),
         (damaged, f"cam_{SERIALS[1]}.mp4 is cut short"),
     ],
@@ -163,9 +170,24 @@ def thin_out(folder: Path) -> None:
         (folder / "images" / time / f"image_{SERIALS[0]}.jpg").unlink()
 
 
+def twin(folder: Path, serial: str) -> None:
+    for path in folder.rglob(f"*_{SERIALS[0]}.*"):
+        shutil.copy(path, path.with_stem(path.stem.replace(SERIALS[0], serial)))
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
+        (
+            lambda folder: (folder / "images" / "0001" / f"mask_{SERIALS[0]}.jpg").unlink(),
+            f"0001/mask_{SERIALS[0]}.jpg is missing, while other pictures have masks",
+        ),
+        (lambda folder: twin(folder, f"0{SERIALS[0]}"), f"of 0{SERIALS[0]} and of {SERIALS[0]}, which are one number"),
+        (lambda folder: twin(folder, "left"), "image_left.jpg: a camera's serial is a number"),
+        (
+            lambda folder: shutil.copytree(folder / "images" / "0001", folder / "images" / "1"),
+            "of 0001 and of 1, which are one number",
+        ),
         (lambda folder: shutil.rmtree(folder / "cameras"), "has pictures of several cameras, but no cameras/0000/"),
         (
             lambda folder: (folder / "cameras" / "0000" / f"camera_{SERIALS[0]}.npz").unlink(),
@@ -191,6 +213,19 @@ def test_folders_of_gaussian_head_avatar_that_are_refused(
             list(camera.footage.read(whole(64, 64), Span(), lambda _: None))
 
 
+@pytest.mark.parametrize(
+    ("rate", "late", "wanted"), [(60.0, 1.0, [1, 3, 7]), (60.0, 0.8, [1, 3, 7]), (96.0, 1.2, [1, 4, 10])]
+)
+def test_a_camera_that_begins_at_another_time_loses_no_picture(rate: float, late: float, wanted: list[int]) -> None:
+    """The nearest pictures are taken of all, though the front camera's tracking took every second or third."""
+    fps, files = rate / stride(rate), tuple(Path(str(n)) for n in range(12))
+    footage = PictureFolder(
+        Path("side"), 64, 64, rate, 1.0, None, (), files, lambda path: (np.full((64, 64, 3), int(path.name)), False)
+    )
+    picked = Times([0, 1, 3], late / rate, fps).pick(footage, whole(64, 64))
+    assert [(number, image[0, 0, 0]) for number, image in picked] == [*zip([0, 1, 3], wanted, strict=True)]
+
+
 def test_the_command_refuses_what_is_for_one_camera(
     raw: Path, tmp_path: Path, demo_head_model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,8 +234,18 @@ def test_the_command_refuses_what_is_for_one_camera(
         (["--focal", "900"], "leave out --focal"),
         (["--crop", "none"], "leave out --focal"),
         (["--size", "8"], "--size must be from 64 to 4096"),
+        (["--start", "2", "--end", "1"], "--end must be a time in seconds after --start"),
+        (["--start", "9"], "--start 9 is behind the end of the video"),
     ):
         assert main([*given, *more]) != 0 and said in capsys.readouterr().err
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "a").touch()
     assert main(given) != 0 and "is not empty" in capsys.readouterr().err
+
+
+def test_one_camera_is_refused_at_once(raw: Path, tmp_path: Path, demo_head_model: Path) -> None:
+    folder = changed(raw, tmp_path, lambda _: None)
+    for serial in SERIALS[1:]:
+        (folder / "images" / f"cam_{serial}.mp4").unlink()
+    with pytest.raises(UserError, match="has pictures of one calibrated camera; two at least .*: copy the others"):
+        track_rig.track_rig(folder, tmp_path / "out", demo_head_model, load_head_assets(demo_head_model))

@@ -55,7 +55,7 @@ def tracked(points: Points, larger: float = 1.0, turn: np.ndarray = TURN) -> Poi
     return Points(larger * points.positions, points.normals, points.turns @ turn, moved)
 
 
-@pytest.mark.parametrize(("unit", "larger"), [(1.0, 1.0), (0.001, 1.0), (1.07, 0.97)])
+@pytest.mark.parametrize(("unit", "larger"), [(1.0, 1.0), (1e-6, 1.0), (1e4, 1.0), (1.07, 0.97)])
 def test_scale_and_depths_come_back(unit: float, larger: float) -> None:
     truth = head()
     found = place_head(tracked(truth, larger), filmed(truth, unit))
@@ -89,6 +89,22 @@ def test_a_camera_that_shows_another_face_is_left_out() -> None:
     views["far"].found[...] += (80.0, -30.0)
     found = place_head(tracked(truth), views)
     assert found.cameras == ("front", "left", "right") and found.scale == pytest.approx(1.07, rel=1e-3)
+
+
+def test_two_cameras_tell_the_scale_wherever_the_origin_lies() -> None:
+    """Far from it, rounding moves the front camera."""
+    truth = head()
+    views = filmed(truth, 1.07, ("front", "left"))
+    views["front"] = views["front"]._replace(t=np.array([3e-13, -2e-13, 1e-13]))
+    assert place_head(tracked(truth), views).scale == pytest.approx(1.07, rel=1e-4)
+
+
+def test_cameras_at_one_place_are_refused() -> None:
+    truth = head()
+    views = filmed(truth, 0.001, ("front",))
+    views["beside"] = views["front"]._replace(t=np.array([5.0, 0.0, 0.0]))
+    with pytest.raises(UserError, match="the cameras that see the face stand at one place"):
+        place_head(tracked(truth), views)
 
 
 def test_one_camera_with_a_face_is_too_few() -> None:

@@ -30,7 +30,8 @@ from avatar.files.third_party import (
     ThirdPartyFile,
     sha256_of,
 )
-from data_prep.track import clip_mattes, segmentation
+from avatar.pipeline.track import tracking_lacks
+from data_prep.track import clip_mattes, segmentation, soft_mattes
 from data_prep.track import track as tracking
 from data_prep.track.segmentation import matte_network
 from data_prep.track.soft_mattes import open_matting
@@ -47,8 +48,8 @@ def published(folder: Path, file: ThirdPartyFile, nodes: list, inputs: dict, out
     ]
     two = helper.make_tensor("two", TensorProto.FLOAT, [1], [2.0])
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
-    axes = helper.make_tensor("axes", TensorProto.INT64, [1], [1])
-    graph = helper.make_graph(nodes, "net", *values, [two, one, axes])
+    axes, rows = (helper.make_tensor(name, TensorProto.INT64, [1], [n]) for name, n in (("axes", 1), ("rows", 2)))
+    graph = helper.make_graph(nodes, "net", *values, [two, one, axes, rows])
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     folder.mkdir(exist_ok=True)
     onnx.save(made, str(folder / file.name))
@@ -132,6 +133,26 @@ def test_what_cannot_be_run_is_refused(rvm: ThirdPartyFile, tmp_path: Path, monk
         open_matting(rvm)
 
 
+@pytest.mark.parametrize(
+    ("given", "made", "axis"), [("photo", "output", 1), ("input", "alpha", 1), ("input", "output", 2)]
+)
+def test_a_network_with_other_inputs_or_outputs_is_refused_before_the_video_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, made: str, axis: int
+) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "models"))
+    nodes = [helper.make_node("ReduceMean", [given, "axes" if axis == 1 else "rows"], [made], keepdims=1)]
+    wrong = published(tmp_path / "models", MODNET, nodes, {given: [1, 3, "height", "width"]}, [made])
+    for module in (tracking, soft_mattes, segmentation):
+        monkeypatch.setattr(module, "MATTING_FILES", (wrong,))
+    said = f"{tmp_path}/models/modnet.onnx makes no matte of a picture"
+    assert any(said in lack for lack in tracking_lacks())
+    monkeypatch.setattr(tracking, "growing", pytest.fail)
+    video = encode(tmp_path / "v.mkv", [picture(0)] * 2, options=LOSSLESS)
+    (tmp_path / "head.npz").touch()
+    with pytest.raises(UserError, match=said):
+        track(video, tmp_path / "out", tmp_path / "head.npz", grid_head())
+
+
 def test_the_command_lists_them_and_fetches_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -149,7 +170,7 @@ def test_the_command_lists_them_and_fetches_none(
 def test_tracking_gives_the_frames_in_order(
     rvm: ThirdPartyFile, with_marks: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (tracking, clip_mattes, segmentation):
+    for module in (tracking, clip_mattes, segmentation, soft_mattes):
         monkeypatch.setattr(module, "MATTING_FILES", (rvm,))
     frames = [picture(n % 5) + np.uint8(4 * n) * (picture(n % 5) == 90) for n in range(12)]
     video = encode(tmp_path / "v.mkv", frames, options=LOSSLESS)

@@ -79,6 +79,30 @@ def test_an_interruption_keeps_whole_stages_only(tmp_path: Path, interruption: B
         assert stages.run("one", {}, interrupted)[0] == {}  # it is not made again
 
 
+def test_an_interruption_keeps_the_stages_of_a_folder_that_a_stage_makes(tmp_path: Path) -> None:
+    made: list[str] = []
+
+    def outer(stop: bool):
+        def write(folder: Path) -> dict[str, int]:
+            folder.rmdir()
+            with growing(folder) as stages:
+                stages.run("one", {}, lambda _: made.append("one") or {})
+                if stop:
+                    raise KeyboardInterrupt
+                stages.finish(folder, ())
+            return {}
+
+        return write
+
+    with pytest.raises(KeyboardInterrupt), growing(tmp_path / "out") as stages:
+        stages.run("front", {}, outer(stop=True))
+    with growing(tmp_path / "out") as stages:
+        stages.run("front", {}, outer(stop=False))
+        stages.finish(tmp_path / "out", ())
+    assert made == ["one"]
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["out", "out/front", "out/front/one"]
+
+
 def test_nothing_is_left_where_nothing_was_done(tmp_path: Path) -> None:
     def fails(folder: Path) -> dict[str, int]:
         (folder / "half").write_text("half")
