@@ -34,7 +34,7 @@ from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import plan_file, round_steps
-from avatar.pipeline.track import bar, head_for_video, tracking_lacks
+from avatar.pipeline.track import head_for_video, progress_bar, tracking_lacks
 from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
@@ -74,7 +74,7 @@ def run_create(arguments: Namespace) -> int:
     say_plan(open_footage(video), assets, training)
     print(f"Folder       {out}")
     say_stage(1, "the face is tracked")
-    info = track(video, place.subject, head, assets, progress=bar)
+    info = track(video, place.subject, head, assets, progress=progress_bar)
     say_stage(2, "is the tracking good enough?")
     judge_tracking(info, place.subject, arguments.anyway)
     say_stage(3, "the avatar is trained")
