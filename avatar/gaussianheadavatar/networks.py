@@ -151,12 +151,7 @@ def _counting(chosen: Bool[Tensor, " N"]) -> Tensor:
 def nearness(
     points: Float[Tensor, "N 3"], landmarks: Float[Tensor, "L 3"], near_distance: float, far_distance: float
 ) -> Float[Tensor, " N"]:
-    """clamp((far^2 - d^2) / (far^2 - near^2), 0, 1), with d the distance to the nearest landmark; all in metres.
-
-    Raises ValueError unless 0 <= near_distance < far_distance.
-    """
-    if not 0.0 <= near_distance < far_distance:
-        raise ValueError(f"the near distance ({near_distance}) must be below the far one ({far_distance})")
+    """clamp((far^2 - d^2) / (far^2 - near^2), 0, 1), with d the distance to the nearest landmark; all in metres."""
     origin = landmarks.mean(dim=0)  # small numbers, because differences of squares follow
     landmarks = landmarks - origin
     lengths = landmarks.square().sum(dim=1)

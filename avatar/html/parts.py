@@ -51,9 +51,7 @@ def picture(
 
 
 def data_uri(image: np.ndarray, format: Literal["jpeg", "png"] = "jpeg", quality: int = 88) -> str:
-    """The image inside a URL. Raises ValueError unless it is uint8 [H, W, 3] or [H, W]."""
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise ValueError(f"the image must be uint8 [H, W] or [H, W, 3], got {image.dtype} {list(image.shape)}")
+    """A uint8 image [H, W, 3] or [H, W] inside a URL."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if format == "jpeg" else []
     encoded = cv2.imencode(f".{format}", pixels, options)[1].tobytes()
