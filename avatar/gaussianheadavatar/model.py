@@ -85,7 +85,7 @@ class GaussianHeadAvatar(Avatar):
         self.features = nn.Parameter(torch.zeros(N, FEATURES))
         theta = num_expressions + CONDITION_EXTRAS
         self.hyper = self.make_hyper(config, N)
-        self.networks = Networks(theta, 6, config.mlp_width, FEATURES, outputs, bounded=self.hyper is None)
+        self.networks = Networks(theta, config.mlp_width, FEATURES, outputs, bounded=self.hyper is None)
         self.upsampler = Upsampler(channels, config.upsampling)
         self.register_buffer("mean_rotation", torch.eye(3))
 
