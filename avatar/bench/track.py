@@ -151,7 +151,7 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
     avatars = {}
     for name, trial, recording in (
         (TRUE, of_truth, truth.recording),
-        (PICTURES, of_own, truly_tracked(own.recording, truth.recording, pairs)),
+        (PICTURES, of_own, with_true_tracking(own.recording, truth.recording, pairs)),
         (AUTOMATIC, of_own, own.recording),
         (REFINED, of_own, better),
         (AGAIN, of_own, of_own.refined(better, "second")),
@@ -189,7 +189,7 @@ def paired(own: Recording, count: int) -> list[tuple[int, int]]:
     return [(index, int(name)) for index, name in enumerate(own.names) if int(name) < count]
 
 
-def truly_tracked(own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Recording:
+def with_true_tracking(own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Recording:
     """The video's frames with the true tracking. Every frame must have a true one."""
     true_rows = torch.tensor([true for _, true in pairs])
     tracks = {name: values if name == "shape" else values[true_rows] for name, values in truth.tracks.items()}

@@ -16,7 +16,7 @@ POLL_SECONDS = 0.5
 STALLED_SECONDS = 15 * 60.0  # in which a worker that computes anything has used a second of its processor
 
 
-class Watch:
+class StallTimer:
     """How long each job's worker has made no progress, by this machine's clock."""
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
     places = {job.name: folder / "jobs" / job.name for job in spec.jobs}
     states = {name: read_state(place) for name, place in places.items()}
     handles: dict[str, Any] = {}
-    watch, ended = Watch(), dict[str, str]()
+    stalls, ended = StallTimer(), dict[str, str]()
 
     def submit(names: list[str]) -> None:
         if names:
@@ -59,7 +59,7 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                     continue
                 states[name] = read_state(places[name])
                 is_running = name not in ended and stored_state(places[name]).status == "running"
-                if is_running and watch.stalled_seconds(places[name]) > STALLED_SECONDS:
+                if is_running and stalls.stalled_seconds(places[name]) > STALLED_SECONDS:
                     ended[name] = f"the worker hung: no progress for {duration(STALLED_SECONDS)}"
                     engine.stop([handle])
             for name in list(elsewhere):  # another engine's worker has it, until it is done or falls silent
@@ -67,7 +67,7 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                 if states[name].status != "running":
                     elsewhere.remove(name)
                     again += [name] if is_open(states[name], spec.retries) else []
-                elif watch.stalled_seconds(places[name]) > STALLED_SECONDS:  # and only its own engine can end it
+                elif stalls.stalled_seconds(places[name]) > STALLED_SECONDS:  # and only its own engine can end it
                     elsewhere.remove(name)
                     hangs = (
                         f"{states[name].worker} hangs: no progress for {duration(STALLED_SECONDS)}; end it, and go on"

@@ -21,7 +21,7 @@ from avatar.motion.rest import RestPose
 from avatar.motion.transfer import retargeted
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
-from avatar.view.auth import same
+from avatar.view.auth import equal_tokens
 from avatar.view.live import LiveFrame
 from avatar.view.packets import MAX_LINE, FrameReader, PacketError
 from avatar.view.player import STREAM
@@ -107,7 +107,7 @@ class Receiver:
         with self._lock:
             sockets = [self._tcp, *self._senders, *([] if self._udp is None else [self._udp])]
         for used in sockets:
-            _wake(used)
+            _shut_down(used)
         self._tcp.close()
         if self._udp is not None:
             self._udp.close()
@@ -135,7 +135,7 @@ class Receiver:
             sender.settimeout(IDLE_SECONDS)
             with self._lock:
                 if len(self._senders) == MAX_SENDERS:  # the one whose last frame is the oldest goes
-                    _wake(longest := min(self._senders, key=lambda other: self._senders[other]))
+                    _shut_down(longest := min(self._senders, key=lambda other: self._senders[other]))
                     del self._senders[longest]
                 self._senders[sender] = 0.0
             threading.Thread(target=self._take_lines, args=(sender,), daemon=True, name="stream").start()
@@ -168,7 +168,7 @@ class Receiver:
         """Why a sender with this first line is closed."""
         if not line.startswith(b"{"):  # a web page can send anything, but not before the head of its request
             return "a sender's first line is not JSON: web pages may not send frames"
-        if self._token is not None and not knows(line, self._token):
+        if self._token is not None and not has_token(line, self._token):
             return "a sender's first line does not say the token"
         return None
 
@@ -218,21 +218,21 @@ class Throttle:
             self._since, self._before = self._clock(), self._used()
 
 
-def knows(line: bytes, token: str) -> bool:
+def has_token(line: bytes, token: str) -> bool:
     """Whether a sender's first line is {"token": TOKEN}."""
     try:
         found = json.loads(line)
     except (ValueError, RecursionError):
         return False
     given = found.get("token") if isinstance(found, dict) else None
-    return isinstance(given, str) and same(given, token)
+    return isinstance(given, str) and equal_tokens(given, token)
 
 
 def _told(error: Exception) -> str:
     return str(error) if isinstance(error, PacketError) else f"a packet cannot be read ({type(error).__name__})"
 
 
-def _wake(used: socket.socket) -> None:
+def _shut_down(used: socket.socket) -> None:
     """End what a thread waits for."""
     with suppress(OSError):
         used.shutdown(socket.SHUT_RDWR)
