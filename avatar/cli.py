@@ -9,7 +9,7 @@ import sys
 from types import FrameType
 from typing import NoReturn
 
-from avatar.commands.main import EXIT_INTERRUPTED, INTERRUPTED, drop_output, failed, main, nobody_reads
+from avatar.commands.main import EXIT_INTERRUPTED, INTERRUPTED, drop_output, end_without_reader, failed, main
 
 
 def run() -> NoReturn:
@@ -33,7 +33,7 @@ def run() -> NoReturn:
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        status = nobody_reads()
+        status = end_without_reader()
     except OSError as error:
         drop_output()
         status = status or failed(f"the output cannot be written ({error.strerror})")

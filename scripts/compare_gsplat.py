@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from avatar.bench.clock import paired_medians
-from avatar.bench.splat_gpu import settle
+from avatar.bench.splat_gpu import synchronize
 from avatar.pipeline.choose_device import choose_device
 from avatar.runs.run import open_trained
 from avatar.splat import splat
@@ -57,7 +57,7 @@ class Splatter:
 
     def forward(self) -> Tensor:
         self._image = self._draw(self._scene.gaussians, self._scene.camera).image
-        settle(self._image.device)
+        synchronize(self._image.device)
         return self._image
 
     def backward(self) -> None:

@@ -127,7 +127,7 @@ class Rehearsal:
     def train(self, perceptual: PerceptualTerm, late: bool) -> None:
         step = self.number(late)
         set_rates(self.optimizer, schedule(step, self.trainer))
-        train_step(self.state(perceptual), step, self.steps.inputs(step, self.frame), self.guard.judge)
+        train_step(self.state(perceptual), step, self.steps.inputs(step, self.frame), self.guard.check_gradients)
 
     def state(self, perceptual: PerceptualTerm) -> TrainState:
         objective = Objective(self.trainer, self.background, perceptual)

@@ -20,7 +20,7 @@ from count_launches import Rehearsal
 from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.splat_gpu import device_of, settle
+from avatar.bench.splat_gpu import device_of, synchronize
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import CPU, interpreted
 from avatar.demo.head import demo_head
@@ -50,11 +50,11 @@ class Scene:
 
     def forward(self, backend: str = "gpu") -> None:
         self.drawn = [splat(self.leaves, self.camera, self.background, backend=backend).image]  # type: ignore[arg-type]
-        settle(self.background.device)
+        synchronize(self.background.device)
 
     def backward(self) -> tuple[Tensor, ...]:
         gradients = torch.autograd.grad(self.drawn.pop(), self.leaves, self.cotangent)
-        settle(self.background.device)
+        synchronize(self.background.device)
         return gradients
 
     def both(self, backend: str = "gpu") -> list[Tensor]:
@@ -122,7 +122,7 @@ class Replays:
 
     def train(self, late: bool) -> None:
         r = self.rehearsal
-        self.steps.make(r.number(late), r.frame, r.guard.judge)
+        self.steps.make(r.number(late), r.frame, r.guard.check_gradients)
 
 
 def check_replays(make: Callable[[], Rehearsal]) -> str:
@@ -166,25 +166,27 @@ def time_all(scene: Scene, rehearsal: Rehearsal, device: torch.device, repeats: 
     with_lpips = Replays(rehearsal, PerceptualTerm("lpips", lpips))
     frame = rehearsal.params.to(CPU), rehearsal.camera
 
-    def settled(function: Callable[[], object]) -> Callable[[], None]:
+    def synchronized(function: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
             function()
-            settle(device)
+            synchronize(device)
 
         return run
 
     functions: dict[str, Callable[[], object]] = {
         "splatting, forward": scene.forward,
         "splatting, backward": scene.backward,
-        "posing": settled(lambda: renderer.avatar.vertices(rehearsal.params)),
-        "network, HyperGaussians and placing": settled(lambda: renderer.gaussians(rehearsal.params)),
-        "a rendered frame": settled(lambda: renderer.draw(renderer.gaussians(*frame), frame[1], renderer.background)),
-        "the same, replayed": settled(lambda: renderer.render(*frame)),
+        "posing": synchronized(lambda: renderer.avatar.vertices(rehearsal.params)),
+        "network, HyperGaussians and placing": synchronized(lambda: renderer.gaussians(rehearsal.params)),
+        "a rendered frame": synchronized(
+            lambda: renderer.draw(renderer.gaussians(*frame), frame[1], renderer.background)
+        ),
+        "the same, replayed": synchronized(lambda: renderer.render(*frame)),
         f"{STREAMED} frames, streamed to the CPU": lambda: sum(1 for _ in renderer.stream([frame] * STREAMED)),
-        "a training step, first half": settled(lambda: rehearsal.train(STAND_IN, late=False)),
-        "a training step with D-SSIM": settled(lambda: rehearsal.train(STAND_IN, late=True)),
-        "the same two, replayed": settled(lambda: (replays.train(False), replays.train(True))),
-        "a training step with LPIPS, replayed": settled(lambda: with_lpips.train(True)),
+        "a training step, first half": synchronized(lambda: rehearsal.train(STAND_IN, late=False)),
+        "a training step with D-SSIM": synchronized(lambda: rehearsal.train(STAND_IN, late=True)),
+        "the same two, replayed": synchronized(lambda: (replays.train(False), replays.train(True))),
+        "a training step with LPIPS, replayed": synchronized(lambda: with_lpips.train(True)),
     }
     return paired_medians(functions, repeats, warm_up=min(WARM + 1, repeats - 1))
 

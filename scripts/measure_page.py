@@ -20,7 +20,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from playwright.sync_api import sync_playwright
 
-from avatar.export.default_view import faded
+from avatar.export.default_view import with_faded_neck
 from avatar.export.web_page import write_page
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
@@ -49,7 +49,7 @@ def open_page(browser: Any, path: Path, renderer: str) -> tuple[Any, float]:
 
 def fitter(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
     """Lowest and mean PSNR to our renderer over FRAMES held-out frames, 8 bits a channel."""
-    test, exported = list(trained.recording.split.test), faded(trained)
+    test, exported = list(trained.recording.split.test), with_faded_neck(trained)
     page.evaluate("avatar.background = null")  # that of training
     found = []
     for k in range(FRAMES):

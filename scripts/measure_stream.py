@@ -101,7 +101,7 @@ def measure(trained: TrainedAvatar, name: str, packets: list[bytes], rate: float
     receiver = Arrivals(trained)
     player = Player(trained, {}, time.monotonic, receiver.newest)
     viewer = Viewer(ViewRenderer(trained), player, trained.rest_camera().width, "127.0.0.1", 0, "measured")
-    viewer.pace = record = Record()
+    viewer.timing = record = Record()
     try:
         words = [sys.executable, "-c", SENDER, "tcp" if name == "JSON" else "udp", str(receiver.port), str(rate)]
         content = json.dumps([packet.hex() for packet in packets])

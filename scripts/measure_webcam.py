@@ -21,7 +21,7 @@ from avatar.commands.reenact import head_of
 from avatar.head.assets import HeadAssets
 from avatar.runs.run import open_trained
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.live import Live, Pace
+from avatar.view.live import LiveFrame, LiveTiming
 from avatar.view.player import WEBCAM, Player
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.viewer import Viewer
@@ -43,7 +43,7 @@ COMPARED = 200  # frames
 TOKEN = "measured"
 
 
-class Record(Pace):
+class Record(LiveTiming):
     """Keeps all."""
 
     def __init__(self) -> None:
@@ -80,13 +80,13 @@ def measure_live(trained: TrainedAvatar, head: Path, video: Path, with_page: boo
     webcam = Webcam(trained, follower, said.append)
     parts: list[dict[str, float]] = []
 
-    def newest() -> Live | None:
+    def newest() -> LiveFrame | None:
         parts.append(dict(follower.milliseconds))
         return webcam.newest()
 
     player = Player(trained, {}, time.monotonic, newest, WEBCAM)
     viewer = Viewer(ViewRenderer(trained), player, trained.rest_camera().width, "127.0.0.1", 0, TOKEN)
-    viewer.pace = record = Record()
+    viewer.timing = record = Record()
     drawing: list[float] = []
     with page(viewer.port, with_page):
         webcam.start(viewer.wake.set)

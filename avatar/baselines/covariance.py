@@ -76,8 +76,6 @@ class CovarianceHeads(nn.Module):
 
     def __init__(self, num_gaussians: int, latent_size: int) -> None:
         super().__init__()
-        if latent_size < 1:
-            raise ValueError(f"a HyperGaussian needs at least one latent dimension, got {latent_size}")
         for name, m in HEADS.items():
             self.add_module(name, CovarianceHead(num_gaussians, m, latent_size))
 

@@ -29,7 +29,7 @@ ORDER = ((0, 8, 2, 10), (12, 4, 14, 6), (3, 11, 1, 9), (15, 7, 13, 5))
 TRANSPARENT = 0.005  # opacity below which a point is removed when the set grows, as 3D Gaussian Splatting prunes
 
 
-def alive_after(steps: int, iterations: int, capacity: int) -> int:
+def active_count(steps: int, iterations: int, capacity: int) -> int:
     """How many points are alive after so many of a training's steps; at least 1."""
     doublings = min(int(steps / (EVERY * iterations) + 1e-9), DOUBLINGS)
     return max(1, capacity >> (DOUBLINGS - doublings))
@@ -42,7 +42,7 @@ def evenly_ordered(texels: UVTexels) -> UVTexels:
     return UVTexels(*(values[order] for values in texels))
 
 
-def drawn(from_: Int[Tensor, " P"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
+def random_choice(from_: Int[Tensor, " P"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
     """So many of these in random order, none a second time before each has come once."""
     rounds = [from_[torch.randperm(len(from_), generator=generator)] for _ in range(-(-count // len(from_)))]
     return torch.cat([*rounds, from_[:0]])[:count]
@@ -68,7 +68,7 @@ class MonoGaussianAvatar(FlashAvatar):
     def make_parameters(self, config: ModelConfig, num_expressions: int, N: int) -> None:
         super().make_parameters(replace(config, skull_binding=False), num_expressions, N)
         self.mesh_points = MeshPoints(N, learned=False)
-        self.register_buffer("count", torch.tensor(alive_after(0, 1, N)))
+        self.register_buffer("count", torch.tensor(active_count(0, 1, N)))
 
     def active(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "alive ..."]:
         """Those of the points that are alive."""
@@ -94,7 +94,7 @@ class MonoGaussianAvatar(FlashAvatar):
 
     def after_step(self, optimizer: torch.optim.Adam, steps: int, config: TrainerConfig) -> None:
         """Let the set grow when it is time."""
-        size = alive_after(steps, config.iterations, len(self))
+        size = active_count(steps, config.iterations, len(self))
         if size > int(self.count):
             self.grow(optimizer, size, config.seed + steps)
 
@@ -115,7 +115,7 @@ class MonoGaussianAvatar(FlashAvatar):
             self.encode_points()
             return
         generator = torch.Generator().manual_seed(seed)
-        parents = drawn(parents_there, len(born), generator).to(points.face.device)
+        parents = random_choice(parents_there, len(born), generator).to(points.face.device)
         born = born.to(points.face.device)
         distinct = parents.unique()
         self.log_scales[distinct] -= math.log(2.0) / 2

@@ -44,15 +44,10 @@ class Slice(NamedTuple):
 
 
 class NdGaussians(nn.Module):
-    """N Gaussians over (position, latent of n values); all parameters 0 at the start.
-
-    Raises ValueError for less than one latent dimension.
-    """
+    """N Gaussians over (position, latent of n values); all parameters 0 at the start."""
 
     def __init__(self, num_gaussians: int, latent_size: int) -> None:
         super().__init__()
-        if latent_size < 1:
-            raise ValueError(f"an N-dimensional Gaussian needs at least one latent dimension, got {latent_size}")
         self.latent_size = latent_size
         self.mean = nn.Parameter(torch.zeros(3 + latent_size, num_gaussians))  # of the position, then of the latent
         self.root = nn.Parameter(torch.zeros(triangle_size(latent_size), num_gaussians))  # B, row by row

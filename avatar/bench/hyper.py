@@ -29,7 +29,7 @@ Leaves = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
-class Way:
+class Method:
     offsets: Callable[[Leaves], Tensor]  # [N, 10]
     leaves: Callable[[HyperHeads], Leaves]
 
@@ -51,7 +51,7 @@ def measure(
     *,
     count: int = HEAD_SPLATS,
     repeats: int = 21,
-    ways: Mapping[str, Way] | None = None,
+    ways: Mapping[str, Method] | None = None,
 ) -> list[Row]:
     """Verify and time every way; those of the same parameters take turns. UserError for a wrong one."""
     rows: list[Row] = []
@@ -59,13 +59,13 @@ def measure(
         print(f"{n} latent dimensions")
         few = min(count, COVARIANCE_FLOATS // (4 + n) ** 2)
         rows += compare(ways or WAYS, by_substitution, random_heads(count, n), repeats, TOLERANCE)
-        covariance = {"covariance": Way(by_covariance, covariance_leaves)}
+        covariance = {"covariance": Method(by_covariance, covariance_leaves)}
         rows += compare(covariance, by_covariance, random_heads(few, n), min(repeats, 5), COVARIANCE_TOLERANCE)
     return rows
 
 
 def compare(
-    ways: Mapping[str, Way],
+    ways: Mapping[str, Method],
     truth: Callable[[Leaves], Tensor],
     heads: HyperHeads,
     repeats: int,
@@ -101,7 +101,7 @@ def compare(
 
 
 def verify(
-    name: str, way: Way, leaves: Leaves, cotangent: Tensor, truth: Callable[[Leaves], Tensor], tolerance: float
+    name: str, way: Method, leaves: Leaves, cotangent: Tensor, truth: Callable[[Leaves], Tensor], tolerance: float
 ) -> tuple[float, float]:
     """The errors of offsets and gradients; UserError if they are above the tolerance."""
     found = way.offsets(leaves)
@@ -120,7 +120,7 @@ def verify(
     return offsets, gradient
 
 
-def passes_of(way: Way, leaves: Leaves, cotangent: Tensor) -> dict[str, Callable[[], object]]:
+def passes_of(way: Method, leaves: Leaves, cotangent: Tensor) -> dict[str, Callable[[], object]]:
     """The forward pass, and the backward pass of what the forward pass made last."""
     made: list[Tensor] = []
     inputs = list(leaves.values())
@@ -228,9 +228,9 @@ def by_covariance(leaves: Leaves) -> Tensor:
     return torch.cat(offsets, dim=-1)
 
 
-WAYS: dict[str, Way] = {
-    "fused": Way(fused, packed_leaves),
-    "substitution": Way(by_substitution, separate_leaves),
-    "solve_triangular": Way(by_solve_triangular, separate_leaves),
-    "slope": Way(by_slope, separate_leaves),
+WAYS: dict[str, Method] = {
+    "fused": Method(fused, packed_leaves),
+    "substitution": Method(by_substitution, separate_leaves),
+    "solve_triangular": Method(by_solve_triangular, separate_leaves),
+    "slope": Method(by_slope, separate_leaves),
 }

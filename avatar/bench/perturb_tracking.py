@@ -24,7 +24,7 @@ JITTER_SHARE = 0.2  # of the error, white from frame to frame
 DRIFT_SECONDS = 0.8  # over which the rest changes
 
 
-def disturbed(recording: Recording, head: HeadModel, seed: int) -> Recording:
+def perturbed(recording: Recording, head: HeadModel, seed: int) -> Recording:
     """The recording with errors such as those of real trackers; the same for the same seed. The neck keeps still."""
     given = values_of(recording.tracks)
     size = torch.zeros(given.shape[1], dtype=torch.float64)

@@ -18,6 +18,7 @@ from avatar.bench.results import Line, Panel, write_report
 from avatar.bench.train import Learner, make_learner, time_steps
 from avatar.data.frame import Frame
 from avatar.data.loader import FrameLoader
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.evaluation.find_lpips import find_lpips
 from avatar.pipeline.open import open_run
@@ -113,10 +114,8 @@ def minutes_of(learner: Learner, step: int, early: Time, late: Time) -> float:
 def held_out_frames(run: Run, count: int) -> list[Frame]:
     """As the tracker left them, where the tracking was refined: that was fitted to the frames' own pictures."""
     subject = run.subject.as_tracked()
-    test = subject.split.test
-    chosen = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, count).round().astype(int))]
     with FrameLoader(subject, run.config.data.size) as loader:
-        return list(loader.frames(chosen))
+        return list(loader.frames(evenly_spread(subject.split.test, count)))
 
 
 def pareto(curves: Sequence[Curve]) -> list[Curve]:

@@ -1,7 +1,7 @@
-"""What refinement gives back of what trackers' errors take: a subject's tracking disturbed, refined and trained on again.
+"""What refinement gives back of what trackers' errors take: a subject's tracking perturbed, refined and trained on again.
 
 The folder's own tracking stands for the truth, and its last frames, which no training sees, are measured. Four avatars of
-the same recipe: trained on the tracking as given, on the disturbed one, and on both as `avatar train --refine 1` refines
+the same recipe: trained on the tracking as given, on the perturbed one, and on both as `avatar train --refine 1` refines
 them, through an avatar that is only trained for that. Each is driven by the tracking that it was trained on; where that was
 refined, it was fitted to the measured frames' pictures too.
 """
@@ -18,7 +18,7 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.figures import Figures, head_figures
-from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed
+from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, perturbed
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config
 from avatar.data.recording import Recording
@@ -71,7 +71,7 @@ def measure(source: Source, config: Config, out: Path) -> list[Row]:
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(dir=out) as scratch:
         trial = Trial(subject, assets, config, Path(scratch))
-        bent = disturbed(subject.recording, HeadModel(assets, subject.identity), SEED)
+        bent = perturbed(subject.recording, HeadModel(assets, subject.identity), SEED)
         for name, recording, again in ((GIVEN, subject.recording, GIVEN_REFINED), (DISTURBED, bent, REFINED)):
             rows.append(trial.row(name, recording))
             rows.append(trial.row(again, trial.refined(recording, f"{name}, first")))

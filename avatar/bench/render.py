@@ -21,7 +21,7 @@ from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import limited_to
 from avatar.bench.results import write_report
-from avatar.bench.splat_gpu import settle
+from avatar.bench.splat_gpu import synchronize
 from avatar.bench.stages import Stopwatch
 from avatar.compute.device import on_gpu, to_device
 from avatar.errors import UserError
@@ -90,8 +90,8 @@ def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> li
         frames = inputs(trained, size, count=repeats)
         error = compare(trained, renderer, frames[:5])
         with torch.no_grad():
-            render = next_of([partial(settled, device, renderer.render, *frame) for frame in frames])
-            unfolded = next_of([partial(settled, device, draw_unfolded, trained, *frame) for frame in frames])
+            render = next_of([partial(synchronized, device, renderer.render, *frame) for frame in frames])
+            unfolded = next_of([partial(synchronized, device, draw_unfolded, trained, *frame) for frame in frames])
             with limited_to(threads=1):
                 steps = {} if on_gpu(renderer.background) else time_steps(renderer, frames)
                 (frame,) = paired_medians({"frame": render}, repeats, warm_up=3).values()
@@ -146,10 +146,10 @@ def draw_unfolded(trained: TrainedAvatar, params: HeadParams, camera: Camera) ->
     return trained.avatar.draw(trained.avatar(params, None, camera.head_rotation), camera, background)
 
 
-def settled(device: torch.device, function: Callable[..., object], *arguments: object) -> None:
+def synchronized(device: torch.device, function: Callable[..., object], *arguments: object) -> None:
     """Call it, and wait until a GPU is done with it."""
     function(*arguments)
-    settle(device)
+    synchronize(device)
 
 
 def next_of(calls: Sequence[Callable[[], object]]) -> Callable[[], object]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avatar.bench.clock import Time, paired_medians
 from avatar.bench.machine import available_simd, limited_to
-from avatar.bench.splat_gpu import device_of, settle
+from avatar.bench.splat_gpu import device_of, synchronize
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
@@ -221,12 +221,12 @@ def passes_of(variant: Variant, gaussians: Gaussians, size: int) -> dict[str, Ca
 
     def forward() -> None:
         drawn[:] = [draw(variant, leaves, size)]
-        settle(device)
+        synchronize(device)
 
     def backward() -> object:
         with limited_to(threads=variant.threads, simd=variant.simd):
             gradients = torch.autograd.grad(drawn.pop().image, leaves, cotangent)
-            settle(device)
+            synchronize(device)
             return gradients
 
     return {"forward": forward, "backward": backward}

@@ -11,7 +11,7 @@ def device_of(backend: str) -> torch.device:
     return torch.device("cuda") if backend == "gpu" and not interpreted() else CPU
 
 
-def settle(device: torch.device) -> None:
+def synchronize(device: torch.device) -> None:
     """Wait until a GPU has done what it was told."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

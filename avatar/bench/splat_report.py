@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 
 from avatar.bench import Request
+from avatar.bench.peak_memory import peak_memory
 from avatar.bench.results import Line, Panel, write_report
 from avatar.bench.splat import Row, Variant, all_variants, measure
-from avatar.bench.splat_work import peak_memory
 from avatar.splat.scenes import HEAD_SPLATS
 
 QUICK_SIZES, QUICK_COUNTS, QUICK_COUNT, QUICK_SIZE = (32, 64), (200, 500), 500, 64

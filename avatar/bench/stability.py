@@ -50,9 +50,9 @@ def measure(latents: Sequence[int], conditions: Sequence[float], count: int) -> 
             generator = torch.Generator().manual_seed(n)
             L = random_factor(count, ATTRIBUTE + n, condition, generator)
             latent = torch.randn(count, n, generator=generator).double()
-            truth = by_trick(L, latent, torch.float64)
+            truth = by_precision(L, latent, torch.float64)
             found = {
-                "trick float32": by_trick(L, latent, torch.float32),
+                "trick float32": by_precision(L, latent, torch.float32),
                 "direct float32": by_covariance(L, latent, torch.float32),
                 "direct float64": by_covariance(L, latent, torch.float64),
             }
@@ -73,7 +73,7 @@ def random_factor(
     return torch.linalg.cholesky(0.5 * (precision + precision.mT))
 
 
-def by_trick(L: Float[Tensor, "N s s"], latent: Float[Tensor, "N n"], dtype: torch.dtype) -> Float[Tensor, "N m"]:
+def by_precision(L: Float[Tensor, "N s s"], latent: Float[Tensor, "N n"], dtype: torch.dtype) -> Float[Tensor, "N m"]:
     m = L.shape[1] - latent.shape[1]
     factor = Factor(L[:, :m, :m].to(dtype), L[:, m:, :m].to(dtype))
     zero_a, zero_b = latent.new_zeros(len(L), m, dtype=dtype), torch.zeros_like(latent, dtype=dtype)

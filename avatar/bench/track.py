@@ -32,7 +32,7 @@ from avatar.demo.subject import make_subject
 from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
-from avatar.pipeline.track import bar
+from avatar.pipeline.track import progress_bar
 from avatar.train.order import planned_steps
 from data_prep.formats.avatar_track import LANDMARKS_FILE
 from data_prep.prepare.open import find_head, open_subject
@@ -141,7 +141,7 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
         for picture in filmed.pictures:
             add(picture)
     # The whole picture: it is then the true one's, pixel for pixel.
-    track(video, tracked, filmed.head, assets, Choices(crop="none"), progress=bar)
+    track(video, tracked, filmed.head, assets, Choices(crop="none"), progress=progress_bar)
     own, _ = open_subject(Source(tracked, filmed.head), config.data.test_frames, assets=assets)
     pairs = paired(own.recording, len(truth))
     held_out = set(own.split.test) & {mine for mine, true in pairs if true in truth.split.test}
@@ -151,7 +151,7 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
     avatars = {}
     for name, trial, recording in (
         (TRUE, of_truth, truth.recording),
-        (PICTURES, of_own, truly_tracked(own.recording, truth.recording, pairs)),
+        (PICTURES, of_own, with_true_tracking(own.recording, truth.recording, pairs)),
         (AUTOMATIC, of_own, own.recording),
         (REFINED, of_own, better),
         (AGAIN, of_own, of_own.refined(better, "second")),
@@ -189,7 +189,7 @@ def paired(own: Recording, count: int) -> list[tuple[int, int]]:
     return [(index, int(name)) for index, name in enumerate(own.names) if int(name) < count]
 
 
-def truly_tracked(own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Recording:
+def with_true_tracking(own: Recording, truth: Recording, pairs: Sequence[tuple[int, int]]) -> Recording:
     """The video's frames with the true tracking. Every frame must have a true one."""
     true_rows = torch.tensor([true for _, true in pairs])
     tracks = {name: values if name == "shape" else values[true_rows] for name, values in truth.tracks.items()}

@@ -11,9 +11,9 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.clock import Time, paired_medians
-from avatar.bench.floor import floor_ms
 from avatar.bench.results import write_report
-from avatar.bench.splat_gpu import settle
+from avatar.bench.roofline import roofline_ms
+from avatar.bench.splat_gpu import synchronize
 from avatar.bench.stages import Stopwatch
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import on_gpu
@@ -30,7 +30,7 @@ from avatar.train import step as train_step
 from avatar.train.objective import Objective, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
-from avatar.train.step import Judge, TrainState
+from avatar.train.step import GradientCheck, TrainState
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import WARM, StepRunner
 from data_prep.prepare.open import find_head, open_subject
@@ -63,14 +63,14 @@ class Learner:
     state: TrainState
     frames: Iterator[Frame]
     steps: StepRunner
-    judge: Judge | None  # None: every step is checked at once
+    check_gradients: GradientCheck | None  # None: every step is checked at once
 
     @property
     def avatar(self) -> Avatar:
         return self.state.avatar
 
     def step(self, number: int) -> None:
-        self.steps.make(number, next(self.frames), self.judge)
+        self.steps.make(number, next(self.frames), self.check_gradients)
 
 
 def run(request: Request) -> None:
@@ -134,11 +134,11 @@ def make_learner(
     corrections = make_pose_corrections(avatar, subject.recording.times(train), config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     state = TrainState(avatar, optimizer, objective, corrections)
-    judge = Guard(optimizer, device).judge if is_gpu else None
+    check_gradients = Guard(optimizer, device).check_gradients if is_gpu else None
     steps = StepRunner(state, say=say)
     for frame in frames:
         steps.vertices(frame)
-    return Learner(config, state, cycle(frames), steps, judge)
+    return Learner(config, state, cycle(frames), steps, check_gradients)
 
 
 def time_steps(learners: Sequence[Learner], repeats: int, warm_up: int = 2) -> list[tuple[Time, Time]]:
@@ -161,7 +161,7 @@ def run_steps(learner: Learner, late: bool) -> None:
             learner.step(first_late_step(learner) + number)
     else:
         learner.step(perceptual_start(learner.config.trainer) - 1)
-    settle(learner.avatar.device)
+    synchronize(learner.avatar.device)
 
 
 def steps_at_once(learner: Learner) -> int:
@@ -213,14 +213,14 @@ def floors(avatar: Avatar) -> dict[str, float]:
     products = 2 * code + 3 * sum(weight.numel() for weight in others)
     everything = sum(parameter.nbytes for parameter in avatar.parameters())
     found = {
-        "network": floor_ms(2.0 * places * products, 0.0, threads),
-        "optimizer": floor_ms(0.0, 7.0 * everything, threads),
-        "check": floor_ms(0.0, 1.0 * everything, threads),
+        "network": roofline_ms(2.0 * places * products, 0.0, threads),
+        "optimizer": roofline_ms(0.0, 7.0 * everything, threads),
+        "check": roofline_ms(0.0, 1.0 * everything, threads),
     }
     if avatar.hyper is not None:
         own = sum(parameter.nbytes for parameter in avatar.hyper.parameters())
         moved = 3 * own + 4 * len(avatar) * (3 * avatar.config.latent_dim + 2 * 10)
-        found["heads"] = floor_ms(0.0, moved, threads)
+        found["heads"] = roofline_ms(0.0, moved, threads)
     return found
 
 

@@ -21,7 +21,7 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.figures import Figures, head_figures
-from avatar.bench.perturb_tracking import disturbed
+from avatar.bench.perturb_tracking import perturbed
 from avatar.bench.refine import Trial
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config
@@ -128,7 +128,7 @@ def avatars(
     trial = Trial(target, assets, config, scratch)
     yield GIVEN, trial.trained(target.recording, GIVEN), target.recording
     if full:
-        recording = disturbed(target.recording, HeadModel(assets, target.identity), DISTURBED_SEED)
+        recording = perturbed(target.recording, HeadModel(assets, target.identity), DISTURBED_SEED)
         avatar = trial.trained(recording, DISTURBED)
         yield DISTURBED, avatar, recording
         better = trial.refined(recording, f"{DISTURBED}, first")

@@ -34,7 +34,7 @@ from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import plan_file, round_steps
-from avatar.pipeline.track import bar, head_for_video, tracking_lacks
+from avatar.pipeline.track import head_for_video, progress_bar, tracking_lacks
 from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
@@ -54,7 +54,7 @@ STEP = {"cpu": 99 / 4000, "cuda": 16 / 4000}  # docs/gpu.md
 FRAME_SIDE = 512  # pixels, at most, of what is tracked
 
 
-class Place(NamedTuple):
+class OutputPaths(NamedTuple):
     subject: Path
     run: Path
     page: Path
@@ -66,32 +66,32 @@ def run_create(arguments: Namespace) -> int:
     check_folder_output(out)
     check_outputs([out], [video, arguments.head])
     refuse_what_is_missing(arguments)
-    place = Place(out / "subject", out / "run", out / "avatar.html")
-    if place.run.exists() and not place.subject.exists():
-        raise UserError(f"{place.subject}, on which {place.run} began, is gone: choose another --out, or remove {out}")
-    training, head = training_arguments(arguments, place), head_for_video(video, arguments.head)
+    paths = OutputPaths(out / "subject", out / "run", out / "avatar.html")
+    if paths.run.exists() and not paths.subject.exists():
+        raise UserError(f"{paths.subject}, on which {paths.run} began, is gone: choose another --out, or remove {out}")
+    training, head = training_arguments(arguments, paths), head_for_video(video, arguments.head)
     training.head, assets = head, load_head_assets(head)
     say_plan(open_footage(video), assets, training)
     print(f"Folder       {out}")
     say_stage(1, "the face is tracked")
-    info = track(video, place.subject, head, assets, progress=bar)
+    info = track(video, paths.subject, head, assets, progress=progress_bar)
     say_stage(2, "is the tracking good enough?")
-    judge_tracking(info, place.subject, arguments.anyway)
+    judge_tracking(info, paths.subject, arguments.anyway)
     say_stage(3, "the avatar is trained")
-    if (status := train_as_asked(place.run, training)) != OK:
+    if (status := train_as_asked(paths.run, training)) != OK:
         print("Start the same command again to go on.")
         return status
     say_stage(4, "the avatar is measured, and its page written")
-    results, trained = measured(place.run), open_trained(place.run)
-    write_page(replace(trained, recording=replace(trained.recording, name=safe_name(video.stem))), place.page)
+    results, trained = measured(paths.run), open_trained(paths.run)
+    write_page(replace(trained, recording=replace(trained.recording, name=safe_name(video.stem))), paths.page)
     print(f"Held-out frames: {figures(results)}")
-    print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {place.page}, the avatar in a browser.")
-    print(f"  {place.subject / 'overlay'}   the tracked mesh on the video")
+    print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {paths.page}, the avatar in a browser.")
+    print(f"  {paths.subject / 'overlay'}   the tracked mesh on the video")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
-    print(f"Next         avatar view {place.run}")
-    print(f"             avatar reenact {place.run} ANOTHER.mp4")
+    print(f"Next         avatar view {paths.run}")
+    print(f"             avatar reenact {paths.run} ANOTHER.mp4")
     if arguments.open:
-        show(place.page)
+        show(paths.page)
     return OK
 
 
@@ -109,23 +109,23 @@ def refuse_what_is_missing(arguments: Namespace) -> None:
         raise UserError("\n  ".join(["this is missing, or of no use, and nothing was begun:", *missing]))
 
 
-def training_arguments(arguments: Namespace, place: Place) -> Namespace:
+def training_arguments(arguments: Namespace, paths: OutputPaths) -> Namespace:
     """Those of `avatar train` with the same choices; a run that has begun is resumed.
 
     Raises UserError for choices that no training takes.
     """
     given = {name: getattr(arguments, name) for name in ("size", "iterations", "device", "refine")}
-    begun, has_rounds = is_begun(place.run), plan_file(place.run).exists()
+    begun, has_rounds = is_begun(paths.run), plan_file(paths.run).exists()
     if given["refine"] is None and not begun and not has_rounds:
         given["refine"] = ROUNDS
     if given["refine"] == 0 and not has_rounds:
         given["refine"] = None
     words = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    training = parse(["train", str(place.subject.resolve()), *words])
-    training.folder, training.out, training.resume = place.subject, place.run, begun or has_rounds
+    training = parse(["train", str(paths.subject.resolve()), *words])
+    training.folder, training.out, training.resume = paths.subject, paths.run, begun or has_rounds
     load_config(overrides := config_overrides(training))
     if training.refine is not None and not training.resume:
-        check_rounds(place.run, training.refine, None, overrides)
+        check_rounds(paths.run, training.refine, None, overrides)
     return training
 
 

@@ -16,8 +16,8 @@ from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.open import open_driver
 from avatar.pipeline.reenact import reenact
-from avatar.pipeline.track import bar, can_track
-from avatar.pipeline.train_refined import go_on_or_begin, is_begun
+from avatar.pipeline.track import can_track, progress_bar
+from avatar.pipeline.train_refined import continue_or_begin, is_begun
 from avatar.runs.run import open_trained, read_run_info
 from data_prep.track.track import track
 
@@ -43,10 +43,10 @@ def run_demo(arguments: Namespace) -> int:
     if is_begun(run) and read_run_info(run).source.folder.resolve() != actor.resolve():
         raise UserError(f"{run} is a run of another video; choose another folder for the demo")
     missing = [person for person in (ACTOR, DRIVER) if not (out / person.name).is_dir()]
-    make = film_and_track if missing and can_track(say_why_not) else make_tracked
+    make = film_and_track if missing and can_track(print_missing) else make_tracked
     for person in missing:
         make(person, out)
-    status = go_on_or_begin(Source(actor, head_beside(actor)), RECIPE, run)
+    status = continue_or_begin(Source(actor, find_subject_head(actor)), RECIPE, run)
     if status != OK:
         return status
     trained = open_trained(run)
@@ -66,23 +66,23 @@ def run_demo(arguments: Namespace) -> int:
 
 def film_and_track(person: Person, out: Path) -> None:
     """As with anybody's own video: only its pictures are known."""
-    head, video = head_beside(out / person.name), out / f"{person.name}.mp4"
+    head, video = find_subject_head(out / person.name), out / f"{person.name}.mp4"
     if not head.is_dir():
         make_head_model(head)
     if not video.is_file():
         make_video(video, person.frames, VIDEO_SIZE, person.seed, "speech")
-    track(video, out / person.name, head, load_head_assets(head), progress=bar)
+    track(video, out / person.name, head, load_head_assets(head), progress=progress_bar)
 
 
 def make_tracked(person: Person, out: Path) -> None:
     make_subject(out / person.name, person.frames, SUBJECT_SIZE, person.seed, "speech")
 
 
-def head_beside(folder: Path) -> Path:
+def find_subject_head(folder: Path) -> Path:
     """The head model in a subject's folder, where it has one, or the one of all that were filmed."""
     own = folder / "head_model"
     return own if own.is_dir() else folder.with_name("head_model")
 
 
-def say_why_not(missing: str) -> None:
+def print_missing(missing: str) -> None:
     print(f"The two people are made with their tracking, not filmed and tracked: {missing}")

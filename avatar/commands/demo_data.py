@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from avatar.commands.demo import head_beside
+from avatar.commands.demo import find_subject_head
 from avatar.commands.outputs import check_outputs
 from avatar.demo import make_camera_folder, make_head_model, make_subject, make_video
 from avatar.errors import UserError
@@ -29,7 +29,7 @@ def run_demo_data(arguments: Namespace) -> int:
     frames, motion = _or(arguments.frames, 600), arguments.motion or "speech"
     if is_video:
         make_video(arguments.out, frames, _or(arguments.size, 512), arguments.seed, motion)
-        if not (head := head_beside(arguments.out)).exists():
+        if not (head := find_subject_head(arguments.out)).exists():
             make_head_model(head)
             print(f"Head   {head}")
         print(f"Next   avatar create {arguments.out} --head {head}")

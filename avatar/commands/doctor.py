@@ -46,7 +46,7 @@ class Finding(NamedTuple):
     is_broken: bool = False  # and every command needs it
 
 
-def diagnose(say: Callable[[str], None] = print) -> int:
+def run_doctor(_: Namespace) -> int:
     """Print the table of findings and the addresses of what is missing.
 
     Returns 1 when something that every command needs does not work, else 0.
@@ -54,13 +54,13 @@ def diagnose(say: Callable[[str], None] = print) -> int:
     found = [*essentials(), gpu(), head_model(), *map(model_file, TRACKING_FILES), *map(lpips, LPIPS_FILES)]
     found += [package(name) for name in EXTRAS]
     system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
-    say(f"avatar {__version__}, Python {platform.python_version()}, {system}\n")
+    print(f"avatar {__version__}, Python {platform.python_version()}, {system}\n")
     for line in table(found):
-        say(line)
+        print(line)
     if missing := [finding for finding in found if finding.addresses]:
-        say(f"\nAddresses: files go into {models_folder()}, those of LPIPS into {lpips_folder()}")
+        print(f"\nAddresses: files go into {models_folder()}, those of LPIPS into {lpips_folder()}")
         for finding in missing:
-            say("\n".join([f"  {finding.name}", *(f"    {address}" for address in finding.addresses)]))
+            print("\n".join([f"  {finding.name}", *(f"    {address}" for address in finding.addresses)]))
     return 1 if any(finding.is_broken for finding in found) else 0
 
 
@@ -183,7 +183,3 @@ def package(name: str) -> Finding:
         return Finding(name, version(name))
     except PackageNotFoundError:
         return Finding(name, "missing", f"{purpose}: {install(extra)}")
-
-
-def run_doctor(_: Namespace) -> int:
-    return diagnose()

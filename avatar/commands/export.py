@@ -79,10 +79,10 @@ def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
         print(f"Note     {page.note}")
     print(f"Licence  {licence_of(SKINNING)}")
     if pack is not None:
-        keep_pack(pack, out)
+        write_mediapipe_pack(pack, out)
 
 
-def keep_pack(pack: bytes, out: Path) -> None:
+def write_mediapipe_pack(pack: bytes, out: Path) -> None:
     """Write the face landmarker beside a page or an avatar."""
     path = out.with_name(PACK)
     write_atomically(path, pack)
@@ -97,7 +97,7 @@ def write_web_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> N
     print(f'Avatar   {out} ({size / MIB:.1f} MiB), for <avatar-view src="{out.name}">')
     print(f"Licence  {licence_of(SKINNING)}")
     if pack is not None:
-        keep_pack(pack, out)
+        write_mediapipe_pack(pack, out)
 
 
 def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:

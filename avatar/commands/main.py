@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
     except UserError as error:
         return failed(str(error))
     except BrokenPipeError:
-        return nobody_reads()
+        return end_without_reader()
     except OSError as error:
         place = "" if error.filename is None else f"{error.filename}: "
         return failed(f"{place}{error.strerror or error}")
@@ -58,7 +58,7 @@ def failed(reason: str) -> int:
     return EXIT_ERROR
 
 
-def nobody_reads() -> int:
+def end_without_reader() -> int:
     """What was printed went to a program that has ended, such as `head`."""
     drop_output()
     return EXIT_ERROR

@@ -69,9 +69,3 @@ def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
         metavar="auto|cpu|cuda[:N]",
         help=f"what computes; auto takes a GPU that passes its test (default: {default})",
     )
-
-
-def add_token(parser: argparse.ArgumentParser, meaning: str) -> None:
-    parser.add_argument(
-        "--token", metavar="TEXT", help=f"{meaning}; other users of this machine can read the command line"
-    )

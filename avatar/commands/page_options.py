@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from avatar.commands.options import add_avatar, add_device, add_folder, add_head, add_token
+from avatar.commands.options import add_avatar, add_device, add_folder, add_head
 
 
 def add_create(create: argparse.ArgumentParser) -> None:
@@ -61,7 +61,12 @@ def add_view(view: argparse.ArgumentParser) -> None:
         "--host", default="127.0.0.1", help="address to listen on; 0.0.0.0: other machines can open the page, too"
     )
     view.add_argument("--port", type=int, default=8080, help="default: 8080; 0 takes a free one")
-    add_token(view, "what a browser and a stream must know (default: $AVATAR_TOKEN, else made up)")
+    view.add_argument(
+        "--token",
+        metavar="TEXT",
+        help="what a browser and a stream must know (default: $AVATAR_TOKEN, else made up); other users of this machine "
+        "can read the command line",
+    )
     view.add_argument(
         "--url", metavar="ADDRESS", help="where a proxy shows the page, such as https://hub.example.org/proxy/8080/"
     )

@@ -15,9 +15,9 @@ from avatar.compute.interruption import interruption
 from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.pipeline import OK
-from data_prep.live.film import WARM_UP, Film
 from data_prep.live.guidance import ENDS, PROMPTS, Adviser, Seen, measures, reaches
 from data_prep.live.pictures import FILMED, Newest, open_source
+from data_prep.live.video_recorder import WARM_UP, VideoRecorder
 from data_prep.track.faces.detect import FaceDetector
 
 SUFFIXES = (".mp4", ".mov", ".mkv")
@@ -50,7 +50,7 @@ def run_record(arguments: Namespace) -> int:
     check_file(out, SUFFIXES, "a film")
     screen, seen, wrong = Screen(), list[Seen](), Counter[str]()
     with interruption(second_acts=False) as interrupted, FaceDetector() as detector:
-        film = Film(open_source(arguments.webcam, FILMED))
+        film = VideoRecorder(open_source(arguments.webcam, FILMED))
         with closing(Newest(film)) as newest:
             screen.say(
                 f"Camera   {film.name}, {film.size[0]} x {film.size[1]} pixels. Ctrl-C ends, and keeps the film."
@@ -79,7 +79,7 @@ def between_pictures(interrupted: Callable[[], bool]) -> None:
 
 
 def wait_for_face(
-    newest: Newest, film: Film, detector: FaceDetector, screen: Screen, interrupted: Callable[[], bool]
+    newest: Newest, film: VideoRecorder, detector: FaceDetector, screen: Screen, interrupted: Callable[[], bool]
 ) -> float:
     """The camera's rate, once that is known and a face there. Raises UserError when the pictures end before."""
     newest.start()
@@ -117,20 +117,20 @@ def follow_prompts(
         face = next(iter(detector.find(picture.image)), None)
         if face is not None:
             seen.append(Seen(time, measures(face)))
-        wrong[advice := adviser.hear(picture.image, face, time)] += 1
-        screen.rewrite(advice, f"{ENDS[number] - time:.0f} s")
+        wrong[problem := adviser.advise(picture.image, face, time)] += 1
+        screen.rewrite(problem, f"{ENDS[number] - time:.0f} s")
 
 
-def report(screen: Screen, film: Film, seen: list[Seen], wrong: Counter[str]) -> None:
+def report(screen: Screen, film: VideoRecorder, seen: list[Seen], wrong: Counter[str]) -> None:
     """The film's length and rate, what was wrong with the pictures, and what each prompt reached."""
     slow = "; more light: cameras slow down in the dark" if film.repeated > OFTEN * film.frames else ""
     screen.say(
         f"         {film.frames / film.rate:.1f} s at {film.rate:g} pictures a second; missing ones repeated: "
         f"{film.repeated}, early ones left out: {film.left_out}{slow}"
     )
-    for advice, count in wrong.most_common():
-        if advice and count > OFTEN * wrong.total():
-            screen.say(f"Picture  {100 * count / wrong.total():.0f} % of the time: {advice}")
+    for problem, count in wrong.most_common():
+        if problem and count > OFTEN * wrong.total():
+            screen.say(f"Picture  {100 * count / wrong.total():.0f} % of the time: {problem}")
     for prompt, reached in zip(PROMPTS, reaches(seen), strict=True):
         got = {} if reached is None else reached
         told = ", ".join(f"{name} {got[name]:.2g} of {least:g}" for name, least in prompt.least.items() if name in got)

@@ -15,7 +15,7 @@ from avatar.pipeline.backdrop import parse_backdrop
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_driver
 from avatar.pipeline.reenact import PICTURES, Choices, first_file, reenact, sidecars
-from avatar.pipeline.track import is_video, tracked_once
+from avatar.pipeline.track import cached_tracking, is_video
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained import TrainedAvatar
 from data_prep.formats.avatar_track import read_info
@@ -42,7 +42,7 @@ def run_reenact(arguments: Namespace) -> int:
     else:
         sound = None
         if is_video(driver):
-            video, driver = driver, tracked_once(driver, head_of(arguments, trained), trained.assets)
+            video, driver = driver, cached_tracking(driver, head_of(arguments, trained), trained.assets)
             sound = (video, read_info(driver).source["begins"]) if video.is_file() else None
         reenact(trained, open_driver(driver, trained, arguments), out, choices, backdrop=backdrop, sound=sound)
     return OK

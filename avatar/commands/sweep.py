@@ -13,7 +13,7 @@ from avatar.evaluation.compare_tables import FORMATS, text, write_tables
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.sweep.engines import EngineOptions, make_engine
 from avatar.sweep.results import fold_results
-from avatar.sweep.run_sweep import conduct
+from avatar.sweep.run_sweep import run_jobs
 from avatar.sweep.spec import Spec, read_spec
 from avatar.sweep.state import SWEEP_FILE, State, read_state, read_sweep, write_state, write_sweep
 from avatar.sweep.status import Progress, full_table, overview
@@ -39,7 +39,7 @@ def run_sweep(arguments: Namespace) -> int:
     print(f"{len(spec.jobs)} jobs on {engine.name}; their files are in {folder / 'jobs'}")
     try:
         with closing(engine):
-            states = conduct(folder, spec, engine, Progress(arguments.workers))
+            states = run_jobs(folder, spec, engine, Progress(arguments.workers))
     except KeyboardInterrupt:
         print(f"\nInterrupted; what was done is kept. Go on with: avatar sweep --out {folder}")
         return INTERRUPTED

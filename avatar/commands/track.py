@@ -9,7 +9,7 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
-from avatar.pipeline.track import bar, head_for_video
+from avatar.pipeline.track import head_for_video, progress_bar
 from data_prep.track.crop import parse_crop
 from data_prep.track.footage.source import Span
 from data_prep.track.rig import track_rig
@@ -32,7 +32,7 @@ def run_track(arguments: Namespace) -> int:
         matte=arguments.matte,
         rotate=arguments.rotate,
     )
-    track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=bar)
+    track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=progress_bar)
     print(f"Look at  {arguments.out / 'overlay'}")
     print(f"Next     avatar train {arguments.out}")
     return OK
@@ -46,7 +46,7 @@ def _track_rig(arguments: Namespace, head: Path, span: Span) -> int:
             "leave out --focal, --fov, --rotate, --crop and --matte"
         )
     track_rig.track_rig(
-        arguments.video, arguments.out, head, load_head_assets(head), arguments.size, span, progress=bar
+        arguments.video, arguments.out, head, load_head_assets(head), arguments.size, span, progress=progress_bar
     )
     print(f"Look at  {arguments.out / 'front' / 'overlay'}")
     print(f"Next     avatar train {arguments.out} --head {head}")

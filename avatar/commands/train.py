@@ -18,7 +18,7 @@ from avatar.pipeline import OK
 from avatar.pipeline.dry_run import estimate_training
 from avatar.pipeline.open import at_new_place, source_of
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, plan_file
-from avatar.pipeline.track import head_for_video, is_video, tracked_once
+from avatar.pipeline.track import cached_tracking, head_for_video, is_video
 from avatar.pipeline.train import resume_run, train_new
 from avatar.pipeline.train_refined import begin_rounds, train_refined
 from avatar.runs.run import RUN_FILE, RunInfo, read_run_info, refuse_trained
@@ -31,7 +31,7 @@ def run_train(arguments: Namespace) -> int:
     if arguments.print_config:
         print_config(config_overrides(arguments))
         return OK
-    settle_paths(arguments)
+    assign_paths(arguments)
     if arguments.dry_run:
         return dry_run(arguments)
     run = arguments.out or default_run(arguments.folder)
@@ -47,7 +47,7 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
     if arguments.device is not None and (arguments.refine is not None or has_plan):
         overrides.append(f"device={arguments.device}")
     if arguments.resume and has_plan:
-        forget_video(arguments)
+        drop_video(arguments)
         plan = Plan.load(run)
         refuse_changed_plan(run, plan, arguments, overrides)
         source = moved_plan_source(run, plan.source, arguments)
@@ -58,7 +58,7 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
     if arguments.resume:
         if arguments.refine is not None:
             raise UserError(f"{run} began without --refine: leave it out to resume, or start a new run")
-        forget_video(arguments)
+        drop_video(arguments)
         refuse_changed_run(run, read_run_info(run), arguments, overrides)
         return resume_run(run, arguments.head, arguments.folder, arguments.device or asked_device(overrides))
     begin = time.monotonic()
@@ -96,7 +96,7 @@ def dry_run(arguments: Namespace) -> int:
     return status
 
 
-def settle_paths(arguments: Namespace) -> None:
+def assign_paths(arguments: Namespace) -> None:
     """Which of the paths that were typed without an option is the run, and which the tracked folder."""
     runs = [path for path in arguments.paths if (path / RUN_FILE).is_file() or plan_file(path).is_file()]
     if runs and not arguments.resume:
@@ -158,11 +158,11 @@ def tracked_source(arguments: Namespace) -> Source:
     """What to train on; a video is tracked first."""
     if is_video(arguments.folder):
         head = head_for_video(arguments.folder, arguments.head)
-        arguments.head, arguments.folder = head, tracked_once(arguments.folder, head)
+        arguments.head, arguments.folder = head, cached_tracking(arguments.folder, head)
     return source_of(arguments)
 
 
-def forget_video(arguments: Namespace) -> None:
+def drop_video(arguments: Namespace) -> None:
     """A run that is resumed knows where the tracking of its video is."""
     if arguments.folder is not None and is_video(arguments.folder):
         arguments.folder = None

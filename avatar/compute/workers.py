@@ -43,14 +43,14 @@ def single_threaded_workers(count: int) -> Iterator[ThreadPoolExecutor]:
     before = torch.get_num_threads()
     all_run = threading.Barrier(count + 1)
 
-    def settle() -> None:
+    def use_one_thread() -> None:
         torch.get_num_threads()  # a thread's first use of torch sets its number to the process's: before, not after
         torch.set_num_threads(1)
         all_run.wait()
 
     with ThreadPoolExecutor(count, thread_name_prefix="worker") as pool:
         for _ in range(count):
-            pool.submit(settle)
+            pool.submit(use_one_thread)
         all_run.wait()
         # torch sets the number for the calling thread and as the start value of threads to come: put that back.
         torch.set_num_threads(before)

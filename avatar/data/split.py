@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from avatar.errors import UserError
 
 TEST_FRAMES, TRAIN_FRAMES = 500, 2000  # FlashAvatar's protocol for clips that are long enough for it
 SHORT_CLIP_TRAIN_FRACTION = 0.8
+Item = TypeVar("Item")
 
 
 class Split(NamedTuple):
@@ -51,6 +52,7 @@ def split_frames(count: int, test_frames: int | None = None) -> Split:
     return Split(tuple(range(available - train, available)), tuple(range(available, count)))
 
 
-def evenly_spread(frames: Sequence[int], count: int) -> list[int]:
-    """`count` of the frames, from the first to the last; all where there are fewer."""
-    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+def evenly_spread(items: Sequence[Item], count: int) -> list[Item]:
+    """`count` of the items, from the first to the last; all where there are fewer."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[i] for i in places.tolist()]

@@ -98,7 +98,8 @@ def lower_mouth() -> Prop:
     return join([_tooth_row(False), tongue])
 
 
-def _tube(path: np.ndarray, radius: np.ndarray, closed: bool, colour: np.ndarray, sides: int = 8) -> Prop:
+def _tube(path: np.ndarray, radius: np.ndarray, closed: bool, colour: np.ndarray) -> Prop:
+    sides = 8
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0)
     if not closed:
         ahead[0], ahead[-1] = path[1] - path[0], path[-1] - path[-2]

@@ -68,14 +68,14 @@ def write_head_model(folder: Path, head: DemoHead) -> None:
     corners = np.stack((head.mesh.faces, head.mesh.uv_faces), -1) + 1
     lines += ["f " + " ".join(f"{v}/{vt}" for v, vt in face) for face in corners]
     (folder / "head_template.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
-    names = {"names": head.expression_names, "arkit": _both_sides(_ARKIT)}
+    names = {"names": head.expression_names, "arkit": _both_sides()}
     (folder / NAMES_FILE).write_text(json.dumps(names, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _both_sides(weights: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+def _both_sides() -> dict[str, dict[str, float]]:
     mirrored = {
         name.replace("Left", "Right"): {target.replace("_left", "_right"): w for target, w in own.items()}
-        for name, own in weights.items()
+        for name, own in _ARKIT.items()
         if name.endswith("Left") and name != "MouthLeft"
     }
-    return weights | mirrored
+    return _ARKIT | mirrored

@@ -15,10 +15,10 @@ REACH = 0.62  # metres of the scene that a map covers
 BIAS = 0.0025  # metres
 
 
-def neutral_params(num_expressions: int = 100) -> HeadParams:
+def neutral_params() -> HeadParams:
     """No expression, jaw closed, eyes ahead and open."""
     identity = torch.tensor(IDENTITY_6D)
-    return HeadParams(torch.zeros(num_expressions), identity, identity.repeat(2), torch.zeros(2), identity)
+    return HeadParams(torch.zeros(100), identity, identity.repeat(2), torch.zeros(2), identity)
 
 
 def ambient_occlusion(performer: scene.Performer) -> np.ndarray:

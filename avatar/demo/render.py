@@ -44,7 +44,7 @@ class RenderedFrame(NamedTuple):
     mouth: np.ndarray  # lips and what is seen between them
 
 
-class Stage(NamedTuple):
+class PosedScene(NamedTuple):
     """A person posed in the studio: what all cameras share. Vertex values are in the studio's axes."""
 
     params: HeadParams
@@ -87,14 +87,14 @@ class Renderer:
         R_studio_head = VIEW_AXES @ camera.R_cam_world.numpy().astype(np.float32)
         t_studio_head = VIEW_AXES @ camera.t_cam_world.numpy().astype(np.float32)
         in_front = replace(camera, R_cam_world=torch.from_numpy(VIEW_AXES), t_cam_world=torch.zeros(3))
-        return self.look(self.stage(params, R_studio_head, t_studio_head), in_front)
+        return self.render_scene(self.pose_scene(params, R_studio_head, t_studio_head), in_front)
 
-    def stage(self, params: HeadParams, R_studio_head: np.ndarray, t_studio_head: np.ndarray) -> Stage:
+    def pose_scene(self, params: HeadParams, R_studio_head: np.ndarray, t_studio_head: np.ndarray) -> PosedScene:
         """The person with FLAME parameters `params` and the head's float32 pose in the studio."""
         performer = self.performer
         geometry = performer.pose(params, _partial_turn(R_studio_head.T, 1.0 - BODY_SHARE))
         slopes = (lighting.turn(slopes, R_studio_head) for slopes in (performer.slopes_u, performer.slopes_v))
-        return Stage(
+        return PosedScene(
             params=params,
             geometry=geometry,
             R_studio_head=R_studio_head,
@@ -107,22 +107,22 @@ class Renderer:
             shadow_map=self._shadow_map(geometry, R_studio_head),
         )
 
-    def look(self, stage: Stage, camera: Camera) -> RenderedFrame:
-        """The picture of a stage from `camera`, whose world is the studio."""
+    def render_scene(self, posed: PosedScene, camera: Camera) -> RenderedFrame:
+        """The picture of a scene from `camera`, whose world is the studio."""
         big = camera.resized(SUPERSAMPLE * camera.width, SUPERSAMPLE * camera.height)
         R_view_studio = VIEW_AXES @ camera.R_cam_world.numpy().astype(np.float32)
         t_view_studio = VIEW_AXES @ camera.t_cam_world.numpy().astype(np.float32)
-        R_view = R_view_studio @ stage.R_studio_head
-        t_view = R_view_studio @ stage.t_studio_head + t_view_studio
-        geometry = stage.geometry
+        R_view = R_view_studio @ posed.R_studio_head
+        t_view = R_view_studio @ posed.t_studio_head + t_view_studio
+        geometry = posed.geometry
         raster = rasterize_mesh(
             to_screen(geometry.points, R_view, t_view, big), self.performer.faces, big.height, big.width
         )
         pixels = covered(raster, self.performer.faces, big, R_view_studio)
         depth = raster.depth[pixels.row, pixels.column]
-        lit = self._key_share(stage, pixels.ray * depth[:, None] - R_view_studio.T @ t_view_studio)
+        lit = self._key_share(posed, pixels.ray * depth[:, None] - R_view_studio.T @ t_view_studio)
 
-        attributes = pixels.interpolate(stage.surface)
+        attributes = pixels.interpolate(posed.surface)
         whole = shading.Surface(
             normals=lighting.unit(attributes[:, :3]),
             view=-lighting.unit(pixels.ray),
@@ -135,25 +135,25 @@ class Renderer:
         for kind in np.unique(material):
             at = np.flatnonzero(material == kind)
             surface = shading.Surface(*[np.take(values, at, axis=0) for values in whole])
-            colour[at] = self._shade(int(kind), surface, pixels.take(at), stage)
+            colour[at] = self._shade(int(kind), surface, pixels.take(at), posed)
         if len(geometry.lens_points):
             lenses = to_screen(geometry.lens_points, R_view, t_view, big)
             front = rasterize_mesh(lenses, self.performer.lenses.faces, big.height, big.width)
-            self._add_lenses(colour, front, pixels, depth, whole.view, stage)
-        return self._develop(colour, material, pixels, camera)
+            self._add_lenses(colour, front, pixels, depth, whole.view, posed)
+        return self._to_picture(colour, material, pixels, camera)
 
-    def _shade(self, kind: int, surface: shading.Surface, pixels: Pixels, stage: Stage) -> np.ndarray:
+    def _shade(self, kind: int, surface: shading.Surface, pixels: Pixels, posed: PosedScene) -> np.ndarray:
         if kind == scene.SKIN:
-            return self._shade_skin(surface, pixels, stage)
+            return self._shade_skin(surface, pixels, posed)
         if kind == scene.HAIR:
             corners = pixels.corners - self.performer.starts[kind]
-            strands, rest = (pixels.interpolate(a, corners) for a in (stage.strands, self.performer.hair_rest))
+            strands, rest = (pixels.interpolate(a, corners) for a in (posed.strands, self.performer.hair_rest))
             return shading.hair(surface, self.lights, strands, shading.strand_pattern(self._strands, rest))
         if kind in (scene.EYE_LEFT, scene.EYE_RIGHT):
             side = int(kind == scene.EYE_RIGHT)
-            outward = lighting.turn(surface.normals, stage.R_studio_head.T)
-            shadow = _lid_shadow(self.performer.head, stage.geometry, side, outward)
-            turn = stage.R_studio_head @ stage.geometry.eye_turns[side]
+            outward = lighting.turn(surface.normals, posed.R_studio_head.T)
+            shadow = _lid_shadow(self.performer.head, posed.geometry, side, outward)
+            turn = posed.R_studio_head @ posed.geometry.eye_turns[side]
             return shading.eye(surface, self.lights, self.iris, turn, shadow)
         if kind in (scene.MOUTH_UPPER, scene.MOUTH_LOWER, scene.LINING):
             return shading.mouth(surface, self.lights)
@@ -161,14 +161,14 @@ class Renderer:
             return shading.frame(surface, self.lights)
         return shading.cloth(surface, self.lights)
 
-    def _shade_skin(self, surface: shading.Surface, pixels: Pixels, stage: Stage) -> np.ndarray:
+    def _shade_skin(self, surface: shading.Surface, pixels: Pixels, posed: PosedScene) -> np.ndarray:
         texels = pixels.interpolate(self._texels, self.performer.head.mesh.uv_faces[pixels.face])
-        expression = stage.params.expression.numpy()[: self._wrinkles_of.shape[1]]
+        expression = posed.params.expression.numpy()[: self._wrinkles_of.shape[1]]
         wrinkle = np.clip(self._wrinkles_of[:, : len(expression)] @ expression, 0.0, 1.2)
         low, high = (lighting.lookup(half, texels) for half in self._relief)
         relief = low[:, :2] + wrinkle[0] * low[:, 2:] + wrinkle[1] * high[:, :2] + wrinkle[2] * high[:, 2:]
         colour = lighting.lookup(self.skin.colour, texels)
-        return shading.skin(surface, self.lights, colour, relief, pixels.interpolate(stage.skin_slopes))
+        return shading.skin(surface, self.lights, colour, relief, pixels.interpolate(posed.skin_slopes))
 
     def _shadow_map(self, geometry: scene.Geometry, R_studio_head: np.ndarray) -> np.ndarray:
         """What the key light sees first."""
@@ -178,11 +178,11 @@ class Renderer:
         raster = rasterize_mesh(on_map + away, self.performer.faces, size, size)
         return lighting.blurred_shadow_map(raster.depth - away[2], raster.face_id >= 0)
 
-    def _key_share(self, stage: Stage, at: np.ndarray) -> np.ndarray:
+    def _key_share(self, posed: PosedScene, at: np.ndarray) -> np.ndarray:
         """Share of the key light [N] at points [N, 3] of the studio."""
-        centre = stage.R_studio_head @ SCENE_CENTRE + stage.t_studio_head
+        centre = posed.R_studio_head @ SCENE_CENTRE + posed.t_studio_head
         on_map = lighting.turn(at - centre, lighting.shadow_basis(self.lights.key)) * _ON_MAP + _MAP_CENTRE
-        return lighting.lit_share(stage.shadow_map, on_map)
+        return lighting.lit_share(posed.shadow_map, on_map)
 
     def _add_lenses(
         self,
@@ -191,7 +191,7 @@ class Renderer:
         pixels: Pixels,
         depth: np.ndarray,
         view: np.ndarray,
-        stage: Stage,
+        posed: PosedScene,
     ) -> None:
         """Lay what the lenses, rasterised as `front`, mirror over the pixels behind them, in place."""
         faces = self.performer.lenses.faces
@@ -199,10 +199,10 @@ class Renderer:
         at = np.flatnonzero((face >= 0) & (lens_depth < depth))
         weights = front.barycentric[pixels.row[at], pixels.column[at]]
         normals = np.einsum("nkc,nk->nc", self.performer.lens_normals[faces[face[at]]], weights)
-        normals = lighting.turn(normals, stage.R_studio_head)
+        normals = lighting.turn(normals, posed.R_studio_head)
         colour[at] = shading.lens(colour[at], lighting.unit(normals), view[at], self.lights)
 
-    def _develop(self, colour: np.ndarray, material: np.ndarray, pixels: Pixels, camera: Camera) -> RenderedFrame:
+    def _to_picture(self, colour: np.ndarray, material: np.ndarray, pixels: Pixels, camera: Camera) -> RenderedFrame:
         height, width = SUPERSAMPLE * camera.height, SUPERSAMPLE * camera.width
         canvas = _background(tuple(self.identity.background.tolist()), height, width).copy()
         canvas[pixels.row, pixels.column] = lighting.tone_map(colour)

@@ -134,7 +134,6 @@ class Performer:
         self._hair_of = _ancestry(parents, len(template))[used]
         at = self._hair_of @ template
         depth = hair_cover(at, identity)
-        self.hair_depth = depth.astype(np.float32)
         seed = identity.seed * 101
         flow = np.stack((at[:, 0] * 1.0, at[:, 1] * 0.32, at[:, 2] * 0.32), -1)
         clumps = fractal_noise(flow, 9.0, 2, seed + 31)

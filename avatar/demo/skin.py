@@ -18,6 +18,8 @@ from avatar.demo.identity import Identity
 from avatar.demo.mesh import EYE_CENTRE, lip_line, smooth_max, smooth_min
 from avatar.head.rasterize import rasterize_mesh
 
+STRAND_SIZE, IRIS_SIZE = 512, 256  # texels a side
+
 
 class SkinTextures(NamedTuple):
     """Float32 maps [T, T, C] whose row 0 is v = 1 (the top of the chart)."""
@@ -162,9 +164,9 @@ def bake_skin(head: DemoHead, identity: Identity, size: int) -> SkinTextures:
     )
 
 
-def strand_tile(seed: int, size: int = 512) -> np.ndarray:
+def strand_tile(seed: int) -> np.ndarray:
     """A periodic map [S, S] of hair strands that run along its rows' axis; unit variance, roughly."""
-    noise = np.random.default_rng((seed, 7)).standard_normal((size, size))
+    noise = np.random.default_rng((seed, 7)).standard_normal((STRAND_SIZE, STRAND_SIZE))
     fine = gaussian_filter(noise, (26.0, 0.8), mode="wrap")
     locks = gaussian_filter(noise[::-1], (40.0, 4.0), mode="wrap")
     return (0.8 * fine / fine.std() + 0.6 * locks / locks.std()).astype(np.float32)
@@ -234,10 +236,10 @@ def _brow_strokes(position: np.ndarray, identity: Identity) -> np.ndarray:
     return np.clip(mask / 255.0 * 0.85 + 0.42 * soft, 0, 0.95) * (0.6 + 0.4 * identity.brow_density)
 
 
-def paint_iris(identity: Identity, size: int = 256) -> np.ndarray:
+def paint_iris(identity: Identity) -> np.ndarray:
     """The eyeball's colour [S, S, 3] over (x, y) of its surface direction in [-1, 1]; the pupil is in the middle."""
     rng = np.random.default_rng((identity.seed, 6))
-    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    axis = (np.arange(IRIS_SIZE) + 0.5) / IRIS_SIZE * 2 - 1
     x, y = np.meshgrid(axis, -axis)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
     iris = 0.455

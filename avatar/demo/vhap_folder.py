@@ -30,7 +30,7 @@ from avatar.compute.native import thread_count
 from avatar.compute.workers import in_order
 from avatar.demo.head_files import write_head_model
 from avatar.demo.motion import FPS, Motion, Performance, frame_camera, frame_params, perform
-from avatar.demo.render import VIEW_AXES, Renderer, Stage, renderer_of
+from avatar.demo.render import VIEW_AXES, PosedScene, Renderer, renderer_of
 from avatar.demo.studio import World, front_camera, root_joint, studio_cameras, world_of
 from avatar.demo.subject import check_arguments, check_number, single_threads, write_image
 from avatar.files.atomic import check_target, whole_folder
@@ -106,9 +106,9 @@ def _film(folder: Path, renderer: Renderer, sequences: list[Sequence], studio: l
     def film(place: tuple[Sequence, int]) -> None:
         sequence, time = place
         params = frame_params(sequence.performance, time)
-        stage = renderer.stage(params, *_head_pose(sequence.performance, time))
+        scene = renderer.pose_scene(params, *_head_pose(sequence.performance, time))
         for index, camera in enumerate(studio):
-            _write_picture(folder / sequence.name, time, index, renderer, stage, camera)
+            _write_picture(folder / sequence.name, time, index, renderer, scene, camera)
 
     places = [(sequence, time) for sequence in sequences for time in range(frames)]
     total, workers = len(places) * len(studio), thread_count()  # before each of them has one thread
@@ -117,9 +117,9 @@ def _film(folder: Path, renderer: Renderer, sequences: list[Sequence], studio: l
             progress.update(len(studio))
 
 
-def _write_picture(folder: Path, time: int, index: int, renderer: Renderer, stage: Stage, camera: Camera) -> None:
+def _write_picture(folder: Path, time: int, index: int, renderer: Renderer, scene: PosedScene, camera: Camera) -> None:
     """The matte ends below the neck, where GaussianAvatars' pictures are cut."""
-    picture = renderer.look(stage, camera)
+    picture = renderer.render_scene(scene, camera)
     write_image(folder / _image(time, index), picture.image[..., ::-1], [])
     write_image(folder / _matte(time, index), picture.head, [])
 

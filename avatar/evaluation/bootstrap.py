@@ -29,8 +29,6 @@ class BlockBootstrap:
     """`RESAMPLES` draws of `count` frames in blocks of `block`, the same ones for every figure."""
 
     def __init__(self, count: int, block: int) -> None:
-        if not 1 <= block <= count:
-            raise ValueError(f"blocks must have 1 to {count} frames, got {block}")
         generator = np.random.default_rng(SEED)
         starts = generator.integers(0, count - block + 1, size=(RESAMPLES, math.ceil(count / block)))
         frames = (starts[:, :, None] + np.arange(block)).reshape(RESAMPLES, -1)[:, :count]

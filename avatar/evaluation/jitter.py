@@ -14,7 +14,7 @@ from avatar.evaluation.measure import Pair
 from avatar.losses.metrics import weighted_mean
 
 
-class _Moment(NamedTuple):
+class _TimeStep(NamedTuple):
     time: int
     error: Float[Tensor, "H W 3"]  # render - truth, levels of 8 bits
     mask: UInt8[Tensor, "H W"]
@@ -30,14 +30,14 @@ class JitterMeter:
 
     def __init__(self) -> None:
         self.of: dict[tuple[int, int], float] = {}  # camera, time of the middle frame; NaN: no pixel in all three masks
-        self._recent: dict[int, deque[_Moment]] = {}
+        self._recent: dict[int, deque[_TimeStep]] = {}
 
     def add(self, camera: int, time: int, pair: Pair, head_mask: UInt8[Tensor, "H W"]) -> None:
         """A camera's next picture in the order of time; three of successive `time` give the middle one its figure."""
         error = pair.render.float() - pair.truth.float()
         error = error if pair.render.dtype == torch.uint8 else error * 255.0
         recent = self._recent.setdefault(camera, deque(maxlen=3))
-        recent.append(_Moment(time, error, to_device(head_mask, error.device)))
+        recent.append(_TimeStep(time, error, to_device(head_mask, error.device)))
         if len(recent) < 3:
             return
         before, middle, after = recent

@@ -24,26 +24,26 @@ _IDENTITY = ("format", "data_hash", "image_size", "head_fingerprint", "step", "p
 _NO_MATTER = ("threads",)  # of the versions: drawing a trained avatar differs by rounding alone
 
 
-class Earlier(NamedTuple):
+class EarlierResults(NamedTuple):
     """What is kept: entries of results.json by protocol, with their tables of frames in place."""
 
     entries: dict[str, Any]
     shown: str | None  # the protocol of worst.png and of the video, where it is among them
 
 
-def read_earlier(folder: Path, facts: Mapping[str, Any], asked: Collection[str]) -> Earlier:
+def read_earlier(folder: Path, facts: Mapping[str, Any], asked: Collection[str]) -> EarlierResults:
     """What RUN/eval holds by other protocols than those `asked` for, of the avatar and frames that `facts` describe."""
     try:
         earlier = read_json(folder / "results.json")
         if _identity(earlier) != _identity(json.loads(json.dumps(facts, allow_nan=False))):
-            return Earlier({}, None)
+            return EarlierResults({}, None)
         others = {
             name: entry for name, entry in earlier["protocols"].items() if name not in asked and NAME.fullmatch(name)
         }
         whole = {name: entry for name, entry in others.items() if _is_whole(folder / name, entry)}
-        return Earlier(whole, earlier["shown"] if earlier["shown"] in whole else None)
+        return EarlierResults(whole, earlier["shown"] if earlier["shown"] in whole else None)
     except (UserError, ValueError, KeyError, TypeError, AttributeError):  # none, or not of this program
-        return Earlier({}, None)
+        return EarlierResults({}, None)
 
 
 def in_order(entries: Mapping[str, Any]) -> dict[str, Any]:

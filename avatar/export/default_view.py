@@ -28,7 +28,7 @@ PIXELS = 128  # width of the picture in which the neck's end is looked for
 
 
 @torch.no_grad()
-def faded(trained: TrainedAvatar) -> TrainedAvatar:
+def with_faded_neck(trained: TrainedAvatar) -> TrainedAvatar:
     """The avatar with a neck that fades."""
     avatar = copy.deepcopy(trained.avatar)
     kept = torch.sigmoid(avatar.opacity_logits) * neck_fade(trained)

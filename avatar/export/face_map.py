@@ -30,7 +30,7 @@ def face_map(trained: TrainedAvatar, kept: list[int]) -> dict[str, Any]:
     weights = np.concatenate(
         (arrays["expression"][:, kept], arrays["jaw"], arrays["eyes"], arrays["eyelids"]), axis=1
     ).round(DIGITS)
-    ranges = [shown_range(values) for values in departures(trained, kept).T]
+    ranges = [shown_range(values) for values in offsets_from_neutral(trained, kept).T]
     return {
         "blendshapes": {
             name[0].lower() + name[1:]: [[int(place), float(row[place])] for place in row.nonzero()[0]]
@@ -42,7 +42,7 @@ def face_map(trained: TrainedAvatar, kept: list[int]) -> dict[str, Any]:
     }
 
 
-def departures(trained: TrainedAvatar, kept: list[int]) -> np.ndarray:
+def offsets_from_neutral(trained: TrainedAvatar, kept: list[int]) -> np.ndarray:
     """How far the training frames are from the neutral face, [T, E + 11], in the order of `face_map`."""
     tracks, train = trained.recording.tracks, trained.recording.times(trained.recording.split.train)
     neutral = trained.neutral

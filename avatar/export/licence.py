@@ -16,6 +16,6 @@ MESH = "In it: this face's mesh with the head model's triangles and UV layout, a
 WHOLE = "In it: the whole head model."
 
 
-def licence_of(content: str, *, has_head: bool = True) -> str:
+def licence_of(content: str) -> str:
     """The sentences that go along with a file; `content` is one of the above."""
-    return " ".join((content, HEAD_LICENCE, CONSENT) if has_head else (content, CONSENT))
+    return f"{content} {HEAD_LICENCE} {CONSENT}"

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.export.default_view import faded
+from avatar.export.default_view import with_faded_neck
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.model import FlashAvatar
@@ -73,7 +73,7 @@ def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
             f"an avatar of model={trained.config.model.name} cannot be exported for browsers, which do not know {unknown}; "
             "train one with model=hypergaussians"
         )
-    model = cast(FlashAvatar, faded(trained).avatar)
+    model = cast(FlashAvatar, with_faded_neck(trained).avatar)
     assets = model.mesh.assets
     moved = (trained.recording.tracks["expression"] != 0).any(dim=0).nonzero().flatten()
     seen = (torch.sigmoid(model.opacity_logits) >= LEAST_ALPHA).nonzero().flatten()

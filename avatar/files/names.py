@@ -12,11 +12,11 @@ _FORBIDDEN = frozenset('/\\:*?"<>|')  # separators, and what Windows refuses
 _NOT_AT_THE_ENDS = " .-~"  # hidden files, options, home folders
 
 
-def safe_name(text: str, otherwise: str = "unnamed") -> str:
-    """`text` as a name without folders, of printable letters and at most `MAX_NAME_BYTES`; `otherwise` for nothing."""
+def safe_name(text: str) -> str:
+    """`text` as a name without folders, of printable letters and at most `MAX_NAME_BYTES`; `unnamed` for nothing."""
     letters = "".join(letter if letter.isprintable() and letter not in _FORBIDDEN else "_" for letter in text)
     short = letters.lstrip(_NOT_AT_THE_ENDS).encode()[:MAX_NAME_BYTES].decode(errors="ignore")
-    return short.rstrip(_NOT_AT_THE_ENDS) or otherwise
+    return short.rstrip(_NOT_AT_THE_ENDS) or "unnamed"
 
 
 def shortened(name: str) -> str:

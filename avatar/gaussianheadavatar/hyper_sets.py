@@ -87,12 +87,10 @@ class HyperSet(nn.Module):
 
 
 class HyperSets(nn.Module):
-    """The five sets. Raises ValueError for less than one latent dimension."""
+    """The five sets."""
 
     def __init__(self, num_gaussians: int, channels: int, latents: int) -> None:
         super().__init__()
-        if latents < 1:
-            raise ValueError(f"a HyperGaussian needs at least one latent dimension, got {latents}")
         self.latents = latents
         self.position, self.colour, self.rotation, self.scale, self.opacity = (
             HyperSet(num_gaussians, m, latents) for m in (3, channels, 4, 3, 1)

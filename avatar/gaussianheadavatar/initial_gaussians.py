@@ -44,7 +44,7 @@ def initial_gaussians(
     colours[~seen] = UNSEEN
     rest = count - len(on_mesh)
     in_mouth = round(MOUTH_SHARE * rest)
-    hull = beyond_mesh(head, on_mesh, frames, centre, half)
+    hull = beyond_mesh(on_mesh, frames, centre, half)
     outside = spread_points(hull, rest - in_mouth)
     lips = head.neutral_vertices()[head.assets.regions.get("lips", torch.arange(head.assets.num_vertices))]
     mouth = mouth_box(lips, in_mouth, torch.Generator().manual_seed(0))
@@ -54,7 +54,7 @@ def initial_gaussians(
 
 
 def beyond_mesh(
-    head: HeadModel, on_mesh: Float[Tensor, "M 3"], frames: Sequence[Frame], centre: Float[Tensor, 3], half: float
+    on_mesh: Float[Tensor, "M 3"], frames: Sequence[Frame], centre: Float[Tensor, 3], half: float
 ) -> Float[Tensor, "H 3"]:
     """Points of the hull that are not on the mesh; all of its points where it is nowhere beyond it."""
     views = [(frame.camera, frame.alpha * frame.head_mask) for frame in frames]

@@ -85,7 +85,7 @@ class GaussianHeadAvatar(Avatar):
         self.features = nn.Parameter(torch.zeros(N, FEATURES))
         theta = num_expressions + CONDITION_EXTRAS
         self.hyper = self.make_hyper(config, N)
-        self.networks = Networks(theta, 6, config.mlp_width, FEATURES, outputs, bounded=self.hyper is None)
+        self.networks = Networks(theta, config.mlp_width, FEATURES, outputs, bounded=self.hyper is None)
         self.upsampler = Upsampler(channels, config.upsampling)
         self.register_buffer("mean_rotation", torch.eye(3))
 
@@ -169,7 +169,7 @@ class GaussianHeadAvatar(Avatar):
         """The picture, and the first three channels of the splatted features, which are a small picture."""
         small = self.splatted(gaussians, camera)
         rgb = Rendering(small.image[..., :3], small.alpha)
-        return [self.enlarged(small, camera, background).image, over(rgb, background).image]
+        return [self.enlarged(small, camera, background).image, over_background(rgb, background).image]
 
     def splatted(self, gaussians: FeatureGaussians, camera: Camera, **options: Any) -> Rendering:
         """The features over white, at the small size."""
@@ -186,7 +186,7 @@ class GaussianHeadAvatar(Avatar):
         reached = max_pool2d((alphas > 0).float(), 3, stride=1, padding=1)  # the others show the background
         reached = interpolate(reached, scale_factor=factor)[0, 0, :height, :width, None] > 0
         image = torch.where(reached, self.upsampler(small.image)[:height, :width], 1.0)
-        return over(Rendering(image, alpha), background)
+        return over_background(Rendering(image, alpha), background)
 
     def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:
         self.mean_rotation.copy_(nearest_rotation(rotations.mean(dim=0)))
@@ -275,6 +275,6 @@ def small_camera(camera: Camera, factor: int) -> Camera:
     return replace(camera, **lens, width=-(-camera.width // factor), height=-(-camera.height // factor))
 
 
-def over(white: Rendering, background: Float[Tensor, 3]) -> Rendering:
+def over_background(white: Rendering, background: Float[Tensor, 3]) -> Rendering:
     """What was drawn over white, over another background."""
     return Rendering(white.image + (1.0 - white.alpha)[..., None] * (background - 1.0), white.alpha)

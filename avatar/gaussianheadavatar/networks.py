@@ -103,7 +103,7 @@ class Branch(nn.Module):
 
 
 class Networks(nn.Module):
-    """The six networks, for an expression of `theta` values, a pose of `beta` and points of `features` values.
+    """The six networks, for an expression of `theta` values, a pose of 6 and points of `features` values.
 
     `outputs` are how many values they give; `bounded` puts the deformation through tanh.
     """
@@ -111,7 +111,6 @@ class Networks(nn.Module):
     def __init__(
         self,
         theta: int,
-        beta: int = 6,
         width: int = 256,
         features: int = 128,
         outputs: Outputs = PUBLISHED,
@@ -120,7 +119,7 @@ class Networks(nn.Module):
         super().__init__()
         half, self.outputs = width // 2, outputs
         last = "tanh" if bounded else None
-        of_pose = beta // 3 * encoded_size(OCTAVES)
+        of_pose = 2 * encoded_size(OCTAVES)
         self.expression = Branch(theta, features, self.outputs, last, (width,) * 5, (width,) * 2, (width,) * 3)
         self.pose = Branch(of_pose, features, self.outputs, last, (width,) * 2, (half,), (half,) * 2)
 
@@ -151,12 +150,7 @@ def _counting(chosen: Bool[Tensor, " N"]) -> Tensor:
 def nearness(
     points: Float[Tensor, "N 3"], landmarks: Float[Tensor, "L 3"], near_distance: float, far_distance: float
 ) -> Float[Tensor, " N"]:
-    """clamp((far^2 - d^2) / (far^2 - near^2), 0, 1), with d the distance to the nearest landmark; all in metres.
-
-    Raises ValueError unless 0 <= near_distance < far_distance.
-    """
-    if not 0.0 <= near_distance < far_distance:
-        raise ValueError(f"the near distance ({near_distance}) must be below the far one ({far_distance})")
+    """clamp((far^2 - d^2) / (far^2 - near^2), 0, 1), with d the distance to the nearest landmark; all in metres."""
     origin = landmarks.mean(dim=0)  # small numbers, because differences of squares follow
     landmarks = landmarks - origin
     lengths = landmarks.square().sum(dim=1)

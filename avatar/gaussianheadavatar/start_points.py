@@ -28,10 +28,8 @@ def visual_hull(
 
     The box from `low` to `high`, in the head's own space, is cut into cubes, `cells` along its longest side; what
     fewer than half of the views see is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987).
-    Raises ValueError for no views, and where the masks leave nothing.
+    Raises ValueError where the masks leave nothing.
     """
-    if not views:
-        raise ValueError("a visual hull needs at least one view")
     size = float((high - low).max()) / cells
     counts = torch.ceil((high - low) / size - 1e-4).long().tolist()
     axes = [low[i] + size * (torch.arange(count) + 0.5) for i, count in enumerate(counts)]
@@ -62,11 +60,8 @@ def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[
 def spread_points(points: Float[Tensor, "M 3"], count: int) -> Float[Tensor, "count 3"]:
     """`count` of the points, evenly spread and always the same ones: one in each voxel, near its centre.
 
-    More than there are: all of them, then again from the first, moved by a thousandth of their extent. Raises ValueError
-    for no points.
+    More than there are: all of them, then again from the first, moved by a thousandth of their extent.
     """
-    if len(points) == 0:
-        raise ValueError("there are no points to choose from")
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
     if count > len(points):
         more = points[torch.arange(count - len(points)) % len(points)]

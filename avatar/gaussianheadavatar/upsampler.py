@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import group_norm, interpolate
 
-FACTORS = (1, 2, 4)
 CAPACITY = 4  # times as many channels at the small size
 
 
@@ -33,14 +32,12 @@ class DoubleConvolution(nn.Module):
 class Upsampler(nn.Module):
     """Features [H, W, channels] to colours [factor H, factor W, 3] between 0 and 1.
 
-    At the small size there are 4 x `channels` channels, and every doubling of the size halves them. Raises
-    ValueError for another factor than 1, 2 and 4.
+    At the small size there are 4 x `channels` channels, and every doubling of the size halves them. The factor is 1, 2
+    or 4.
     """
 
     def __init__(self, channels: int = 32, factor: int = 4) -> None:
         super().__init__()
-        if factor not in FACTORS:
-            raise ValueError(f"the upsampler enlarges by 1, 2 or 4, not by {factor}")
         self.factor = factor
         wide = CAPACITY * channels
         halvings = [DoubleConvolution(wide >> i, wide >> (i + 1)) for i in range(factor.bit_length() - 1)]

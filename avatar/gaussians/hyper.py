@@ -134,8 +134,6 @@ class HyperHeads(nn.Module):
 
     def __init__(self, num_gaussians: int, latent_size: int) -> None:
         super().__init__()
-        if latent_size < 1:
-            raise ValueError(f"a HyperGaussian needs at least one latent dimension, got {latent_size}")
         self.num_gaussians, self.latent_size = num_gaussians, latent_size
         packed = torch.zeros(packed_shape(num_gaussians, latent_size))
         if packed.dtype is torch.float32 and packed.is_cpu:

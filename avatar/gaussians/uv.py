@@ -111,8 +111,6 @@ def painted(
 
 def _raster(assets: HeadAssets, size: int, sides: float = 1.0) -> UVTexels:
     """The texels of one raster, which reaches down so many sides of the map."""
-    if size < 1:
-        raise ValueError(f"the UV raster must have at least one texel a side, got {size}")
     uv = assets.uvs.numpy()
     flat = np.stack((uv[:, 0] * size, (1.0 - uv[:, 1]) * size, np.ones(len(uv), np.float32)), axis=1)
     raster = rasterize_mesh(flat, assets.uv_faces.numpy(), math.ceil(sides * size), size)

@@ -50,7 +50,7 @@ def with_teeth(assets: HeadAssets) -> HeadAssets:
     points = assets.template.numpy()
     low, high = points[rim].min(axis=0), points[rim].max(axis=0)
     middle = np.array([(low[0] + high[0]) / 2, points[rim, 1].mean(), _foremost(points, rim) - BEHIND], np.float32)
-    chin = _about(points, middle + np.array([0, -CHIN, BEHIND], np.float32), AROUND_CHIN)
+    chin = _about(points, middle + np.array([0, -CHIN, BEHIND], np.float32))
     grown, below = assets, 0.0
     for row in ROWS:
         grown = _with_row(grown, row, middle, float(high[0] - low[0]), below, rim, chin if row.with_chin else None)
@@ -114,8 +114,8 @@ def _foremost(points: Float[np.ndarray, "V 3"], rim: Int[np.ndarray, " R"]) -> f
     return float(points[near, 2].max(initial=high[2]))
 
 
-def _about(points: Float[np.ndarray, "V 3"], place: Float[np.ndarray, 3], reach: float) -> Int[np.ndarray, " C"]:
-    """The vertices within so many metres of the one that is nearest to a place."""
+def _about(points: Float[np.ndarray, "V 3"], place: Float[np.ndarray, 3]) -> Int[np.ndarray, " C"]:
+    """The vertices within `AROUND_CHIN` of the one that is nearest to a place."""
     tree = KDTree(points)
     nearest = points[tree.query(place)[1]]
-    return np.array(sorted(tree.query_ball_point(nearest, reach)))
+    return np.array(sorted(tree.query_ball_point(nearest, AROUND_CHIN)))

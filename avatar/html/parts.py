@@ -14,6 +14,7 @@ from avatar.errors import check_installed
 from avatar.html.document import Content, Markup, element
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 INK, GRID = "#1d2733", "#d9dee5"  # of style.css
@@ -51,31 +52,28 @@ def picture(
 
 
 def data_uri(image: np.ndarray, format: Literal["jpeg", "png"] = "jpeg", quality: int = 88) -> str:
-    """The image inside a URL. Raises ValueError unless it is uint8 [H, W, 3] or [H, W]."""
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise ValueError(f"the image must be uint8 [H, W] or [H, W, 3], got {image.dtype} {list(image.shape)}")
+    """A uint8 image [H, W, 3] or [H, W] inside a URL."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if format == "jpeg" else []
     encoded = cv2.imencode(f".{format}", pixels, options)[1].tobytes()
     return f"data:image/{format};base64,{base64.b64encode(encoded).decode()}"
 
 
-def figure_of(columns: int = 1, *, width: float = 5.4, height: float = 3.0) -> tuple[Figure, list]:
-    """A matplotlib figure in the page's style with `columns` axes side by side; the sizes are of one of them, in inches."""
+def figure_of() -> tuple[Figure, Axes]:
+    """A matplotlib figure in the page's style and its axes."""
     check_installed("a plot", "plots", "matplotlib")
     from matplotlib.figure import Figure  # takes half a second
 
-    figure = Figure(figsize=(columns * width, height), layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    for one in axes:
-        one.grid(color=GRID, linewidth=0.6)
-        one.set_axisbelow(True)
-        one.spines[["top", "right"]].set_visible(False)
-        one.spines[["left", "bottom"]].set_color(GRID)
-        one.tick_params(colors=INK, labelsize=8, length=0)
-        one.xaxis.label.set(color=INK, fontsize=9)
-        one.yaxis.label.set(color=INK, fontsize=9)
-    return figure, list(axes)
+    figure = Figure(figsize=(5.4, 3.0), layout="constrained")
+    axes = figure.subplots()
+    axes.grid(color=GRID, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GRID)
+    axes.tick_params(colors=INK, labelsize=8, length=0)
+    axes.xaxis.label.set(color=INK, fontsize=9)
+    axes.yaxis.label.set(color=INK, fontsize=9)
+    return figure, axes
 
 
 def plot(figure: Figure, caption: Content = None, alt: str = "plot") -> Markup:

@@ -12,7 +12,7 @@ MOMENTS = tl.constexpr(9)
 
 
 @triton.jit
-def show_again(records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max):
+def recompute_splats(records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max):
     """STEP splats once more, from behind: (u, v), falloff, alpha before it is clamped, whether drawn, 1 - alpha, the
     transmittance behind each, its weight [STEP, pixels], and the transmittance in front of all."""
     u, v, falloff, unclamped = falloffs(records, stride, at, column, row)
@@ -108,7 +108,7 @@ def composite_backward(
     for done in range(0, seen, STEP):
         start = seen - STEP - done
         at = first + start + k
-        u, v, falloff, unclamped, drawn, through, after, shown, transmittance = show_again(
+        u, v, falloff, unclamped, drawn, through, after, shown, transmittance = recompute_splats(
             records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max
         )
         g = tl.fma(

@@ -8,7 +8,7 @@ import triton.language as tl
 
 from avatar.kernels.bin import first_record
 from avatar.kernels.composite import NEVER_STOPS, behind_step, tile_pixels, weights
-from avatar.kernels.composite_backward import MOMENTS, show_again, store_shape
+from avatar.kernels.composite_backward import MOMENTS, recompute_splats, store_shape
 
 SHAPE = tl.constexpr(6)  # moments that are not of a colour
 
@@ -166,7 +166,7 @@ def composite_features_backward(
     for done in range(0, seen, STEP):
         start = seen - STEP - done
         at = first + start + k
-        u, v, falloff, unclamped, drawn, through, after, shown, transmittance = show_again(
+        u, v, falloff, unclamped, drawn, through, after, shown, transmittance = recompute_splats(
             records, stride, at, start, k, pairs, column, row, transmittance, stop, alpha_min, alpha_max
         )
         g = tl.zeros([STEP, TILE * TILE], tl.float32)

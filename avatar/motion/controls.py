@@ -53,7 +53,7 @@ def expression_controls(
     if any(names):
         kept = [i for i, name in enumerate(names) if name and float(away[:, i].amax() - away[:, i].amin()) > 1e-3]
         directions = torch.eye(expressions.shape[1], dtype=torch.float64)[kept]
-        labels = [(_part(name), spoken(name), 1.0) for i in kept if (name := names[i])]
+        labels = [(_part(name), readable_name(name), 1.0) for i in kept if (name := names[i])]
     else:
         directions = principal_directions(away)
         labels = name_components(directions, head)
@@ -131,7 +131,7 @@ def turned(about_x: float, about_y: float) -> Float[Tensor, 6]:
     return axis_angle_to_rotation_matrix(torch.tensor([[about_x, about_y, 0.0]]))[0, :2].reshape(6)
 
 
-def spoken(name: str) -> str:
+def readable_name(name: str) -> str:
     """mouthSmile_L, mouth_smile_left and MouthSmileLeft are `mouth smile left`."""
     name = re.sub(r"_L$", "_left", re.sub(r"_R$", "_right", name))
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).replace("_", " ").lower()

@@ -50,9 +50,7 @@ class ExpressionSpace:
 
 
 def fit_expressions(training: Sequence[HeadParams]) -> ExpressionSpace:
-    """The space of the frames that an avatar was trained on. Raises ValueError when there is none."""
-    if not training:
-        raise ValueError("an expression space needs training frames, got none")
+    """The space of the frames that an avatar was trained on."""
     points = coordinates(training)
     mean = points.mean(dim=0)
     centred = points - mean

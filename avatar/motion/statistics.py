@@ -25,8 +25,6 @@ def learn_statistics(
 ) -> MotionStatistics:
     """The statistics of the frames that an avatar is trained on; `head` has their person's identity.
 
-    The neutral face is searched for among the frames where it is not given. Raises ValueError when there is no frame.
+    The neutral face is searched for among the frames where it is not given.
     """
-    if not training:
-        raise ValueError("motion statistics need training frames, got none")
     return MotionStatistics(neutral or find_neutral(training, head), find_mean(training), fit_expressions(training))

@@ -64,13 +64,13 @@ def transfer_motion(
     elif mode in NEUTRAL_MODES:
         source, goal = rest or find_neutral(driver, driver_head), target.neutral
     zero = RestPose(torch.zeros_like(driver[0].expression), torch.eye(3), None)
-    moved = departed(driver, source or zero, goal or zero, strength)
+    moved = retargeted(driver, source or zero, goal or zero, strength)
     if mode == "pca":
         moved = target.expressions.nearest(moved)
     return Transferred(moved, source, goal)
 
 
-def departed(driver: Sequence[HeadParams], source: RestPose, goal: RestPose, strength: float) -> list[HeadParams]:
+def retargeted(driver: Sequence[HeadParams], source: RestPose, goal: RestPose, strength: float) -> list[HeadParams]:
     """goal + strength (driver - source), and for the jaw's rotation goal (source^-1 driver)^strength."""
     expression, jaw = stacked(driver)
     change = source.jaw.T @ jaw

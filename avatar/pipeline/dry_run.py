@@ -12,7 +12,7 @@ from avatar.data.split import check_divided
 from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import round_steps
-from avatar.pipeline.train import new_avatar, on_subject
+from avatar.pipeline.train import config_for_subject, new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.runs.checkpoint import KEPT
 from avatar.runs.memory_estimate import training_needs
@@ -32,7 +32,7 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     chosen = choose_device(device or config.device, print)
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
     check_divided(subject.split)
-    config, size = on_subject(config, subject), subject.image_size(config.data.size)
+    config, size = config_for_subject(config, subject), subject.image_size(config.data.size)
     frames = len(subject.split.train)
     perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
     needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual.name)

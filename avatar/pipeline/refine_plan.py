@@ -34,7 +34,7 @@ FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.25, 1000
 PLANNED_SHARE = 0.97  # of the minutes: the rest is for opening and closing the run itself, which nothing before shows
 
 
-class Pace(NamedTuple):
+class RoundTimes(NamedTuple):
     """What a round took, in seconds, with all that belongs to it."""
 
     step: float
@@ -76,15 +76,15 @@ class Plan:
             raise UserError(f"{path} is damaged: {error}; start a new run") from None
         return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations, in_rounds, spent)
 
-    def paced(self, pace: Pace, rounds: int, frames: int) -> Plan:
+    def replanned(self, times: RoundTimes, rounds: int, frames: int) -> Plan:
         """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
         many rounds are still to come; never fewer than make an avatar."""
         assert self.minutes is not None
         asked = within_epochs(load_config(self.overrides).trainer, frames).iterations
-        able = affordable_iterations(plannable(self.minutes) - self.spent, pace.step, pace.refinement, rounds, frames)
+        able = affordable_iterations(plannable(self.minutes) - self.spent, times.step, times.refinement, rounds, frames)
         chosen = min(asked, max(able, LEAST_STEPS))
         print(
-            f"Time         {self.spent:.0f} s of {self.minutes:g} minutes are gone, and a step takes {pace.step:.3f} s: "
+            f"Time         {self.spent:.0f} s of {self.minutes:g} minutes are gone, and a step takes {times.step:.3f} s: "
             f"{chosen:,} steps are taken" + (", which is more than there is time for" if chosen > able else "")
         )
         return replace(self, iterations=chosen, round_iterations=round_steps(chosen, frames))

@@ -55,7 +55,7 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
     return float((found.cpu() - expected).abs().max() / expected.abs().max())
 
 
-class Sheet:
+class RandomMesh:
     """Gaussians that hang on random triangles of vertices, and take part of random nodes."""
 
     def __init__(self, generator: torch.Generator, device: torch.device) -> None:
@@ -72,7 +72,7 @@ class Sheet:
 def placed(device: torch.device) -> Fields:
     """What a network's values make of a mesh, by HyperGaussians and all, and the gradients."""
     generator = torch.Generator().manual_seed(0)
-    sheet = Sheet(generator, device)
+    sheet = RandomMesh(generator, device)
     heads = HyperHeads(COUNT, LATENT)
     shapes = {"vertices": (VERTICES, 3), "values": (NODES, LATENT), "packed": tuple(heads.packed.shape)}
     shapes |= {"quats": (COUNT, 4), "log_scales": (COUNT, 3), "opacity_logits": (COUNT,)}

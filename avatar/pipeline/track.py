@@ -44,7 +44,7 @@ def is_video(path: Path) -> bool:
     return not recognise(path) and is_footage(path)
 
 
-def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> Path:
+def cached_tracking(video: Path, head: Path, assets: HeadAssets | None = None) -> Path:
     """The tracked folder of a video, in the cache by what the video and the head model hold; made where it is missing or
     damaged."""
     assets = assets or load_head_assets(head)
@@ -56,7 +56,7 @@ def tracked_once(video: Path, head: Path, assets: HeadAssets | None = None) -> P
             return folder
         print(f"the tracking {folder} is damaged: {damage}; it is made again")
         shutil.rmtree(folder)
-    track(video, folder, head, assets, progress=bar, seal=write_contents)
+    track(video, folder, head, assets, progress=progress_bar, seal=write_contents)
     return folder
 
 
@@ -81,6 +81,6 @@ def can_track(say: Callable[[str], object]) -> bool:
     return not missing
 
 
-def bar(items: Iterable[Item], total: int | None, title: str, unit: str = "frames") -> Iterable[Item]:
-    """A progress bar with a rate, which leaves its line."""
+def progress_bar(items: Iterable[Item], total: int | None, title: str, unit: str = "frames") -> Iterable[Item]:
+    """A progress progress_bar with a rate, which leaves its line."""
     return tqdm(items, total=total, desc=title, unit=f" {unit}")

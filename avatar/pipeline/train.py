@@ -45,7 +45,7 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
         chosen = choose_device(device or config.device, print)
         subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
         check_divided(subject.split)
-        config = on_subject(config, subject)
+        config = config_for_subject(config, subject)
         size = subject.image_size(config.data.size)
         perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
         avatar = new_avatar(assets, subject, config, perceptual.name, chosen)
@@ -53,7 +53,7 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
         return finish_training(avatar, subject, config, run, perceptual, chosen)
 
 
-def on_subject(config: Config, subject: Subject) -> Config:
+def config_for_subject(config: Config, subject: Subject) -> Config:
     """With the steps that `trainer.max_epochs` leaves on this subject; says so where they are fewer."""
     trainer = within_epochs(config.trainer, len(subject.split.train))
     if trainer.iterations < config.trainer.iterations:
@@ -70,10 +70,10 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, 
         subject, assets = open_subject(source, held_out.test_frames, test_cameras=held_out.test_cameras)
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
-        return go_on(run, info, checkpoint, subject, assets, device)
+        return continue_training(run, info, checkpoint, subject, assets, device)
 
 
-def go_on(
+def continue_training(
     run: Path, info: RunInfo, checkpoint: Checkpoint, subject: Subject, assets: HeadAssets, device: str | None
 ) -> int:
     config = info.config

@@ -18,7 +18,7 @@ from avatar.files.names import safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.open import open_run
 from avatar.pipeline.refine import refine_run
-from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Pace, Plan, steps_in_time
+from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, RoundTimes, steps_in_time
 from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.model_registry import refuse_features
@@ -50,7 +50,7 @@ def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
                 return status
         # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
         source = replace(source, folder=stage / name, tracking=None, frame_offset=None, format=None, fps=None)
-    status = go_on_or_begin(source, plan.final_overrides(), run)
+    status = continue_or_begin(source, plan.final_overrides(), run)
     if status == OK and plan.minutes is not None:
         print(f"Time         {(time.monotonic() - begin) / 60:.1f} of {plan.minutes:g} minutes")
     return status
@@ -60,7 +60,7 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
     """The round in the folder `stage`, with `to_come` after it; and the plan, with the time that is gone. A round that was
     made in one sitting shows what steps take, and so how many there is time for."""
     at_once, started = not is_begun(stage / "run"), time.monotonic()
-    status = go_on_or_begin(source, plan.round_overrides(), stage / "run")
+    status = continue_or_begin(source, plan.round_overrides(), stage / "run")
     trained = time.monotonic()
     if status != OK:
         return status, replace(plan, spent=trained - begin)
@@ -69,12 +69,12 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
     refined = time.monotonic()
     plan = replace(plan, spent=refined - begin)
     if status == OK and at_once and plan.minutes is not None:
-        pace = Pace((trained - started) / plan.round_iterations, refined - trained)
-        plan = plan.paced(pace, to_come, len(run.subject.split.train))
+        times = RoundTimes((trained - started) / plan.round_iterations, refined - trained)
+        plan = plan.replanned(times, to_come, len(run.subject.split.train))
     return status, plan
 
 
-def go_on_or_begin(source: Source, overrides: list[str], run: Path) -> int:
+def continue_or_begin(source: Source, overrides: list[str], run: Path) -> int:
     return resume_run(run, source.head, source.folder) if is_begun(run) else train_new(source, overrides, run)
 
 

@@ -49,20 +49,9 @@ class HeadPose(NamedTuple):
 def rotation(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     """Rotation vectors -> matrices by Rodrigues' formula; smooth everywhere, at zero too."""
     skew = vector_to_skew_symmetric_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape, 3)
-    angle = _angle(vectors)[..., None]
+    angle = (vectors.square().sum(dim=-1)[..., None, None] + 1e-20).sqrt()  # its derivative at zero is a number
     sine, cosine = torch.sinc(angle / math.pi), 0.5 * torch.sinc(angle / (2.0 * math.pi)).square()
     return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + sine * skew + cosine * (skew @ skew)
-
-
-def quaternion(vector: Float[Tensor, 3]) -> Float[Tensor, 4]:
-    """Rotation vector -> unit quaternion (w, x, y, z); smooth everywhere."""
-    angle = _angle(vector)
-    return torch.cat((torch.cos(0.5 * angle), 0.5 * torch.sinc(angle / (2.0 * math.pi)) * vector))
-
-
-def _angle(vectors: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 1"]:
-    """Lengths whose derivative at zero is a number: what they go into is even."""
-    return (vectors.square().sum(dim=-1, keepdim=True) + 1e-20).sqrt()
 
 
 def six_d(matrices: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 6"]:

@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.data.recording import Recording
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.files.video import error_map, side_by_side
 from avatar.gaussians.base_model import Avatar
@@ -99,8 +100,7 @@ def sheet(
 def sheet_frames(test: Sequence[int], refined: Refined) -> list[int]:
     """Held-out frames for the sheet, in order."""
     gain = np.where(np.isfinite(refined.after - refined.before), refined.after - refined.before, 0.0)[list(test)]
-    spread = np.linspace(0, len(test) - 1, min(SHEET_FRAMES, len(test))).round().astype(int)
-    return sorted({test[i] for i in (*spread.tolist(), int(gain.argmax()), int(gain.argmin()))})
+    return sorted({*evenly_spread(test, SHEET_FRAMES), test[int(gain.argmax())], test[int(gain.argmin())]})
 
 
 def _mean(values: Float[np.ndarray, " T"]) -> float:

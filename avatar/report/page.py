@@ -194,7 +194,7 @@ def _curves(run: Path) -> list[Markup]:
         return [element("p", "No curves were recorded.", class_="soft")]
     plots = []
     for title, scale, values in (("loss", "log", loss), ("PSNR, dB", "linear", psnr)):
-        figure, (axes,) = figure_of()
+        figure, axes = figure_of()
         axes.plot(steps, values, color=SERIES[0], linewidth=0.9)
         axes.set(xlabel="step", ylabel=title, yscale=scale)
         plots.append(plot(figure, f"{title[:1].upper()}{title[1:]} of the training frames as they came", title))

@@ -63,7 +63,7 @@ def capacity_of(kind: Kind, count: Callable[[], int]) -> int:
     if capacity is None and is_checked(kind.device):
         return (needed // _GRAIN + 1) * _GRAIN
     if capacity is None:
-        capacity = _fixed[kind] = roomy(kind, needed, free_bytes(kind.device))
+        capacity = _fixed[kind] = capacity_with_headroom(kind, needed, free_bytes(kind.device))
     if needed > capacity:
         raise CannotDraw(
             f"drawing needs {needed} pairs of a tile and a splat, the GPU's buffers hold {capacity}; a lower --size or "
@@ -72,7 +72,7 @@ def capacity_of(kind: Kind, count: Callable[[], int]) -> int:
     return capacity
 
 
-def roomy(kind: Kind, needed: int, free: float | None) -> int:
+def capacity_with_headroom(kind: Kind, needed: int, free: float | None) -> int:
     """The capacity of a kind whose first drawing needs so many pairs; the headroom takes half of the free bytes at most."""
     wanted = max(HEADROOM * needed, PER_SPLAT * kind.splats + PER_TILE * kind.tiles)
     affordable = MAX_PAIRS if free is None else int(free / 2 / (BYTES + 4 * kind.features))

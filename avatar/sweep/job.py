@@ -20,7 +20,7 @@ from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.sweep.output import BoundedLog, end_of, old_of
 from avatar.sweep.spec import Job
-from avatar.sweep.state import HEARTBEAT_SECONDS, State, beat, read_job, read_state, worker_name, write_state
+from avatar.sweep.state import HEARTBEAT_SECONDS, State, read_job, read_state, worker_name, write_heartbeat, write_state
 
 OPTIONS = ("head", "tracking", "frame_offset", "format", "fps")  # of a source, as `avatar train` calls them
 OK, EXIT_ERROR, EXIT_INTERRUPTED = 0, 1, 130
@@ -40,7 +40,7 @@ def run_job(folder: Path, command: Command) -> State:
         begin = time.monotonic()
         running = State("running", before.attempts + 1, worker_name(), seconds=before.seconds)
         write_state(folder, running)
-        with heart(folder):
+        with heartbeat(folder):
             outcome = work(job, folder, command)
         seconds = before.seconds + time.monotonic() - begin
         # A worker that was wanted back has not failed; the attempt does not count.
@@ -100,16 +100,16 @@ def computed() -> int:
 
 
 @contextmanager
-def heart(folder: Path) -> Iterator[None]:
+def heartbeat(folder: Path) -> Iterator[None]:
     """Says every few seconds that the worker lives and how much it has computed, until the block ends."""
     ended = threading.Event()
 
-    def keep_beating() -> None:
+    def keep_writing() -> None:
         while not ended.wait(HEARTBEAT_SECONDS):
-            beat(folder, computed())
+            write_heartbeat(folder, computed())
 
-    beat(folder, computed())
-    thread = threading.Thread(target=keep_beating, daemon=True)
+    write_heartbeat(folder, computed())
+    thread = threading.Thread(target=keep_writing, daemon=True)
     thread.start()
     try:
         yield

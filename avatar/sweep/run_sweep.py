@@ -13,23 +13,23 @@ from avatar.sweep.state import State, progress_mark, read_state, stored_state, w
 from avatar.sweep.status import Progress, duration
 
 POLL_SECONDS = 0.5
-STILL_SECONDS = 15 * 60.0  # in which a worker that computes anything has used a second of its processor
+STALLED_SECONDS = 15 * 60.0  # in which a worker that computes anything has used a second of its processor
 
 
-class Watch:
+class StallTimer:
     """How long each job's worker has made no progress, by this machine's clock."""
 
     def __init__(self) -> None:
         self._marks: dict[Path, tuple[bytes, float]] = {}
 
-    def still_seconds(self, place: Path) -> float:
+    def stalled_seconds(self, place: Path) -> float:
         now, mark = time.monotonic(), progress_mark(place)
         if place not in self._marks or self._marks[place][0] != mark:
             self._marks[place] = mark, now
         return now - self._marks[place][1]
 
 
-def conduct(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> dict[str, State]:
+def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> dict[str, State]:
     """Run every job that is not done on the engine; returns what became of each.
 
     A job that fails never stops the others. One whose worker was killed or crashed is tried again up to `spec.retries`
@@ -39,7 +39,7 @@ def conduct(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> dic
     places = {job.name: folder / "jobs" / job.name for job in spec.jobs}
     states = {name: read_state(place) for name, place in places.items()}
     handles: dict[str, Any] = {}
-    watch, ended = Watch(), dict[str, str]()
+    stalls, ended = StallTimer(), dict[str, str]()
 
     def submit(names: list[str]) -> None:
         if names:
@@ -54,22 +54,24 @@ def conduct(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> dic
                 said = engine.poll(handle)
                 if said is not None:
                     del handles[name]
-                    states[name] = settle(places[name], ended.pop(name, said), spec.retries)
+                    states[name] = final_state(places[name], ended.pop(name, said), spec.retries)
                     again += [name] if is_open(states[name], spec.retries) else []
                     continue
                 states[name] = read_state(places[name])
                 is_running = name not in ended and stored_state(places[name]).status == "running"
-                if is_running and watch.still_seconds(places[name]) > STILL_SECONDS:
-                    ended[name] = f"the worker hung: no progress for {duration(STILL_SECONDS)}"
+                if is_running and stalls.stalled_seconds(places[name]) > STALLED_SECONDS:
+                    ended[name] = f"the worker hung: no progress for {duration(STALLED_SECONDS)}"
                     engine.stop([handle])
             for name in list(elsewhere):  # another engine's worker has it, until it is done or falls silent
                 states[name] = read_state(places[name])
                 if states[name].status != "running":
                     elsewhere.remove(name)
                     again += [name] if is_open(states[name], spec.retries) else []
-                elif watch.still_seconds(places[name]) > STILL_SECONDS:  # and only its own engine can end it
+                elif stalls.stalled_seconds(places[name]) > STALLED_SECONDS:  # and only its own engine can end it
                     elsewhere.remove(name)
-                    hangs = f"{states[name].worker} hangs: no progress for {duration(STILL_SECONDS)}; end it, and go on"
+                    hangs = (
+                        f"{states[name].worker} hangs: no progress for {duration(STALLED_SECONDS)}; end it, and go on"
+                    )
                     states[name] = replace(states[name], status="failed", sentence=hangs)
             submit(again)
             progress.show(states)
@@ -89,7 +91,7 @@ def is_open(state: State, retries: int) -> bool:
     return state.status != "failed" or state.attempts <= retries
 
 
-def settle(place: Path, said: str, retries: int) -> State:
+def final_state(place: Path, said: str, retries: int) -> State:
     """The state of a job whose worker has ended. One that died without a word leaves `running` behind."""
     state = stored_state(place)
     if state.status == "running":

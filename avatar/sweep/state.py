@@ -98,7 +98,7 @@ def read_job(folder: Path) -> Job:
 def read_state(folder: Path) -> State:
     """A job's state; one that says `running` and has been silent for a minute is waiting again."""
     state = stored_state(folder)
-    if state.status == "running" and silence(folder) > SILENT_SECONDS:
+    if state.status == "running" and heartbeat_age(folder) > SILENT_SECONDS:
         return replace(state, status="waiting")
     return state
 
@@ -115,7 +115,7 @@ def write_state(folder: Path, state: State) -> None:
     write_atomically(folder / "state.json", json.dumps(asdict(state), allow_nan=False).encode())
 
 
-def beat(folder: Path, computed: int) -> None:
+def write_heartbeat(folder: Path, computed: int) -> None:
     """Say that the job's worker lives, and the seconds of processor time that it has used."""
     with suppress(OSError):  # a disk that is full for a moment; who stays silent is missed
         (folder / "heartbeat").write_text(str(computed))
@@ -126,7 +126,7 @@ def progress_mark(folder: Path) -> bytes:
     return end_of(folder / "heartbeat") + b" " + end_of(folder / "log.txt")
 
 
-def silence(folder: Path) -> float:
+def heartbeat_age(folder: Path) -> float:
     """Seconds since the worker last said that it lives, by the clock of the file's machine as far as this one can tell."""
     try:
         return time.time() - (folder / "heartbeat").stat().st_mtime

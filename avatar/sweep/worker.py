@@ -38,7 +38,7 @@ class Worker:
         if (status := self._process.poll()) is None:
             return None
         self._reader.join(1.0)  # a process that it has left behind may hold its output open
-        return last_words(status, self._end)
+        return reason_of_end(status, self._end)
 
     def wait(self) -> str:
         """`poll`, when it has ended."""
@@ -84,7 +84,7 @@ def work_until_done(folder: str, threads: int) -> str:
         raise
 
 
-def last_words(status: int, said: bytes) -> str:
+def reason_of_end(status: int, said: bytes) -> str:
     """Why a worker ended, empty when it ended as it should."""
     if status == 0:
         return ""

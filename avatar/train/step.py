@@ -23,7 +23,7 @@ from avatar.train.objective import Objective, sh_degree
 from avatar.train.pose_corrections import PoseCorrections
 from avatar.types import HeadParams
 
-Judge = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
+GradientCheck = Callable[[PhotometricLoss, list[Tensor]], None]  # given the loss and all gradients before the update
 
 _IMAGES = ("image", "alpha", "head_mask", "mouth_mask")
 _OPTIONAL = ("noise", "row", "pose_jacobian", "crop_rows", "crop_columns")
@@ -88,11 +88,13 @@ class TrainState:
         return named
 
 
-def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | None = None) -> StepOutputs:
+def train_step(
+    state: TrainState, step: int, inputs: StepInputs, check_gradients: GradientCheck | None = None
+) -> StepOutputs:
     """Step number `step` (from 0) at the optimizer's rates.
 
     Raises UserError, leaving the parameters as they were, when the Gaussians cannot be drawn or when the loss or a gradient
-    is not finite; with a `judge` the latter is for it to see to.
+    is not finite; with `check_gradients` it handles the latter.
     """
     avatar, objective, frame = state.avatar, state.objective, inputs.frame
     target = frame.composite(inputs.background)
@@ -105,7 +107,7 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
         gaussians = avatar(params, inputs.vertices, camera.head_rotation.detach())
         image, *smaller = avatar.training_images(gaussians, camera, inputs.background, sh_degree(step))
     except CannotDraw as error:
-        raise stopped(step + 1, frame, str(error)) from error
+        raise non_finite_error(step + 1, frame, str(error)) from error
     crop = None
     if inputs.crop_rows is not None and inputs.crop_columns is not None:
         crop = inputs.crop_rows, inputs.crop_columns
@@ -113,10 +115,10 @@ def train_step(state: TrainState, step: int, inputs: StepInputs, judge: Judge | 
     state.optimizer.zero_grad()
     loss.total.backward()
     gradients = gradients_of(state)
-    if judge is None:
+    if check_gradients is None:
         check_step(step, frame, loss, gradients)
     else:
-        judge(loss, list(gradients.values()))
+        check_gradients(loss, list(gradients.values()))
     state.optimizer.step()
     return StepOutputs(PhotometricLoss(*(term.detach() for term in loss)), image.detach(), target)
 
@@ -135,13 +137,13 @@ def check_step(step: int, frame: Frame, loss: PhotometricLoss, gradients: Mappin
     suspects |= {f"the gradient of {n}": g for n, g in gradients.items()}
     for name, tensor in suspects.items():
         if message := describe_non_finite(name, tensor.detach()):
-            raise stopped(step + 1, frame, message)
+            raise non_finite_error(step + 1, frame, message)
     # Every value is finite but a norm overflows float32: as useless to Adam as a NaN.
     largest = max(gradients, key=lambda name: float(gradients[name].abs().max()))
-    raise stopped(step + 1, frame, f"the norm of the gradient of {largest} is beyond float32")
+    raise non_finite_error(step + 1, frame, f"the norm of the gradient of {largest} is beyond float32")
 
 
-def stopped(step: int, frame: Frame, problem: str) -> UserError:
+def non_finite_error(step: int, frame: Frame, problem: str) -> UserError:
     """What is said when the parameters have left what can be computed with; `step` counts from 1."""
     return UserError(
         f"training stopped at step {step}, frame {frame.name}: {problem}; what was saved before is untouched. Train "

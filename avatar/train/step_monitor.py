@@ -18,7 +18,7 @@ from torch import Tensor
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
 from avatar.train.log import TrainingLog
-from avatar.train.step import Judge, StepOutputs
+from avatar.train.step import GradientCheck, StepOutputs
 
 MOST_AHEAD = 64  # steps
 
@@ -39,7 +39,7 @@ class Guard:
         self.is_nonfinite: Float[Tensor, ""] = torch.zeros((), device=device)
         optimizer.found_inf = self.is_nonfinite  # type: ignore[attr-defined]  # of Adam's fused kernel: 1 is to do nothing
 
-    def judge(self, loss: PhotometricLoss, gradients: list[Tensor]) -> None:
+    def check_gradients(self, loss: PhotometricLoss, gradients: list[Tensor]) -> None:
         """Before the optimizer's step."""
         norms = torch._foreach_norm(gradients)  # pyright: ignore
         self._sum.add_(torch.stack((*norms, loss.total.detach())).sum(), alpha=0.0)
@@ -77,12 +77,12 @@ class SyncStepMonitor:
     def __init__(self, log: TrainingLog) -> None:
         self._log = log
 
-    judge = None  # `train_step` checks each step itself
+    check_gradients = None  # `train_step` checks each step itself
 
     def note(self, step: int, outcome: StepOutputs) -> None:
         self._log.step(step, outcome.loss, outcome.render, outcome.target)
 
-    def settle(self) -> None:
+    def flush(self) -> None:
         """Everything is known."""
 
 
@@ -92,7 +92,7 @@ class AsyncStepMonitor:
     def __init__(self, log: TrainingLog, optimizer: torch.optim.Adam, device: torch.device) -> None:
         self._log, self._guard = log, Guard(optimizer, device)
         self._notes: deque[_Note] = deque()
-        self.judge: Judge = self._guard.judge
+        self.check_gradients: GradientCheck = self._guard.check_gradients
 
     @torch.no_grad()
     def note(self, step: int, outcome: StepOutputs) -> None:
@@ -108,7 +108,7 @@ class AsyncStepMonitor:
         self._notes.append(_Note(step, copy, arrived))
         self._read(most_left=MOST_AHEAD)
 
-    def settle(self) -> None:
+    def flush(self) -> None:
         """Wait for all that is known of the steps so far. Raises NonFiniteStep."""
         self._read(most_left=0)
 

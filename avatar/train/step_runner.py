@@ -24,7 +24,7 @@ from avatar.losses.photometric import crop_of_few_sizes
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
-from avatar.train.step import Judge, StepInputs, StepOutputs, TrainState, train_step
+from avatar.train.step import GradientCheck, StepInputs, StepOutputs, TrainState, train_step
 from avatar.types import Camera
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
@@ -90,20 +90,20 @@ class StepRunner:
                 self._meshes[frame.time] = mesh
         return mesh
 
-    def make(self, step: int, frame: Frame, judge: Judge | None) -> StepOutputs:
-        """Step number `step` (from 0) on one frame. See `train_step` for `judge` and what is raised. What a replayed step
-        gives is overwritten by the next one."""
+    def make(self, step: int, frame: Frame, check_gradients: GradientCheck | None) -> StepOutputs:
+        """Step number `step` (from 0) on one frame. See `train_step` for `check_gradients` and what is raised. What a
+        replayed step gives is overwritten by the next one."""
         state, config = self._state, self._state.objective.config
         set_rates(state.optimizer, schedule(step, config))
         inputs = self.inputs(step, frame)
         kind = Kind.of(step, inputs, state.objective.term(step)) if self._replays else None  # None: to be launched
-        replay = None if kind is None or judge is None else self._ready(kind, step, inputs, judge)
+        replay = None if kind is None or check_gradients is None else self._ready(kind, step, inputs, check_gradients)
         if replay is not None:
             self.replayed += 1
             outputs = replay(inputs.tensors())
         else:
-            outputs = train_step(state, step, inputs, judge)
-            if kind is not None and judge is not None:
+            outputs = train_step(state, step, inputs, check_gradients)
+            if kind is not None and check_gradients is not None:
                 self._launched[kind] += 1
         state.avatar.after_step(state.optimizer, step + 1, config)
         return outputs
@@ -148,7 +148,9 @@ class StepRunner:
             self._noises = first, to_device(self._noise.of_steps(range(first, first + BLOCK)), self._device)
         return self._noises[1][step - first]
 
-    def _ready(self, kind: Kind, step: int, inputs: StepInputs, judge: Judge) -> Replay[StepOutputs] | None:
+    def _ready(
+        self, kind: Kind, step: int, inputs: StepInputs, check_gradients: GradientCheck
+    ) -> Replay[StepOutputs] | None:
         """What replays steps like this one, captured if need be; None: the step has to be launched."""
         if kind in self._captured:
             self._captured.move_to_end(kind)  # what was used longest ago makes room
@@ -157,7 +159,7 @@ class StepRunner:
             return None
 
         def play(tensors: Mapping[str, Tensor]) -> StepOutputs:
-            return train_step(self._state, step, inputs.with_tensors(tensors), judge)
+            return train_step(self._state, step, inputs.with_tensors(tensors), check_gradients)
 
         try:
             replay = Replay(play, inputs.tensors(), self._pool)

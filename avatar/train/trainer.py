@@ -26,7 +26,7 @@ from avatar.train.objective import Objective, PerceptualTerm
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.order import frame_order
 from avatar.train.pose_corrections import PREFIX, make_pose_corrections
-from avatar.train.step import TrainState, stopped
+from avatar.train.step import TrainState, non_finite_error
 from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor
 from avatar.train.step_runner import StepRunner
 
@@ -100,12 +100,12 @@ def train(
         order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
         try:
             for frame in loader.frames(order):
-                outcome = steps.make(step, frame, progress.judge)
+                outcome = steps.make(step, frame, progress.check_gradients)
                 step += 1
                 progress.note(step, outcome)
                 saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
                 if saves or interrupted():
-                    progress.settle()
+                    progress.flush()
                 if saves:
                     log.preview(step, *render_held_out(avatar, loader, subject, background, step))
                     save(step)
@@ -116,8 +116,8 @@ def train(
             index = next(frame_order(subject.split.train, trainer.seed, nonfinite.step, trainer.iterations))
             frame = next(iter(loader.frames([index])))
             with checked_drawings():
-                steps.make(nonfinite.step, frame, judge=None)  # raises what was wrong
-            raise stopped(nonfinite.step + 1, frame, "the loss or a gradient was not finite") from nonfinite
+                steps.make(nonfinite.step, frame, check_gradients=None)  # raises what was wrong
+            raise non_finite_error(nonfinite.step + 1, frame, "the loss or a gradient was not finite") from nonfinite
         if step > saved:
             save(step)
     return step
@@ -151,5 +151,5 @@ def render_held_out(
         with checked_drawings():
             drawn = avatar.draw(gaussians, frame.camera, background)
     except CannotDraw as error:
-        raise stopped(step, frame, str(error)) from error
+        raise non_finite_error(step, frame, str(error)) from error
     return frame.composite(background), drawn.image

@@ -59,13 +59,13 @@ class AccessCheck:
                 "Another site's page may not use the viewer. Behind a proxy, start it with --url ADDRESS.",
             )
         path, _, query = path.partition("?")
-        if same(path.rstrip("/").rpartition("/")[2], self.token):
+        if equal_tokens(path.rstrip("/").rpartition("/")[2], self.token):
             return None
-        if same(urllib.parse.parse_qs(query).get("token", [""])[0], self.token):
+        if equal_tokens(urllib.parse.parse_qs(query).get("token", [""])[0], self.token):
             return Refusal(HTTPStatus.SEE_OTHER, "", f"./{self.token}/")  # relative: it stays in a proxy's sub-path
         return Refusal(HTTPStatus.UNAUTHORIZED, "The viewer needs its token: open the whole address that it printed.")
 
 
-def same(given: str, token: str) -> bool:
+def equal_tokens(given: str, token: str) -> bool:
     """In a time that tells nothing of how much agrees."""
     return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), token.encode())

@@ -12,7 +12,7 @@ from avatar.types import Camera, HeadParams
 SHORT = 2.0  # seconds that rate and latency on the page are of
 
 
-class Live(NamedTuple):
+class LiveFrame(NamedTuple):
     """A frame as the avatar shows it."""
 
     number: int  # another one for another frame
@@ -21,7 +21,7 @@ class Live(NamedTuple):
     taken: float | None = None  # seconds of `time.monotonic`, when its picture was taken or its packet came
 
 
-class Pace:
+class LiveTiming:
     """Latency and rate of the live frames that were drawn lately."""
 
     def __init__(self) -> None:

@@ -52,7 +52,7 @@ class MessageCheck:
         self._checks: dict[str, Callable[[Value], Value]] = {}
         self._decoder = msgspec.msgpack.Decoder(_Camera | _Change)
 
-    def admit(self, handle: Any, check: Callable[[Value], Value]) -> None:
+    def allow(self, handle: Any, check: Callable[[Value], Value]) -> None:
         """A page may set this control of viser's to what `check` returns; it raises MessageError."""
         self._checks[handle._impl.uuid] = check  # there is no public name for it
 

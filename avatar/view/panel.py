@@ -43,7 +43,7 @@ class Panel:
         self._add_picture()
         self._add_face()
 
-    def tell(self, lines: list[str], live: str) -> None:
+    def show_status(self, lines: list[str], live: str) -> None:
         """What the panel says: `lines` are Markdown of this program's own, `live` is of anybody."""
         self._status.content = "\n\n".join(lines)
         if self._live is not None:
@@ -89,13 +89,13 @@ class Panel:
         return safely
 
     def _input(self, handle: Any, check: Callable[[Value], Value], act: Callable[[Any], object]) -> Any:
-        self._viewer.messages.admit(handle, check)
+        self._viewer.messages.allow(handle, check)
         handle.on_update(self._safe(act))
         return handle
 
     def _button(self, label: str, act: Callable[[Any], object]) -> Any:
         button = self._gui.add_button(label)
-        self._viewer.messages.admit(button, pressed)
+        self._viewer.messages.allow(button, pressed)
         button.on_click(self._safe(act))
         return button
 
@@ -111,7 +111,7 @@ class Panel:
         def limit() -> None:
             self._scrub.value, self._scrub.visible = 0.0, player.clip is not None
             self._scrub.max = max(round(player.duration, 2), 0.01)
-            viewer.messages.admit(self._scrub, within(0.0, self._scrub.max))
+            viewer.messages.allow(self._scrub, within(0.0, self._scrub.max))
 
         def toggle(event: Any) -> None:
             if player.clip is None:

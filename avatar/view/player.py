@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from avatar.runs.clips import Clip
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
-from avatar.view.live import Live
+from avatar.view.live import LiveFrame
 
 NEUTRAL, STREAM, WEBCAM = "neutral face", "stream", "webcam"
 
@@ -30,7 +30,7 @@ class Player:
         trained: TrainedAvatar,
         clips: Mapping[str, Clip],
         clock: Callable[[], float],
-        live: Callable[[], Live | None] | None = None,
+        live: Callable[[], LiveFrame | None] | None = None,
         live_name: str = STREAM,
     ) -> None:
         self._clips, self._clock, self._live = dict(clips), clock, live

@@ -17,7 +17,7 @@ def _print(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
-class Complaints:
+class RateLimitedLog:
     def __init__(self, say: Callable[[str], object] = _print, clock: Callable[[], float] = time.monotonic) -> None:
         self._say, self._clock = say, clock
         self._lock = threading.Lock()
@@ -31,16 +31,16 @@ class Complaints:
                 kind = "other trouble with a client"
             self._counts[kind] = self._counts.get(kind, 0) + 1
             if kind not in self._told or self._clock() - self._told[kind][0] >= SILENCE:
-                self._tell(kind)
+                self._print_count(kind)
 
     def close(self) -> None:
         """Say the counts that have grown since they were said."""
         with self._lock:
             for kind, count in self._counts.items():
                 if count > self._told[kind][1]:
-                    self._tell(kind)
+                    self._print_count(kind)
 
-    def _tell(self, kind: str) -> None:
+    def _print_count(self, kind: str) -> None:
         count = self._counts[kind]
         self._told[kind] = self._clock(), count
         self._say(f"Viewer: {kind}" + (f" ({count} times)" if count > 1 else ""))

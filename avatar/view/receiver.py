@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from avatar.errors import UserError
 from avatar.head.model import matrix_from_6d
 from avatar.motion.rest import RestPose
-from avatar.motion.transfer import departed
+from avatar.motion.transfer import retargeted
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
-from avatar.view.auth import same
-from avatar.view.live import Live
+from avatar.view.auth import equal_tokens
+from avatar.view.live import LiveFrame
 from avatar.view.packets import MAX_LINE, FrameReader, PacketError
 from avatar.view.player import STREAM
 
@@ -81,7 +81,7 @@ class Receiver:
         said = f"Port {self.port}: {counts.received} frames, {counts.dropped} dropped"
         return said + (f", {counts.malformed} malformed (last: {complaint})" if counts.malformed else "")
 
-    def newest(self) -> Live | None:
+    def newest(self) -> LiveFrame | None:
         """The newest frame as the avatar's; None before the first."""
         with self._lock:
             if self._newest is None:
@@ -91,8 +91,8 @@ class Receiver:
         if is_departure and source is None:
             identity = matrix_from_6d(params.neck)  # no rotation
             source = RestPose(params.expression * 0, identity, None)
-        own = params if source is None else departed([params], source, self._goal, 1.0)[0]
-        return Live(number, own, taken=taken)
+        own = params if source is None else retargeted([params], source, self._goal, 1.0)[0]
+        return LiveFrame(number, own, taken=taken)
 
     def calibrate(self) -> None:
         """Take the newest frame for the driver's neutral face: departures from it are shown from the avatar's own."""
@@ -107,7 +107,7 @@ class Receiver:
         with self._lock:
             sockets = [self._tcp, *self._senders, *([] if self._udp is None else [self._udp])]
         for used in sockets:
-            _wake(used)
+            _shut_down(used)
         self._tcp.close()
         if self._udp is not None:
             self._udp.close()
@@ -135,7 +135,7 @@ class Receiver:
             sender.settimeout(IDLE_SECONDS)
             with self._lock:
                 if len(self._senders) == MAX_SENDERS:  # the one whose last frame is the oldest goes
-                    _wake(longest := min(self._senders, key=lambda other: self._senders[other]))
+                    _shut_down(longest := min(self._senders, key=lambda other: self._senders[other]))
                     del self._senders[longest]
                 self._senders[sender] = 0.0
             threading.Thread(target=self._take_lines, args=(sender,), daemon=True, name="stream").start()
@@ -147,7 +147,7 @@ class Receiver:
                 while self._is_open and (line := lines.readline(MAX_LINE + 1)):
                     if is_first:
                         is_first = False
-                        if (complaint := self._unwelcome(line)) is not None:
+                        if (complaint := self._refusal(line)) is not None:
                             return self._refuse(complaint)
                         if self._token is not None:
                             continue
@@ -157,18 +157,18 @@ class Receiver:
                             line = lines.readline(MAX_LINE)
                     elif line.strip():
                         self._take_line(reader, line, sender)
-                    throttle.rest()
+                    throttle.sleep()
         except OSError:
             pass  # the sender has gone, or says nothing
         finally:
             with self._lock:
                 self._senders.pop(sender, None)
 
-    def _unwelcome(self, line: bytes) -> str | None:
+    def _refusal(self, line: bytes) -> str | None:
         """Why a sender with this first line is closed."""
         if not line.startswith(b"{"):  # a web page can send anything, but not before the head of its request
             return "a sender's first line is not JSON: web pages may not send frames"
-        if self._token is not None and not knows(line, self._token):
+        if self._token is not None and not has_token(line, self._token):
             return "a sender's first line does not say the token"
         return None
 
@@ -194,7 +194,7 @@ class Receiver:
                     self._take(params, True)
             except Exception as error:
                 self._refuse(_told(error))
-            throttle.rest()
+            throttle.sleep()
 
 
 class Throttle:
@@ -209,7 +209,7 @@ class Throttle:
         self._clock, self._used, self._sleep = clock, used, sleep
         self._since, self._before = clock(), used()
 
-    def rest(self) -> None:
+    def sleep(self) -> None:
         """Called after each packet; sleeps where the last second's took too long."""
         used = self._used() - self._before
         if used > SHARE:
@@ -218,21 +218,21 @@ class Throttle:
             self._since, self._before = self._clock(), self._used()
 
 
-def knows(line: bytes, token: str) -> bool:
+def has_token(line: bytes, token: str) -> bool:
     """Whether a sender's first line is {"token": TOKEN}."""
     try:
         found = json.loads(line)
     except (ValueError, RecursionError):
         return False
     given = found.get("token") if isinstance(found, dict) else None
-    return isinstance(given, str) and same(given, token)
+    return isinstance(given, str) and equal_tokens(given, token)
 
 
 def _told(error: Exception) -> str:
     return str(error) if isinstance(error, PacketError) else f"a packet cannot be read ({type(error).__name__})"
 
 
-def _wake(used: socket.socket) -> None:
+def _shut_down(used: socket.socket) -> None:
     """End what a thread waits for."""
     with suppress(OSError):
         used.shutdown(socket.SHUT_RDWR)

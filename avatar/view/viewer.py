@@ -21,11 +21,11 @@ from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
 from avatar.runs.trained import TrainedAvatar
 from avatar.view.auth import LOCAL, AccessCheck
-from avatar.view.live import Pace
+from avatar.view.live import LiveTiming
 from avatar.view.messages import MessageCheck
 from avatar.view.panel import Panel, notes
 from avatar.view.player import Player
-from avatar.view.rate_limited_log import Complaints
+from avatar.view.rate_limited_log import RateLimitedLog
 from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 from avatar.view.viser_server import WebServer
 
@@ -66,8 +66,8 @@ class Viewer:
         self._live_status = live_status
         self._save_lock = threading.Lock()
         self.picture: np.ndarray | None = None
-        self.milliseconds, self.pace = 0.0, Pace()
-        self.complaints, self.messages = Complaints(), MessageCheck()
+        self.milliseconds, self.timing = 0.0, LiveTiming()
+        self.complaints, self.messages = RateLimitedLog(), MessageCheck()
         camera = renderer.trained.rest_camera()
         self._own: Angles = seen_from(camera)
         x, y, z = (-camera.R_cam_world.T @ camera.t_cam_world).tolist()
@@ -83,7 +83,7 @@ class Viewer:
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         server.initial_camera.up = (0.0, 1.0, 0.0)
         self.panel = Panel(self, server.gui, None if live_status is None else player.live_name, calibrate)
-        server.on_client_connect(self._welcome)
+        server.on_client_connect(self._add_client)
         self._thread = threading.Thread(target=self._loop, daemon=True, name="viewer")
         self._thread.start()
 
@@ -117,7 +117,7 @@ class Viewer:
         yaw, elevation = math.degrees(math.atan2(x, z)), math.degrees(math.atan2(y, math.hypot(x, z)))
         return ViewOffset(self._own.yaw - yaw, elevation - self._own.elevation, self._distance / distance)
 
-    def _welcome(self, client: Any) -> None:
+    def _add_client(self, client: Any) -> None:
         @client.camera.on_update
         def _(camera: Any) -> None:
             look, _ = self.renderer.within(self.look_from(np.asarray(camera.position) - np.asarray(camera.look_at)))
@@ -153,7 +153,7 @@ class Viewer:
             for number, aspect in windows:
                 self._send(clients[number], aspect, picture, is_moving)
             if shown.taken is not None:
-                self.pace.add(shown.taken, time.monotonic())
+                self.timing.add(shown.taken, time.monotonic())
             if is_moving:
                 self._fit(self.milliseconds)
         else:
@@ -162,7 +162,7 @@ class Viewer:
         if now - self._told > STATUS_EVERY:
             self._told = now
             is_recorded = shown.recorded is not None
-            self._tell(renderer.distance(renderer.params(shown.params, setting)), setting, is_recorded)
+            self._show_status(renderer.distance(renderer.params(shown.params, setting)), setting, is_recorded)
 
     def _fit(self, milliseconds: float) -> None:
         low, high = TARGET_MS
@@ -176,7 +176,7 @@ class Viewer:
         except Exception as error:  # the others get theirs
             self.complaints.add(f"a picture could not be sent ({type(error).__name__})")
 
-    def _tell(self, distance: float, setting: Setting, is_recorded: bool) -> None:
+    def _show_status(self, distance: float, setting: Setting, is_recorded: bool) -> None:
         height, width = (0, 0) if self.picture is None else self.picture.shape[:2]
         _, is_supported = self.renderer.within(setting.look)
         lines = [
@@ -187,9 +187,9 @@ class Viewer:
         ]
         if not is_supported:
             lines.append("**The camera is where the training video never was: the avatar guesses.**")
-        if (pace := self.pace.now(time.monotonic())) is not None:
-            lines.append(f"Latency {pace[0]:.0f} ms at {pace[1]:.0f} pictures a second")
-        self.panel.tell(lines, "" if self._live_status is None else self._live_status())
+        if (timing := self.timing.now(time.monotonic())) is not None:
+            lines.append(f"Latency {timing[0]:.0f} ms at {timing[1]:.0f} pictures a second")
+        self.panel.show_status(lines, "" if self._live_status is None else self._live_status())
 
     def save_picture(self, event: Any) -> None:
         with self.lock:

@@ -27,7 +27,7 @@ from websockets.protocol import State
 from avatar.errors import UserError
 from avatar.view.auth import AccessCheck, Refusal
 from avatar.view.messages import MAX_MESSAGE, MessageCheck, MessageError
-from avatar.view.rate_limited_log import Complaints
+from avatar.view.rate_limited_log import RateLimitedLog
 
 MAX_WAITING = 64  # connections that have not been let in yet
 MAX_CLIENTS = 16
@@ -54,7 +54,7 @@ PageServer = Callable[[ServerConnection, Request], Response | None]
 class Connection(ServerConnection):
     """One client: its messages are checked, counted and paced as they come in."""
 
-    def __init__(self, *arguments: Any, messages: MessageCheck, complaints: Complaints, **options: Any) -> None:
+    def __init__(self, *arguments: Any, messages: MessageCheck, complaints: RateLimitedLog, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._messages, self._complaints = messages, complaints
         self.heard = self.loop.time()  # when its last message came, or the connection itself
@@ -115,7 +115,12 @@ class WebServer:
     """viser, reached through `access` on a socket that listens."""
 
     def __init__(
-        self, listening: socket.socket, access: AccessCheck, messages: MessageCheck, complaints: Complaints, label: str
+        self,
+        listening: socket.socket,
+        access: AccessCheck,
+        messages: MessageCheck,
+        complaints: RateLimitedLog,
+        label: str,
     ) -> None:
         self._access, self._messages, self._complaints = access, messages, complaints
         self._listening = listening
@@ -217,7 +222,7 @@ class WebServer:
 
 
 class _Counter(logging.Handler):
-    def __init__(self, complaints: Complaints) -> None:
+    def __init__(self, complaints: RateLimitedLog) -> None:
         super().__init__()
         self._complaints = complaints
 

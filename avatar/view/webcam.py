@@ -18,10 +18,10 @@ from avatar.errors import UserError
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.controls import joint_ranges
 from avatar.motion.rest import RestPose, find_neutral
-from avatar.motion.transfer import departed
+from avatar.motion.transfer import retargeted
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import Camera, HeadParams
-from avatar.view.live import Live
+from avatar.view.live import LiveFrame
 from avatar.view.player import WEBCAM
 
 NO_FACE = "There is no face in the picture."
@@ -85,7 +85,7 @@ class Webcam:
         recording = trained.recording
         self._has_torso = not {"lean", "turn"}.isdisjoint(joint_ranges(recording.motion(recording.split.train)))
         self._lock = threading.Lock()
-        self._newest: Live | None = None
+        self._newest: LiveFrame | None = None
         self._face: Face | None = None
         self._rest: RestPose | None = None
         self._rest_face: Face | None = None
@@ -104,7 +104,7 @@ class Webcam:
         if self._thread.is_alive():
             self._thread.join(5)
 
-    def newest(self) -> Live | None:
+    def newest(self) -> LiveFrame | None:
         """The newest frame as the avatar's; None until calibration is done."""
         return self._newest
 
@@ -125,20 +125,20 @@ class Webcam:
 
     def _run(self) -> None:
         try:
-            calibration = self._tracker.calibrate(self._tell)
+            calibration = self._tracker.calibrate(self._set_status)
             self._learn(calibration)
             self._say("Calibrated: the avatar follows.")
             while self._is_open:
                 self._take(self._tracker.follow())
         except UserError as error:
             if self._is_open:
-                self._tell(str(error))
+                self._set_status(str(error))
         except Exception as error:
             if self._is_open:
-                self._tell(f"Following the face has failed ({type(error).__name__}: {error}); start anew.")
+                self._set_status(f"Following the face has failed ({type(error).__name__}: {error}); start anew.")
                 raise
 
-    def _tell(self, words: str) -> None:
+    def _set_status(self, words: str) -> None:
         self._words = words
         self._say(words)
 
@@ -155,12 +155,12 @@ class Webcam:
         with self._lock:
             self._face, rest, rest_face = face, self._rest, self._rest_face
         assert rest is not None and rest_face is not None
-        params = departed([face.params], rest, self._goal, 1.0)[0]
+        params = retargeted([face.params], rest, self._goal, 1.0)[0]
         camera = moved_camera(self._own, rest_face, face)
         if self._has_torso:
             params = replace(params, neck=still_torso(self._trained.rest_params().neck, self._own, camera))
         number = 0 if self._newest is None else self._newest.number + 1
-        self._newest = Live(number, params, camera, face.taken)
+        self._newest = LiveFrame(number, params, camera, face.taken)
         self._on_frame()
 
 

@@ -182,7 +182,7 @@ def _exposure(clip: Clip) -> Iterator[Finding]:
     numbers, head, background = measured
     has_background = bool(np.isfinite(background).all()) and _flat_background(clip) is None
     both = np.where(np.sign(head) == np.sign(background), np.sign(head), 0) * np.minimum(abs(head), abs(background))
-    change = steady(both if has_background else head)
+    change = moving_median(both if has_background else head)
     low, high = int(np.argmin(change)), int(np.argmax(change))
     span = float(change[high] - change[low])
     if span <= (EXPOSURE if has_background else HEAD_EXPOSURE):
@@ -198,7 +198,7 @@ def _exposure(clip: Clip) -> Iterator[Finding]:
     )
 
 
-def steady(values: np.ndarray) -> np.ndarray:
+def moving_median(values: np.ndarray) -> np.ndarray:
     """Moving median over a second, so that one frame does not count as a change of light."""
     half = min(_STEADY, len(values)) // 2
     return np.array([np.nanmedian(values[max(0, i - half) : i + half + 1]) for i in range(len(values))])

@@ -12,7 +12,7 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
 from data_prep.check.clip import NOT_SOUGHT, Clip
 from data_prep.check.findings import Finding, from_sentence, grouped
-from data_prep.check.motion import suddenness
+from data_prep.check.motion import measure_jumps
 from data_prep.formats.frame_files import TRACKING
 from data_prep.prepare.pairing import BEHIND_CAMERA, REPEATS
 
@@ -150,7 +150,7 @@ def _jumps(clip: Clip) -> Iterator[Finding]:
     numbers = list(tracked)
     if not numbers:
         return
-    sudden = suddenness(numbers, list(tracked.values()))
+    sudden = measure_jumps(numbers, list(tracked.values()))
     expressions = np.stack([track.expression for track in tracked.values()])
     spread = float(np.sqrt(((expressions - expressions.mean(axis=0)) ** 2).sum(axis=1).mean()))
     for what, values, floor, unit in (

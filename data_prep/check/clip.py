@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from avatar.data.source import DEFAULT_FPS, Source
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
@@ -27,7 +28,7 @@ from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
 from data_prep.prepare.masks import read_masks
-from data_prep.prepare.misfit import Judgement, judge, sample
+from data_prep.prepare.misfit import SAMPLED_FRAMES, Judgement, judge
 from data_prep.prepare.pairing import unusable
 from data_prep.progress import Progress, silent
 
@@ -65,7 +66,7 @@ class Clip:
         if not self.fits:
             return None
         measured = [pair for pair in self.pairs() if pair[0] in self.fits]
-        return judge([self.fits[image] for image, _ in sample(measured)], self.files)
+        return judge([self.fits[image] for image, _ in evenly_spread(measured, SAMPLED_FRAMES)], self.files)
 
     @cached_property
     def _listed_names(self) -> dict[int, str]:

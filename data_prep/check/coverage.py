@@ -14,7 +14,6 @@ from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.motion import HeadAngles, head_angles
 from data_prep.formats.division import divide
 
-MIN_TEST_FRAMES = 2
 SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120
 NARROW_YAW = 20.0  # degrees; with less, ears and the sides of the nose are never seen
 FAR_ANGLE = 5.0  # degrees to the nearest training frame

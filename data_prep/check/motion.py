@@ -29,7 +29,7 @@ def head_angles(rotations: np.ndarray) -> HeadAngles:
 
 
 @dataclass(frozen=True)
-class Suddenness:
+class Jumps:
     """How far each frame lies from half-way between its neighbours; NaN at the ends and beside missing numbers."""
 
     rotation: np.ndarray  # [n] degrees
@@ -37,7 +37,7 @@ class Suddenness:
     expression: np.ndarray  # [n] norm over the coefficients
 
 
-def suddenness(numbers: Sequence[int], tracks: Sequence[FrameTrack]) -> Suddenness:
+def measure_jumps(numbers: Sequence[int], tracks: Sequence[FrameTrack]) -> Jumps:
     rotations, translations, expressions = (
         np.array([getattr(track, name) for track in tracks]).reshape(len(tracks), *shape)
         for name, shape in (("R", (3, 3)), ("t", (3,)), ("expression", (-1,)))
@@ -53,4 +53,4 @@ def suddenness(numbers: Sequence[int], tracks: Sequence[FrameTrack]) -> Suddenne
         for row, values, unit in ((1, translations, 1000.0), (2, expressions, 1.0)):
             middle = values[1:-1] - (values[:-2] + values[2:]) / 2
             result[row, 1:-1] = np.where(consecutive, unit * np.linalg.norm(middle, axis=1), np.nan)
-    return Suddenness(*result)
+    return Jumps(*result)

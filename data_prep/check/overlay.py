@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from avatar.data.images import read_image
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.prepare.mask_overlap import Mesh, MeshProjector
@@ -32,7 +33,7 @@ def choose_frames(clip: Clip) -> list[int]:
     drawable = [n for n, _ in clip.tracked() if clip.is_whole(n)]
     if len(drawable) <= SHOWN:
         return drawable
-    spread = [drawable[round(i)] for i in np.linspace(0, len(drawable) - 1, SHOWN // 2)]
+    spread = evenly_spread(drawable, SHOWN // 2)
 
     def misfit(number: int) -> float:
         fit = clip.fits.get(number)

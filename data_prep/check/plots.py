@@ -16,14 +16,14 @@ _FRAME = "image number"
 
 def coverage_plots(coverage: Coverage) -> list[Markup]:
     train, test = list(coverage.split.train), list(coverage.split.test)
-    pose, (axes,) = figure_of()
+    pose, axes = figure_of()
     _scatter(axes, coverage.angles.yaw, coverage.angles.pitch, train, test)
     axes.set(xlabel="yaw in degrees", ylabel="pitch in degrees")
     axes.axis("equal")
-    face, (axes,) = figure_of()
+    face, axes = figure_of()
     _scatter(axes, coverage.expressions[:, 0], coverage.expressions[:, 1], train, test)
     axes.set(xlabel="first principal expression", ylabel="second principal expression")
-    course, (axes,) = figure_of()
+    course, axes = figure_of()
     for name, colour in zip(("yaw", "pitch", "roll"), SERIES, strict=False):
         axes.plot(coverage.images, getattr(coverage.angles, name), color=colour, linewidth=1, label=name)
     axes.axvspan(coverage.images[test[0]], coverage.images[test[-1]], color=TEST, alpha=0.1, linewidth=0)
@@ -41,7 +41,7 @@ def course_plots(clip: Clip) -> list[Markup]:
     plots = []
     if clip.fits:
         numbers = list(clip.fits)
-        figure, (axes,) = figure_of()
+        figure, axes = figure_of()
         for name, label, colour in (
             ("overhang", "mesh sticks out of the head mask", SERIES[0]),
             ("mouth", "lips away from the mouth mask", SERIES[1]),
@@ -55,7 +55,7 @@ def course_plots(clip: Clip) -> list[Markup]:
     light = exposure(clip)
     if light is not None:
         numbers, head, background = light
-        figure, (axes,) = figure_of()
+        figure, axes = figure_of()
         axes.plot(numbers, head, color=SERIES[0], linewidth=1, label="head")
         if np.isfinite(background).any():
             axes.plot(numbers, background, color=SERIES[2], linewidth=1, label="background")
@@ -64,7 +64,7 @@ def course_plots(clip: Clip) -> list[Markup]:
         axes.legend(frameon=False, fontsize=8)
         plots.append(plot(figure, "Brightness against the median of the clip", "brightness over time"))
     if clip.steps:
-        figure, (axes,) = figure_of()
+        figure, axes = figure_of()
         axes.plot(list(clip.steps), list(clip.steps.values()), color=SERIES[0], linewidth=0.8)
         axes.set(xlabel=_FRAME, ylabel="grey levels", ylim=(0, None))
         plots.append(plot(figure, "Mean change of the image since the frame before; zero is a repeat", "image change"))

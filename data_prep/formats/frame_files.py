@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,22 +131,17 @@ def find_frame_files(
         raise UserError(f"{folder} is a file; give the folder that holds imgs/ (the frames of the video)")
     if not folder.is_dir():
         raise UserError(f"the folder {folder} does not exist")
-    images = _numbered(folder / "imgs", IMAGE_SUFFIXES, complain)
+    images = find_numbered(folder / "imgs", complain)
     if not images and not _others(folder / "imgs"):
         complain(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
     return FrameFiles(
         folder=folder,
         images=images,
-        alphas=_numbered(folder / "alpha", IMAGE_SUFFIXES, complain) or transparent(images),
-        head_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_neckhead"),
-        mouth_masks=_numbered(folder / "parsing", IMAGE_SUFFIXES, complain, "_mouth"),
+        alphas=find_numbered(folder / "alpha", complain) or transparent(images),
+        head_masks=find_numbered(folder / "parsing", complain, "_neckhead"),
+        mouth_masks=find_numbered(folder / "parsing", complain, "_mouth"),
         tracking=find_tracking(folder, tracking, complain),
     )
-
-
-def find_numbered(folder: Path, complain: Callable[[str], object] = refuse) -> dict[int, Path]:
-    """The pictures of a folder by the number at the end of their names; `complain` as in `find_frame_files`."""
-    return _numbered(folder, IMAGE_SUFFIXES, complain)
 
 
 def transparent(images: Mapping[int, Path]) -> dict[int, Path]:
@@ -165,26 +160,28 @@ def find_tracking(
     folder: Path, given: Path | None = None, complain: Callable[[str], object] = refuse
 ) -> dict[int, Path]:
     """metrical-tracker's files by number, of `folder` or of the folder that is given; `complain` as above."""
+    find = partial(find_numbered, complain=complain, suffixes=(".frame",))
     if given is None:
-        found = _numbered(folder / "checkpoint", (".frame",), complain)
+        found = find(folder / "checkpoint")
         if not found:
             complain(f"{folder / 'checkpoint'} holds no .frame files of metrical-tracker; give --tracking their folder")
         return found
     if not Path(given).is_dir():
         complain(f"the tracking folder {given} does not exist")
         return {}
-    found = _numbered(Path(given) / "checkpoint", (".frame",), complain) or _numbered(
-        Path(given), (".frame",), complain
-    )
+    found = find(Path(given) / "checkpoint") or find(Path(given))
     if not found:
         complain(f"neither {given} nor {Path(given) / 'checkpoint'} holds .frame files of metrical-tracker")
     return found
 
 
-def _numbered(
-    folder: Path, suffixes: tuple[str, ...], complain: Callable[[str], object], tag: str = ""
+def find_numbered(
+    folder: Path,
+    complain: Callable[[str], object] = refuse,
+    tag: str = "",
+    suffixes: tuple[str, ...] = IMAGE_SUFFIXES,
 ) -> dict[int, Path]:
-    """Files `<anything><number><tag><suffix>` (any case) by number, in the order of the numbers."""
+    """Files `<anything><number><tag><suffix>` (any case) by number, in the order of the numbers; `complain` as above."""
     if not folder.is_dir():
         return {}
     found: dict[int, Path] = {}

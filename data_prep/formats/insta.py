@@ -22,7 +22,7 @@ from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import Tracking
 from data_prep.formats.insta_meshes import CANONICAL, mesh_paths, read_meshes
 from data_prep.formats.metrical_tracker import read_tracking
-from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, numbered
+from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of
 from data_prep.formats.transforms import ListedFrame, frame_rate
 
 NAME = "INSTA"
@@ -35,7 +35,7 @@ def recognise(frames: list[ListedFrame]) -> bool:
 
 def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None = None) -> TrackedFolder:
     """Raises UserError for paths outside the folder, and where there is neither the tracker's result nor a mesh."""
-    listed = numbered(frames)
+    listed = dict(enumerate(frames))
     images = {number: frame.image for number, frame in listed.items()}
     result = _result_folder(folder, tracking)
     if result is None and tracking is not None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.files.opening import is_there, read_text
 from avatar.head.assets import HeadAssets
@@ -144,7 +145,7 @@ class _Clip:
     def _sample(self, folder: Path) -> dict[int, np.ndarray]:
         """The vertices of meshes from all parts of the clip."""
         numbers, found, reason = list(self.paths), {}, ""
-        for number in (numbers[i] for i in np.unique(np.linspace(0, len(numbers) - 1, SAMPLES).round().astype(int))):
+        for number in evenly_spread(numbers, SAMPLES):
             try:
                 found[number] = self._points(self.paths[number])
             except BadFrame as error:

@@ -60,10 +60,6 @@ def matte_notes(files: FrameFiles) -> tuple[str, ...]:
     )
 
 
-def numbered(frames: list[ListedFrame]) -> dict[int, ListedFrame]:
-    return dict(enumerate(frames))
-
-
 def listings_of(frames: list[ListedFrame]) -> tuple[Path, ...]:
     return tuple(dict.fromkeys(frame.listing for frame in frames))
 

@@ -34,7 +34,7 @@ from data_prep.formats.division import ALL, chosen_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, read_frames, vector
 from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
-from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes, numbered
+from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes
 from data_prep.formats.transforms import (
     OPENCV_FROM_OPENGL,
     ListedFrame,
@@ -59,7 +59,7 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
     Raises UserError for paths outside the folder, frames without parameters, and cameras that there are not.
     """
     frames, notes = _chosen(frames, cameras, folder)
-    listed = numbered(frames)
+    listed = dict(enumerate(frames))
     parameters = {number: _parameter_file(frame) for number, frame in listed.items()}
     images = {number: frame.image for number, frame in listed.items()}
     shots = _shots(listed, parameters)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from avatar.types import HeadParams
@@ -112,8 +113,7 @@ class FaceFollower:
                 f"{error}; {len(found)} pictures showed the face, calibration takes {FEWEST} and {CALIBRATION_SECONDS:g} s"
             ) from None
         tell("Fitting the face.")
-        chosen = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST)).round().astype(int)).tolist()
-        return self._calibrated([found[k] for k in chosen])
+        return self._calibrated(evenly_spread(found, MOST))
 
     def follow(self) -> FollowedFace | None:
         """The face in the newest picture, waited for; None without a face. Raises UserError when the pictures end.

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.landmarks import BLENDSHAPES
 
-# Of the picture, for `advice`.
+# Of the picture, for `problem`.
 LEAST_HEIGHT = 200.0  # pixels, of the face
 DARK = 100.0  # grey level that a tenth of the face exceeds; skin of every colour has highlights
 WHITE, MOST_WHITE = 250, 0.15  # grey level, and the share of the face that may have it
@@ -101,14 +101,14 @@ class Adviser:
         self._sharp: list[float] = []
         self._wrong, self._since = "", 0.0
 
-    def hear(self, image: UInt8[np.ndarray, "H W 3"], face: Face | None, time: float) -> str:
+    def advise(self, image: UInt8[np.ndarray, "H W 3"], face: Face | None, time: float) -> str:
         """Of the picture at this second; empty where nothing is wrong."""
-        wrong = self.advice(image, face)
+        wrong = self.problem(image, face)
         if wrong != self._wrong:
             self._wrong, self._since = wrong, time
         return wrong if time - self._since >= PATIENCE else ""
 
-    def advice(self, image: UInt8[np.ndarray, "H W 3"], face: Face | None) -> str:
+    def problem(self, image: UInt8[np.ndarray, "H W 3"], face: Face | None) -> str:
         if face is None:
             return "no face: look into the camera"
         size, tall = np.array(image.shape[1::-1]), face.height

@@ -113,7 +113,7 @@ def _no_camera(number: int) -> str:
     )
 
 
-class Played:
+class VideoFile:
     """A video, or a folder of pictures, at its own rate. Implements `Source`."""
 
     silent_after = STALL_SECONDS + SILENT_AFTER  # by then the decoder has ended what does not get on
@@ -146,7 +146,7 @@ def open_source(given: str, settings: Mapping[int, float] = FOLLOWED) -> Source:
     """A camera by its number, with OpenCV's settings, or a video. Raises UserError where neither is there."""
     if re.fullmatch("[0-9]{1,3}", given) and not Path(given).exists():
         return Camera(int(given), settings=settings)
-    return Played(open_footage(Path(given)))
+    return VideoFile(open_footage(Path(given)))
 
 
 class Newest:

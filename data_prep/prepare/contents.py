@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 from avatar.errors import UserError
-from avatar.files.opening import open_file, read_text
+from avatar.files.opening import read_text
+from avatar.files.third_party import sha256_of
 
 CONTENTS_FILE = "contents.sha256"  # in the format of sha256sum
 _MAX_BYTES = 2**26  # of it: half a million files
@@ -14,7 +14,7 @@ _MAX_BYTES = 2**26  # of it: half a million files
 
 def write_contents(folder: Path) -> None:
     """Write the hash of every file into `CONTENTS_FILE`."""
-    lines = [f"{_hash(path)}  {name}\n" for name, path in _files(folder).items()]
+    lines = [f"{sha256_of(path)}  {name}\n" for name, path in _files(folder).items()]
     (folder / CONTENTS_FILE).write_text("".join(lines), encoding="utf-8")
 
 
@@ -28,9 +28,9 @@ def find_damage(folder: Path) -> str | None:
     files = _files(folder)
     for name, digest in recorded.items():
         try:
-            if name not in files or _hash(files[name]) != digest:
+            if name not in files or sha256_of(files[name]) != digest:
                 return f"{name} is {'missing' if name not in files else 'not what was written'}"
-        except (UserError, OSError):
+        except UserError:
             return f"{name} cannot be read"
     return None if recorded else f"{CONTENTS_FILE} is empty"
 
@@ -38,8 +38,3 @@ def find_damage(folder: Path) -> str | None:
 def _files(folder: Path) -> dict[str, Path]:
     found = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != CONTENTS_FILE)
     return {path.relative_to(folder).as_posix(): path for path in found}
-
-
-def _hash(path: Path) -> str:
-    with open_file(path, None) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]

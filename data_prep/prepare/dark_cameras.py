@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from avatar.data.images import read_image
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, FrameFiles
 from data_prep.formats.tracked_folder import Shot
-from data_prep.prepare.misfit import SAMPLED_OF_A_CAMERA, sample
+from data_prep.prepare.misfit import SAMPLED_OF_A_CAMERA
 
 DARK = 0.1  # of the median camera's brightness, inside the mattes
 
@@ -20,7 +21,8 @@ def refuse_dark_cameras(files: FrameFiles, pairs: Sequence[tuple[int, int]], sho
     cameras = dict.fromkeys(shots[image].camera for image, _ in pairs) if shots else {}
     light = {}
     for camera in cameras:
-        own = sample([pair for pair in pairs if shots[pair[0]].camera == camera], SAMPLED_OF_A_CAMERA)
+        seen = [pair for pair in pairs if shots[pair[0]].camera == camera]
+        own = evenly_spread(seen, SAMPLED_OF_A_CAMERA)
         light[camera] = float(np.median([_brightness(files, image) for image, _ in own]))
     usual = float(np.median(list(light.values()))) if light else 0.0
     for camera, own_light in light.items():

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from avatar.data.split import evenly_spread
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles, describe_numbers
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.mask_overlap import MeshProjector, measured_size
 from data_prep.prepare.mask_values import WHAT, place_of
-from data_prep.prepare.misfit import sample
+from data_prep.prepare.misfit import SAMPLED_FRAMES
 from data_prep.prepare.projection import silhouette
 
 MAX_ON_HEAD, MIN_IN_CORNERS, MIN_COVERED = 0.25, 0.75, 0.35  # of an inverted mask, mean opacity; the last of all of it
@@ -100,7 +101,7 @@ def _frames(
     tracked = list(tracks.values())
     project = MeshProjector(head)
     places = np.linspace(0, len(tracked) - 1, len(usable)).round().astype(int).tolist()
-    for number, place in sample(list(zip(usable, places, strict=True))):
+    for number, place in evenly_spread(list(zip(usable, places, strict=True)), SAMPLED_FRAMES):
         masks, size = {}, None
         for kind in (ALPHA, HEAD, MOUTH):
             if (pixels := files.read(kind, number)) is not None:

@@ -7,7 +7,7 @@ they are read as 0 and 255; anything else that is not a mask is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from avatar.data.images import decode_image, decode_values, read_bytes
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 
@@ -49,7 +50,7 @@ def mask_kinds(files: FrameFiles) -> dict[str, dict[int, Path]]:
 def refuse_colours(files: FrameFiles) -> None:
     """Raises UserError where pictures in colour stand in for masks, as cut-outs on a plain background do."""
     for kind, paths in mask_kinds(files).items():
-        for path in _some(paths):
+        for path in evenly_spread(list(paths.values()), SAMPLES):
             if kind not in files.labels and _is_coloured(path):
                 raise UserError(coloured_sentence(str(path), WHAT[kind]))
 
@@ -99,7 +100,7 @@ def only_label(values: Iterable[set[int]]) -> int | None:
 
 def _values_of_some(paths: Mapping[int, Path]) -> list[set[int]]:
     found = []
-    for path in _some(paths):
+    for path in evenly_spread(list(paths.values()), SAMPLES):
         try:
             found.append(set(np.unique(decode_values(read_bytes(path), path)).tolist()))
         except UserError:
@@ -121,15 +122,6 @@ def is_coloured(pixels: np.ndarray, values: np.ndarray) -> bool:
         return False  # the mask is its transparency, or a palette's indices
     spread = pixels.max(axis=2).astype(np.int16) - pixels.min(axis=2)
     return bool((spread > _COLOURED).mean() > _COLOURED_SHARE)
-
-
-def _some(paths: Mapping[int, Path]) -> Iterator[Path]:
-    yield from sampled(list(paths.values()))
-
-
-def sampled(files: Sequence[Path]) -> list[Path]:
-    places = np.unique(np.linspace(0, len(files) - 1, min(SAMPLES, len(files))).round().astype(int))
-    return [files[i] for i in places.tolist()]
 
 
 def place_of(paths: Mapping[int, Path]) -> Path:

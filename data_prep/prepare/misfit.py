@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import FrameFiles
@@ -67,7 +68,8 @@ def judge_sample(
     if not pairs:
         return judge([], files)
     project = MeshProjector(head)
-    fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in sample(pairs)]
+    chosen = evenly_spread(pairs, SAMPLED_FRAMES)
+    fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in chosen]
     return judge([fit for fit in fits if fit is not None], files)
 
 
@@ -81,7 +83,8 @@ def refuse_misplaced_cameras(
     """Raise UserError for a camera of several in whose pictures the head is not where its pose puts it."""
     project = MeshProjector(head)
     for camera in dict.fromkeys(shot.camera for shot in shots.values()):
-        own = sample([pair for pair in pairs if shots[pair[0]].camera == camera], SAMPLED_OF_A_CAMERA)
+        seen = [pair for pair in pairs if shots[pair[0]].camera == camera]
+        own = evenly_spread(seen, SAMPLED_OF_A_CAMERA)
         fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in own]
         problem = judge([fit for fit in fits if fit is not None], files).problem
         if problem is not None:
@@ -89,11 +92,6 @@ def refuse_misplaced_cameras(
                 f"camera {camera}: {problem}; is its calibration right? Leave it out with --cameras, or say "
                 "--ignore-misfit to go on regardless"
             )
-
-
-def sample(pairs: Sequence[tuple[int, int]], most: int = SAMPLED_FRAMES) -> list[tuple[int, int]]:
-    """At most so many of them, from the first to the last."""
-    return [pairs[round(i)] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), most))]
 
 
 def judge(fits: Sequence[Fit], files: FrameFiles) -> Judgement:

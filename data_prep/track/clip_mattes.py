@@ -37,10 +37,10 @@ def write_mattes(
     own = threading.local()  # a network is for one thread
 
     def by_network(number: int) -> tuple[np.ndarray, np.ndarray]:
-        if not hasattr(own, "matter"):
-            own.matter = open_segmentation(network)
+        if not hasattr(own, "matte"):
+            own.matte = open_segmentation(network)
         picture = image(number)
-        return picture, own.matter(picture)
+        return picture, own.matte(picture)
 
     of_clip = numbers[:: -(-len(numbers) // background_plate.CLIP_FRAMES)]
     seen = ahead(of_clip, by_network, progress, "looking at the background")

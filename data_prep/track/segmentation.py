@@ -26,7 +26,7 @@ from avatar.files.third_party import (
 SIDE = 256  # of the networks' pictures
 _LOADING = threading.Lock()
 """Two loads at once find operators unsupported, or crash: OpenCV's table of them is filled by the first."""
-Matter = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
+MatteFunction = Callable[[UInt8[np.ndarray, "H W 3"]], UInt8[np.ndarray, "H W"]]
 """From a picture to its matte."""
 
 
@@ -36,22 +36,22 @@ def matte_network() -> ThirdPartyFile:
     return next((file for file in optional if find(file) is not None), SELFIE_SEGMENTATION)
 
 
-def open_segmentation(network: ThirdPartyFile) -> Matter:
+def open_segmentation(network: ThirdPartyFile) -> MatteFunction:
     """MediaPipe's, for one thread. Raises UserError where the file is not the published one."""
     return _with_mirrored(_segmentation() if network is SELFIE_SEGMENTATION else _multiclass())
 
 
-def _with_mirrored(matter: Matter) -> Matter:
+def _with_mirrored(matte_of: MatteFunction) -> MatteFunction:
     """The mean of a picture's matte and its mirror image's, which errs less than either."""
 
     def matte(image: np.ndarray) -> np.ndarray:
-        mirrored = matter(np.ascontiguousarray(image[:, ::-1]))[:, ::-1]
-        return cv2.addWeighted(matter(image), 0.5, mirrored, 0.5, 0.0)
+        mirrored = matte_of(np.ascontiguousarray(image[:, ::-1]))[:, ::-1]
+        return cv2.addWeighted(matte_of(image), 0.5, mirrored, 0.5, 0.0)
 
     return matte
 
 
-def _segmentation() -> Matter:
+def _segmentation() -> MatteFunction:
     file = require(SELFIE_SEGMENTATION)
     try:
         with _LOADING:
@@ -67,7 +67,7 @@ def _segmentation() -> Matter:
     return matte
 
 
-def _multiclass() -> Matter:
+def _multiclass() -> MatteFunction:
     """Through MediaPipe's own runner, which knows the file's normalisation. Class 0 is the background."""
     file = require(SELFIE_MULTICLASS)
     from data_prep.track.faces.detect import load_mediapipe, quiet

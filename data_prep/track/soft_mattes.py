@@ -18,14 +18,14 @@ from jaxtyping import Float32, UInt8
 from avatar.compute.native import thread_count
 from avatar.errors import UserError, check_installed
 from avatar.files.third_party import MATTING_FILES, MODNET, ThirdPartyFile, require
-from data_prep.track.segmentation import Matter, enlarged
+from data_prep.track.segmentation import MatteFunction, enlarged
 
 _MODNET_SIDE, _MODNET_MULTIPLE = 512, 32  # of its pictures' shorter side, and of both
 _RVM_SIDE = 512  # of the longer side, at which Robust Video Matting works; the rest is its own upsampling
 _STATES = ("r1", "r2", "r3", "r4")
 
 
-def open_matting(network: ThirdPartyFile) -> Matter:
+def open_matting(network: ThirdPartyFile) -> MatteFunction:
     """One of MATTING_FILES; the pictures of a clip have to be given in order, all of one size.
 
     Raises UserError where onnxruntime is missing, and where the file is not the published one or cannot be run.
@@ -48,7 +48,7 @@ def check_matting(network: ThirdPartyFile) -> None:
         open_matting(network)(np.zeros((_MODNET_SIDE, _MODNET_SIDE, 3), np.uint8))
 
 
-def _modnet(session: Any, file: Path) -> Matter:
+def _modnet(session: Any, file: Path) -> MatteFunction:
     def matte(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
         height, width = image.shape[:2]
         scale = _MODNET_SIDE / min(height, width)
@@ -60,7 +60,7 @@ def _modnet(session: Any, file: Path) -> Matter:
     return matte
 
 
-def _robust_video_matting(session: Any, file: Path) -> Matter:
+def _robust_video_matting(session: Any, file: Path) -> MatteFunction:
     states = [np.zeros((1, 1, 1, 1), np.float32)] * len(_STATES)
 
     def matte(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from avatar.data.images import decode_image, decode_mask, decode_values, read_bytes
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
-from data_prep.prepare.mask_values import coloured_sentence, is_coloured, judge_range, only_label, sampled
+from data_prep.prepare.mask_values import SAMPLES, coloured_sentence, is_coloured, judge_range, only_label
 from data_prep.track.faces.detect import Face
 from data_prep.track.footage.pictures import PictureFolder, open_footage, resampled
 from data_prep.track.footage.rotated import turned
@@ -112,7 +113,7 @@ def _mask_reader(label: int | None) -> Callable[[Path], tuple[np.ndarray, bool]]
 def _values_of_some(footage: Footage) -> Iterator[UInt8[np.ndarray, "H W"]]:
     """Raises UserError where they are pictures in colour."""
     if isinstance(footage, PictureFolder):
-        for file in sampled(footage.files):
+        for file in evenly_spread(footage.files, SAMPLES):
             data = read_bytes(file)
             values = decode_values(data, file)
             if is_coloured(decode_image(data, file), values):

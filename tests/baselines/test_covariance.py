@@ -91,8 +91,3 @@ def test_the_start_is_that_of_the_trick() -> None:
         assert gradient is not None
         cross = [(m + i) * (m + i + 1) // 2 + j for i in range(8) for j in range(m)]
         assert bool((gradient[cross] != 0).all())
-
-
-def test_a_latent_needs_a_dimension() -> None:
-    with pytest.raises(ValueError, match="at least one latent dimension, got 0"):
-        CovarianceHeads(3, 0)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import torch
 from heads import grid_head
 
-from avatar.baselines.monogaussianavatar import alive_after, evenly_ordered
+from avatar.baselines.monogaussianavatar import active_count, evenly_ordered
 from avatar.gaussians.uv import UVTexels, uv_texels
 
 
 def test_a_set_doubles_at_every_tenth_of_the_training() -> None:
-    found = [alive_after(step, 1000, 1600) for step in (0, 99, 100, 199, 200, 300, 399, 400, 1000)]
+    found = [active_count(step, 1000, 1600) for step in (0, 99, 100, 199, 200, 300, 399, 400, 1000)]
     assert found == [100, 100, 200, 200, 400, 800, 800, 1600, 1600]
-    assert alive_after(0, 1000, 5) == 1 and alive_after(7, 7, 5) == 5
-    assert all(alive_after(3 * step, 30, 1600) == alive_after(step, 10, 1600) for step in range(11))
+    assert active_count(0, 1000, 5) == 1 and active_count(7, 7, 5) == 5
+    assert all(active_count(3 * step, 30, 1600) == active_count(step, 10, 1600) for step in range(11))
 
 
 def test_every_beginning_is_spread_over_the_map() -> None:

@@ -94,8 +94,3 @@ def test_at_the_start_nothing_moves_but_what_could_move_it_has_a_gradient() -> N
     torch.testing.assert_close(density, torch.exp(-0.5 * latents.square().sum(-1)))
     position.sum().backward()
     assert gaussians.cross.grad is not None and bool((gaussians.cross.grad != 0).all())
-
-
-def test_a_latent_needs_a_dimension() -> None:
-    with pytest.raises(ValueError, match="at least one latent dimension, got 0"):
-        NdGaussians(3, 0)

@@ -9,7 +9,7 @@ import torch
 from heads import grid_head
 from small_runs import open_small, small_config, train_small
 
-from avatar.baselines.monogaussianavatar import alive_after, drawn
+from avatar.baselines.monogaussianavatar import active_count, random_choice
 from avatar.config import TrainerConfig
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
@@ -40,7 +40,7 @@ def params() -> HeadParams:
 def test_a_set_grows_beside_what_is_seen_and_covers_as_much() -> None:
     avatar, optimizer, config = started("monogaussianavatar")
     points, N = avatar.mesh_points, len(avatar)
-    alive = alive_after(0, 100, N)
+    alive = active_count(0, 100, N)
     assert int(avatar.count) == alive == len(avatar(params()).means) < N
     avatar.after_step(optimizer, 9, config)
     assert int(avatar.count) == alive
@@ -52,7 +52,7 @@ def test_a_set_grows_beside_what_is_seen_and_covers_as_much() -> None:
     before, scales = avatar.opacity_logits.detach().clone(), avatar.log_scales.detach().clone()
     places = points.points(avatar.head.neutral_vertices())
     avatar.after_step(optimizer, 10, config)
-    doubled = alive_after(10, 100, N)
+    doubled = active_count(10, 100, N)
     assert int(avatar.count) == doubled == len(avatar(params()).means) >= 2 * alive
 
     born = torch.cat((torch.tensor([3]), torch.arange(alive, doubled)))
@@ -85,7 +85,7 @@ def test_growth_repeats_to_the_bit_and_another_seed_is_another_set() -> None:
 
 
 def test_all_are_drawn_once_before_one_is_drawn_twice() -> None:
-    found = drawn(torch.tensor([4, 5, 6]), 7, torch.Generator().manual_seed(0)).tolist()
+    found = random_choice(torch.tensor([4, 5, 6]), 7, torch.Generator().manual_seed(0)).tolist()
     assert len(found) == 7 and sorted(found[:3]) == sorted(found[3:6]) == [4, 5, 6] and found[6] in (4, 5, 6)
 
 

@@ -9,7 +9,7 @@ import torch
 from avatar.bench.hyper import (
     WAYS,
     Leaves,
-    Way,
+    Method,
     by_covariance,
     covariance_leaves,
     fused,
@@ -59,7 +59,7 @@ def not_a_number(leaves: Leaves) -> torch.Tensor:
 @pytest.mark.parametrize("wrong", [off_by_a_little, with_steeper_gradients, not_a_number])
 def test_a_wrong_way_is_not_timed(wrong) -> None:
     with pytest.raises(UserError, match="wrong with 3 latent dimensions is wrong, so it is not timed"):
-        measure((3,), count=50, repeats=1, ways={"wrong": Way(wrong, packed_leaves)})
+        measure((3,), count=50, repeats=1, ways={"wrong": Method(wrong, packed_leaves)})
 
 
 def test_the_covariances_are_those_of_the_same_heads() -> None:

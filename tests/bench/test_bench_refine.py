@@ -15,7 +15,7 @@ from drawn_clip import drawn_clip, patterned_avatar, true_tracks
 from tracked_folder import write_tracked_folder
 
 from avatar.bench import refine as bench
-from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, disturbed, tracking_noise
+from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, perturbed, tracking_noise
 from avatar.bench.refine import Figures, Row, recovered, report, vertex_error
 from avatar.cli import main
 from avatar.data.recording import Recording
@@ -36,7 +36,7 @@ def recording(avatar: Avatar) -> Recording:
 
 
 def test_the_disturbance_is_as_large_as_it_says(avatar: Avatar, recording: Recording) -> None:
-    bent = disturbed(recording, avatar.head, seed=1)
+    bent = perturbed(recording, avatar.head, seed=1)
     centre = avatar.head.neutral_vertices().mean(dim=0)
     turns, shifts = movements(recording.tracks, bent.tracks, centre)
     assert math.degrees(np.sqrt(np.mean(turns**2))) == pytest.approx(TURN_DEGREES, rel=0.1)
@@ -51,7 +51,7 @@ def test_the_disturbance_is_as_large_as_it_says(avatar: Avatar, recording: Recor
 
 
 def test_it_is_the_same_for_a_seed(avatar: Avatar, recording: Recording) -> None:
-    first, again, other = (disturbed(recording, avatar.head, seed) for seed in (1, 1, 2))
+    first, again, other = (perturbed(recording, avatar.head, seed) for seed in (1, 1, 2))
     assert torch.equal(first.tracks["t"], again.tracks["t"]) and not torch.equal(first.tracks["t"], other.tracks["t"])
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from avatar import cli
-from avatar.bench.stability import FORMS, Row, by_covariance, by_trick, fails_at, measure, random_factor
+from avatar.bench.stability import FORMS, Row, by_covariance, by_precision, fails_at, measure, random_factor
 
 
 @pytest.mark.parametrize("latent", [1, 8, 128])
@@ -50,7 +50,7 @@ def test_both_forms_in_float64_are_the_mean_in_exact_arithmetic() -> None:
     x = (cofactors[2][2] * b[0] - cofactors[1][2] * b[1]) / s_bb
     y = (cofactors[1][1] * b[1] - cofactors[1][2] * b[0]) / s_bb
     assert cofactors[0][1] * x + cofactors[0][2] * y == exact
-    for found in (by_trick(L, latent, torch.float64), by_covariance(L, latent, torch.float64)):
+    for found in (by_precision(L, latent, torch.float64), by_covariance(L, latent, torch.float64)):
         assert float(found) == pytest.approx(float(exact), rel=1e-9)
 
 

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from avatar.bench.splat_work import peak_memory
+from avatar.bench.peak_memory import peak_memory
 
 pytestmark = pytest.mark.slow
 

@@ -205,7 +205,7 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
     monkeypatch.setattr(train_refined, "train_round", lambda plan, *_: (0, plan))
-    monkeypatch.setattr(train_refined, "go_on_or_begin", lambda *_: 0)
+    monkeypatch.setattr(train_refined, "continue_or_begin", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
     # 0.97 of 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
     assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output
@@ -223,7 +223,7 @@ def test_what_the_first_folder_was_allowed_later_ones_are(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[Source] = []
-    monkeypatch.setattr(train_refined, "go_on_or_begin", lambda source, *_: opened.append(source) or 0)
+    monkeypatch.setattr(train_refined, "continue_or_begin", lambda source, *_: opened.append(source) or 0)
     monkeypatch.setattr(train_refined, "open_run", lambda *_: None)
     monkeypatch.setattr(train_refined, "refine_run", lambda *_: 0)
     words = ("--frame-offset", 1, "--fps", 30, "--max-left-out", 0.5, "--ignore-misfit", "--refine", 1)

@@ -210,10 +210,10 @@ def test_a_damaged_tracking_in_the_cache_is_made_again_and_it_is_said(
 
     monkeypatch.setattr(track, "track", fake_track)
     monkeypatch.setattr(track, "open_footage", lambda path: SimpleNamespace(content_hash="ab"))
-    folder = track.tracked_once(video, head)
-    assert track.tracked_once(video, head) == folder and made == [folder]
+    folder = track.cached_tracking(video, head)
+    assert track.cached_tracking(video, head) == folder and made == [folder]
     flip(folder / "frames" / "00000.jpg", 2)
     capsys.readouterr()
-    assert track.tracked_once(video, head) == folder and made == [folder, folder]
+    assert track.cached_tracking(video, head) == folder and made == [folder, folder]
     assert "frames/00000.jpg is not what was written; it is made again" in capsys.readouterr().out
-    assert track.tracked_once(video, head) == folder and made == [folder, folder]
+    assert track.cached_tracking(video, head) == folder and made == [folder, folder]

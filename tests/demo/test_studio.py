@@ -98,7 +98,7 @@ def test_nobody_blinks_since_the_layout_has_no_eyelids(camera_folder: Path) -> N
     written = cv2.imread(str(camera_folder / "SPEECH" / "images" / f"00000_{FRONT:02d}.png"))
     assert written is not None and params.eyelids.max() > 0.05
     for lids, is_written in ((torch.zeros(2), True), (params.eyelids, False)):
-        picture = renderer.look(renderer.stage(replace(params, eyelids=lids), *pose), front)
+        picture = renderer.render_scene(renderer.pose_scene(replace(params, eyelids=lids), *pose), front)
         assert np.array_equal(picture.image, written[..., ::-1]) == is_written
 
 
@@ -123,9 +123,9 @@ def test_lights_stand_still_in_the_studio_while_cameras_move() -> None:
     performance = perform(SEED, 1, "speech")
     params, single = frame_params(performance, 0), frame_camera(performance, 0, size)
     R, t = VIEW_AXES @ single.R_cam_world.numpy(), VIEW_AXES @ single.t_cam_world.numpy()
-    stage = renderer.stage(params, R, t)
+    scene = renderer.pose_scene(params, R, t)
     front = replace(single, R_cam_world=torch.from_numpy(VIEW_AXES), t_cam_world=torch.zeros(3))
-    for mine, theirs in zip(renderer.look(stage, front), renderer.render(params, single), strict=True):
+    for mine, theirs in zip(renderer.render_scene(scene, front), renderer.render(params, single), strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
     aside = studio_cameras(16, size)[12]
@@ -135,14 +135,14 @@ def test_lights_stand_still_in_the_studio_while_cameras_move() -> None:
         t_cam_world=aside.R_cam_world @ torch.from_numpy(t).double() + aside.t_cam_world,
     )
     face = renderer.performer.head.regions["face"]
-    face = face[(stage.surface[face][:, :3] @ [0.3, 0.0, 0.95]) > 0.8]  # what both cameras see
-    points = torch.from_numpy(stage.geometry.points[face] @ R.T + t)
+    face = face[(scene.surface[face][:, :3] @ [0.3, 0.0, 0.95]) > 0.8]  # what both cameras see
+    points = torch.from_numpy(scene.geometry.points[face] @ R.T + t)
 
     def brightness(image: np.ndarray, camera: Camera) -> np.ndarray:
         x, y = camera.project(points.to(camera.R_cam_world)).numpy()[:, :2].astype(int).T
         return image[y, x].mean(-1)
 
-    seen = brightness(renderer.look(stage, front).image, front)
-    still = brightness(renderer.look(stage, aside).image, aside) - seen
+    seen = brightness(renderer.render_scene(scene, front).image, front)
+    still = brightness(renderer.render_scene(scene, aside).image, aside) - seen
     carried = brightness(renderer.render(params, beside_head).image, aside) - seen  # the camera's own lights
     assert len(face) > 100 and np.abs(still).mean() < 0.7 * np.abs(carried).mean()

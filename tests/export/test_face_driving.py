@@ -18,7 +18,7 @@ from avatar.export.default_view import front_camera
 from avatar.export.web_page import write_web_avatar
 from avatar.head.model import matrix_from_6d
 from avatar.motion.rest import RestPose
-from avatar.motion.transfer import departed
+from avatar.motion.transfer import retargeted
 from avatar.runs.trained import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.packets import BLENDSHAPES, FrameReader
@@ -117,7 +117,7 @@ def test_scores_move_the_face_as_in_the_program(trained: TrainedAvatar, tmp_path
     source = RestPose(frames[0].expression, matrix_from_6d(frames[0].jaw), None)
     goal = RestPose(trained.neutral.expression, trained.neutral.jaw, None)
     rest = torch.tensor(found["rest"])
-    for pose, params in zip(found["poses"], departed(frames[1:], source, goal, 1.0), strict=True):
+    for pose, params in zip(found["poses"], retargeted(frames[1:], source, goal, 1.0), strict=True):
         expected = torch.cat((params.expression, params.jaw, params.eyes, params.eyelids, params.neck))
         torch.testing.assert_close(torch.tensor(pose["parameters"]), expected, atol=2e-5, rtol=0)
         assert (expected - rest)[: len(params.expression)].abs().max() > 0.1, "it moves"

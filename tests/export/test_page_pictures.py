@@ -15,7 +15,7 @@ from browsers import WEB
 from lively import psnr
 from pages import until
 
-from avatar.export.default_view import faded, front_camera
+from avatar.export.default_view import front_camera, with_faded_neck
 from avatar.export.web_page import write_page
 from avatar.runs.trained import TrainedAvatar
 
@@ -52,7 +52,7 @@ def test_a_saved_picture_is_drawn_anew_with_1024_pixels(
     download.value.save_as(tmp_path / "someone.png")
     saved = iio.imread(tmp_path / "someone.png")
     assert saved.shape[:2] == (1024, 1024) and page.evaluate("avatar.canvas.width") == 64
-    expected = faded(trained).render(trained.rest_params(), front_camera(trained, 1024)).image.clamp(0, 1)
+    expected = with_faded_neck(trained).render(trained.rest_params(), front_camera(trained, 1024)).image.clamp(0, 1)
     assert psnr(torch.from_numpy(saved[..., :3].astype(np.float32) / 255), expected) > 40
     page.close()
 

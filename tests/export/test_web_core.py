@@ -16,7 +16,7 @@ from browsers import WEB, node
 from lively import lively_avatar, psnr
 
 from avatar.errors import UserError
-from avatar.export.default_view import faded
+from avatar.export.default_view import with_faded_neck
 from avatar.export.web_page import write_web_avatar
 from avatar.motion.orbit import orbited
 from avatar.runs.trained import TrainedAvatar
@@ -82,7 +82,7 @@ def pictures_of_node(trained: TrainedAvatar, folder: Path) -> torch.Tensor:
 
 
 def drawn_here(trained: TrainedAvatar) -> torch.Tensor:
-    exported = faded(trained)
+    exported = with_faded_neck(trained)
     images = torch.stack([exported.render(*frame).image for frame in chosen_frames(trained)])
     return (images.clamp(0, 1) * 255).round() / 255
 

@@ -15,7 +15,7 @@ from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
 from pages import shown, until
 
-from avatar.export.default_view import faded, front_camera
+from avatar.export.default_view import front_camera, with_faded_neck
 from avatar.export.web_page import bundle, script_text, write_page, write_web_avatar
 from avatar.motion.controls import expression_controls, joint_ranges, posed
 from avatar.motion.orbit import orbited
@@ -41,7 +41,7 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 @pytest.fixture(scope="module")
 def drawn(trained: TrainedAvatar) -> TrainedAvatar:
-    return faded(trained)
+    return with_faded_neck(trained)
 
 
 @pytest.fixture(scope="module")

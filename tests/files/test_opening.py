@@ -31,7 +31,7 @@ READING = re.compile(
 # What they open is the program's own, the system's, just written by them, or checked before.
 OPEN_BY_THEMSELVES = {
     "avatar/bench/machine.py",
-    "avatar/bench/splat_work.py",
+    "avatar/bench/peak_memory.py",
     "avatar/compute/memory.py",
     "avatar/data/tensor_file.py",
     "avatar/commands/doctor.py",

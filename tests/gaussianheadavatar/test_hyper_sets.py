@@ -108,8 +108,3 @@ def test_colours_start_where_they_are_told_to() -> None:
     sets.start_colour(colours)
     attributes = sets(*latents_of(5, 2))
     assert torch.equal(attributes.colour, colours) and not bool(attributes.position.any())
-
-
-def test_a_latent_needs_a_dimension() -> None:
-    with pytest.raises(ValueError, match="at least one latent dimension, got 0"):
-        HyperSets(3, 4, 0)

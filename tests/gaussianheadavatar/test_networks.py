@@ -119,5 +119,3 @@ def test_nearness_falls_with_the_squared_distance(monkeypatch: pytest.MonkeyPatc
     near = nearness(points, landmarks, 1.0, 3.0)
     torch.testing.assert_close(near, ((9 - distances**2) / 8).clamp(0, 1))
     assert not near.requires_grad
-    with pytest.raises(ValueError, match="must be below the far one"):
-        nearness(points, landmarks, 3.0, 3.0)

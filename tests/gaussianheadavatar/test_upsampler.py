@@ -46,8 +46,3 @@ def test_an_image_without_contrast_gives_finite_colours_and_gradients(value: flo
     assert bool(((colours >= 0) & (colours <= 1)).all())
     assert image.grad is not None and bool(image.grad.isfinite().all())
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in upsampler.parameters())
-
-
-def test_other_factors_are_refused() -> None:
-    with pytest.raises(ValueError, match="by 1, 2 or 4, not by 3"):
-        Upsampler(4, 3)

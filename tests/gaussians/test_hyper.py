@@ -95,11 +95,6 @@ def test_parameters_are_counted_as_in_the_paper(n: int) -> None:
     assert heads.packed.numel() == 14_880 * (whole - triangles)
 
 
-def test_a_latent_needs_a_dimension() -> None:
-    with pytest.raises(ValueError, match="at least one latent dimension, got 0"):
-        HyperHeads(3, 0)
-
-
 @pytest.mark.parametrize(("num", "n"), [(0, 1), (1, 8), (16, 3), (33, 17)])
 def test_packing_loses_nothing_but_the_upper_triangles(num: int, n: int) -> None:
     heads = {name: random_head(num, m, n) for name, m in HEADS.items()}

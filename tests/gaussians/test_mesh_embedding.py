@@ -88,8 +88,3 @@ def test_initial_scales_are_the_rms_distance_to_three_neighbours() -> None:
 def test_coincident_and_single_points_have_a_positive_scale() -> None:
     assert bool((knn_scales(torch.zeros(5, 3)) > 0).all())
     assert bool((knn_scales(torch.zeros(1, 3)) > 0).all())
-
-
-def test_a_raster_without_a_texel_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one texel a side, got 0"):
-        uv_texels(grid_head(), 0)

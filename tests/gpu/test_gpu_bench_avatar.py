@@ -27,7 +27,7 @@ def test_a_timed_step_is_the_gpus_and_is_not_cut(tracked_folder: Path) -> None:
     learner = train.make_learner(new_avatar(assets, subject, config).to(DEVICE), subject, config, lambda _: None)
     before = learner.avatar.sh_dc.detach().clone()
     train.run_steps(learner, late=True)
-    assert learner.judge is not None, "nothing is read back in a step"
+    assert learner.check_gradients is not None, "nothing is read back in a step"
     assert next(learner.frames).image.device.type == learner.avatar.device.type == DEVICE.type
     assert not torch.equal(learner.avatar.sh_dc, before)
     once = Time(1.0, 2.0, 3)

@@ -24,7 +24,16 @@ from splat.scenes import (
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from avatar.splat import CannotDraw, gpu_buffers
-from avatar.splat.gpu_buffers import BYTES, HEADROOM, MAX_PAIRS, Kind, capacity_of, checked_drawings, most_pairs, roomy
+from avatar.splat.gpu_buffers import (
+    BYTES,
+    HEADROOM,
+    MAX_PAIRS,
+    Kind,
+    capacity_of,
+    capacity_with_headroom,
+    checked_drawings,
+    most_pairs,
+)
 from avatar.types import Gaussians
 
 SCENE = SCENES["17x33"]
@@ -157,15 +166,17 @@ def test_checked_drawings_fix_nothing_and_hold_what_each_needs() -> None:
 
 
 def test_a_capacity_has_headroom_and_is_bounded() -> None:
-    nothing_drawn = roomy(KIND, 0, None)
+    nothing_drawn = capacity_with_headroom(KIND, 0, None)
     assert 50_000 < nothing_drawn < 100_000, "a first drawing that shows nothing says nothing of the next"
-    assert roomy(KIND, 10, None) == nothing_drawn
-    assert roomy(KIND._replace(splats=3), 10, None) == most_pairs(KIND._replace(splats=3)) == 3000
+    assert capacity_with_headroom(KIND, 10, None) == nothing_drawn
+    assert capacity_with_headroom(KIND._replace(splats=3), 10, None) == most_pairs(KIND._replace(splats=3)) == 3000
     huge = KIND._replace(splats=10**6)
-    assert roomy(huge, MAX_PAIRS - 1, None) == roomy(huge, MAX_PAIRS, None) == MAX_PAIRS
+    assert (
+        capacity_with_headroom(huge, MAX_PAIRS - 1, None) == capacity_with_headroom(huge, MAX_PAIRS, None) == MAX_PAIRS
+    )
     # Half of the free memory for the headroom; what is needed is asked for in any case.
-    assert roomy(huge, 10**6, 2 * BYTES * 1.5e6) == 1_500_000
-    assert roomy(huge, 10**6, 0.0) == 10**6
+    assert capacity_with_headroom(huge, 10**6, 2 * BYTES * 1.5e6) == 1_500_000
+    assert capacity_with_headroom(huge, 10**6, 0.0) == 10**6
     # int32 finds every value of a record, with room for the tiles' rounding.
     assert 9 * (MAX_PAIRS + 32 * 2**20) < 2**31
 

@@ -42,8 +42,6 @@ def test_an_image_comes_back_from_its_url() -> None:
     np.testing.assert_array_equal(decoded[..., ::-1], image)
     assert data_uri(image).startswith("data:image/jpeg;base64,")
     assert SAFE in picture(image, NASTY)
-    with pytest.raises(ValueError, match=r"must be uint8 \[H, W\] or \[H, W, 3\], got float64 \[5, 7, 3\]"):
-        data_uri(image / 255)
 
 
 def test_the_policy_forbids_all_but_the_pages_own_script() -> None:

@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from avatar.errors import UserError
-from avatar.sweep import run_sweep as conducting
+from avatar.sweep import run_sweep
 from avatar.sweep import worker as workers
 from avatar.sweep.engines import EngineOptions, LocalProcesses, make_engine
 from avatar.sweep.output import BoundedLog, end_of, old_of
-from avatar.sweep.run_sweep import conduct
+from avatar.sweep.run_sweep import run_jobs
 from avatar.sweep.spec import Job, Resources, Spec
-from avatar.sweep.state import State, beat, progress_mark, read_state, write_state
+from avatar.sweep.state import State, progress_mark, read_state, write_heartbeat, write_state
 from avatar.sweep.status import Progress
 from avatar.sweep.worker import OUTPUT_FILE, Worker
 
@@ -36,7 +36,7 @@ def run_instead(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(sys, "executable", str(script))
 
 
-def last_words(engine: LocalProcesses, folder: Path) -> str:
+def reason_of_end(engine: LocalProcesses, folder: Path) -> str:
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         if (said := engine.poll(folder)) is not None:
@@ -54,7 +54,7 @@ def test_a_worker_that_prints_a_megabyte_past_python_does_not_hang(
     )
     engine = LocalProcesses(SPEC.resources, workers=1)
     engine.submit([tmp_path])
-    assert last_words(engine, tmp_path).endswith("the end")
+    assert reason_of_end(engine, tmp_path).endswith("the end")
     assert (tmp_path / OUTPUT_FILE).stat().st_size == 1_000_016
 
 
@@ -80,7 +80,7 @@ def test_a_worker_that_ignores_being_asked_is_ended(tmp_path: Path, monkeypatch:
     while not end_of(tmp_path / OUTPUT_FILE):
         time.sleep(0.02)
     engine.stop([tmp_path])
-    assert last_words(engine, tmp_path) == "the worker was killed by signal 9"
+    assert reason_of_end(engine, tmp_path) == "the worker was killed by signal 9"
 
 
 def test_the_log_keeps_what_is_new(tmp_path: Path) -> None:
@@ -106,13 +106,13 @@ class Hanging:
 
     def submit(self, folders: Sequence[Path]) -> list[Any]:
         write_state(self.place, State("running", 1, "here:1"))
-        beat(self.place, 0)
+        write_heartbeat(self.place, 0)
         return list(folders)
 
     def poll(self, handle: Any) -> str | None:
         self.polls += 1
         if self.computes:
-            beat(self.place, self.polls)
+            write_heartbeat(self.place, self.polls)
             if self.polls == 5:
                 write_state(self.place, State("done", 1))
                 return ""
@@ -126,17 +126,17 @@ class Hanging:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(conducting, "STILL_SECONDS", 0.05)
-    monkeypatch.setattr(conducting, "POLL_SECONDS", 0.02)
+    monkeypatch.setattr(run_sweep, "STALLED_SECONDS", 0.05)
+    monkeypatch.setattr(run_sweep, "POLL_SECONDS", 0.02)
     place = tmp_path / "jobs" / "j"
     place.mkdir(parents=True)
     return place
 
 
 @pytest.mark.timeout(30)
-def test_a_worker_whose_heart_beats_and_that_makes_no_progress_is_ended(place: Path) -> None:
+def test_a_worker_whose_heartbeat_goes_on_without_progress_is_ended(place: Path) -> None:
     engine = Hanging(place)
-    state = conduct(place.parents[1], SPEC, engine, Progress())["j"]
+    state = run_jobs(place.parents[1], SPEC, engine, Progress())["j"]
     assert engine.ended and state.status == "failed" and state.attempts == 1
     assert "the worker hung: no progress for" in state.sentence
     assert read_state(place) == state
@@ -144,26 +144,26 @@ def test_a_worker_whose_heart_beats_and_that_makes_no_progress_is_ended(place: P
 
 def test_a_worker_that_computes_is_left_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     engine = Hanging(place, computes=True)
-    monkeypatch.setattr(conducting, "STILL_SECONDS", 1.0)
-    assert conduct(place.parents[1], SPEC, engine, Progress())["j"].status == "done"
+    monkeypatch.setattr(run_sweep, "STALLED_SECONDS", 1.0)
+    assert run_jobs(place.parents[1], SPEC, engine, Progress())["j"].status == "done"
     assert not engine.ended
 
 
 @pytest.mark.timeout(30)
 def test_a_worker_of_another_sweep_that_hangs_is_named_and_not_waited_for(place: Path) -> None:
     write_state(place, State("running", 1, "elsewhere:17"))
-    beat(place, 3)
-    state = conduct(place.parents[1], SPEC, Hanging(place), Progress())["j"]
+    write_heartbeat(place, 3)
+    state = run_jobs(place.parents[1], SPEC, Hanging(place), Progress())["j"]
     assert state.status == "failed" and "elsewhere:17 hangs" in state.sentence
     assert json.loads((place / "state.json").read_text())["status"] == "running", "it is not ours"
 
 
 def test_progress_is_processor_time_or_something_said(tmp_path: Path) -> None:
-    beat(tmp_path, 3)
+    write_heartbeat(tmp_path, 3)
     mark = progress_mark(tmp_path)
-    beat(tmp_path, 3)
+    write_heartbeat(tmp_path, 3)
     assert progress_mark(tmp_path) == mark
-    beat(tmp_path, 4)
+    write_heartbeat(tmp_path, 4)
     computed = progress_mark(tmp_path)
     (tmp_path / "log.txt").write_text("step 1")
     assert len({mark, computed, progress_mark(tmp_path)}) == 3

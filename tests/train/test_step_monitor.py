@@ -56,7 +56,9 @@ def test_from_a_step_that_is_not_finite_on_nothing_moves(weights: list[Tensor], 
             weights[1].grad.fill_(3e38)  # type: ignore[union-attr]
         before = [weight.detach().clone() for weight in weights]
         counted = {id(weight): optimizer.state[weight].get("step", torch.zeros(())).clone() for weight in weights}
-        guard.judge(loss_of(float("inf") if step == 2 and where == "loss" else 1.0), [w.grad for w in weights])  # type: ignore[misc]
+        guard.check_gradients(
+            loss_of(float("inf") if step == 2 and where == "loss" else 1.0), [w.grad for w in weights]
+        )  # type: ignore[misc]
         optimizer.step()
         moved = [not torch.equal(weight, old) for weight, old in zip(weights, before, strict=True)]
         assert moved == [step < 2] * 2, step
@@ -74,7 +76,7 @@ def test_a_guard_changes_no_bit_of_a_step(weights: list[Tensor]) -> None:
             for weight in own:
                 weight.grad = torch.linspace(-1, 1 + step, weight.numel()).reshape(weight.shape)
             if guard:
-                guard.judge(loss_of(1.0), [weight.grad for weight in own])  # type: ignore[misc]
+                guard.check_gradients(loss_of(1.0), [weight.grad for weight in own])  # type: ignore[misc]
             optimizer.step()
         results.append([weight.detach() for weight in own])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
@@ -85,7 +87,7 @@ def test_numbers_are_logged_in_order_with_all_terms(weights: list[Tensor]) -> No
     ahead = AsyncStepMonitor(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
     for step in (1, 2, 3):
         ahead.note(step, outcome_of(float(step)))
-    ahead.settle()
+    ahead.flush()
     assert [(step, total) for step, total, _, _ in log.noted] == [(1, 1.0), (2, 2.0), (3, 3.0)]
     assert log.noted[1][2] == {"total": 2.0, "frame": 1.0, "mouth": 0.5, "perceptual": 0.5}
     assert log.noted[1][3] == pytest.approx(20.0)  # of an error of 0.1, in dB
@@ -95,7 +97,7 @@ def test_a_step_that_is_not_finite_is_named_and_not_logged(weights: list[Tensor]
     log = Log()
     ahead = AsyncStepMonitor(log, adam(weights), torch.device("cpu"))  # type: ignore[arg-type]
     for step, value in enumerate((1.0, float("nan"))):
-        ahead.judge(loss_of(value), [torch.ones(3)])
+        ahead.check_gradients(loss_of(value), [torch.ones(3)])
         if step == 0:
             ahead.note(step + 1, outcome_of(value))
     with pytest.raises(NonFiniteStep) as caught:
@@ -117,5 +119,5 @@ def test_only_so_many_steps_are_ahead(weights: list[Tensor], monkeypatch: pytest
     for step in range(1, 6):
         ahead.note(step, outcome_of(1.0))
         assert len(log.noted) == max(step - 3, 0)
-    ahead.settle()
+    ahead.flush()
     assert waited == [1, 2, 3, 4, 5] == [step for step, *_ in log.noted]

@@ -27,10 +27,10 @@ def handle(name: str) -> Any:
 @pytest.fixture
 def messages() -> MessageCheck:
     messages = MessageCheck()
-    messages.admit(handle("slider"), within(-0.5, 2.0))
-    messages.admit(handle("button"), pressed)
-    messages.admit(handle("checkbox"), switched)
-    messages.admit(handle("list"), one_of(("none", "mesh")))
+    messages.allow(handle("slider"), within(-0.5, 2.0))
+    messages.allow(handle("button"), pressed)
+    messages.allow(handle("checkbox"), switched)
+    messages.allow(handle("list"), one_of(("none", "mesh")))
     return messages
 
 

@@ -156,7 +156,7 @@ def test_a_flood_takes_a_part_of_the_time() -> None:
     def work(seconds: float) -> None:
         now[0] += seconds
         used[0] += seconds
-        throttle.rest()
+        throttle.sleep()
 
     throttle = Throttle(lambda: now[0], lambda: used[0], sleep)
     while now[0] < 100:

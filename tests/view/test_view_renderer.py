@@ -14,7 +14,7 @@ from avatar.motion.controls import posed
 from avatar.motion.orbit import orbited
 from avatar.runs.clips import own_clip
 from avatar.runs.trained import TrainedAvatar
-from avatar.view.live import Live
+from avatar.view.live import LiveFrame
 from avatar.view.player import NEUTRAL, STREAM, Player
 from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer, to_bytes
 
@@ -117,6 +117,6 @@ def test_a_stream_is_shown_from_its_first_frame_on(trained: TrainedAvatar) -> No
     newest: list = [None]
     player = Player(trained, {}, lambda: 0.0, lambda: newest[0])
     assert player.name == STREAM and player.now().params.expression.equal(trained.rest_params().expression)
-    newest[0] = Live(7, trained.recording.params(3))
+    newest[0] = LiveFrame(7, trained.recording.params(3))
     shown = player.now()
     assert shown.params is newest[0].params and shown.key == (STREAM, 7) and shown.recorded is None

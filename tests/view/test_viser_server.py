@@ -30,7 +30,7 @@ from avatar.view.viewer import LARGEST, Viewer
 def said(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """What the viewer says of its clients."""
     lines: list[str] = []
-    monkeypatch.setattr(rate_limited_log.Complaints.__init__, "__defaults__", (lines.append, time.monotonic))
+    monkeypatch.setattr(rate_limited_log.RateLimitedLog.__init__, "__defaults__", (lines.append, time.monotonic))
     yield lines
 
 
@@ -272,12 +272,12 @@ def test_a_viser_that_listens_in_another_way_is_not_used(monkeypatch: pytest.Mon
         socket.create_server(("127.0.0.1", 0)) as listening,
         pytest.raises(Exception, match="does not work with viser"),
     ):
-        viser_server.WebServer(listening, None, None, rate_limited_log.Complaints(), "x")  # type: ignore[arg-type]
+        viser_server.WebServer(listening, None, None, rate_limited_log.RateLimitedLog(), "x")  # type: ignore[arg-type]
 
 
 def test_complaints_are_counted() -> None:
     now, lines = [0.0], []
-    counted = rate_limited_log.Complaints(lines.append, lambda: now[0])
+    counted = rate_limited_log.RateLimitedLog(lines.append, lambda: now[0])
     for _ in range(500):
         counted.add("a silent client")
     assert lines == ["Viewer: a silent client"]

@@ -18,7 +18,7 @@ from avatar.errors import UserError
 from avatar.head.model import matrix_from_6d
 from avatar.runs.trained import TrainedAvatar, load_avatar
 from avatar.types import HeadParams
-from avatar.view.live import Live, Pace
+from avatar.view.live import LiveFrame, LiveTiming
 from avatar.view.player import WEBCAM, Player
 from avatar.view.webcam import NO_FACE, Webcam, moved_camera
 
@@ -98,7 +98,7 @@ def webcam(trained: TrainedAvatar, script: Script, said: list[str]) -> Iterator[
     webcam.close()
 
 
-def shown(webcam: Webcam) -> Live:
+def shown(webcam: Webcam) -> LiveFrame:
     newest = webcam.newest()
     assert newest is not None
     return newest
@@ -198,7 +198,7 @@ def test_closing_ends_at_once_and_says_nothing(webcam: Webcam, said: list[str]) 
 
 
 def test_the_player_shows_it_with_the_heads_pose(trained: TrainedAvatar) -> None:
-    frame = Live(4, trained.rest_params(), replace(trained.rest_camera(), cx=7.0), 3.5)
+    frame = LiveFrame(4, trained.rest_params(), replace(trained.rest_camera(), cx=7.0), 3.5)
     player = Player(trained, {}, lambda: 0.0, lambda: frame, WEBCAM)
     assert player.name == WEBCAM and player.names[-1] == WEBCAM
     now = player.now()
@@ -208,11 +208,11 @@ def test_the_player_shows_it_with_the_heads_pose(trained: TrainedAvatar) -> None
 
 
 def test_pace_is_of_the_last_seconds() -> None:
-    pace = Pace()
-    assert pace.now(0.0) is None
+    timing = LiveTiming()
+    assert timing.now(0.0) is None
     for n in range(11):
-        pace.add(n / 10, n / 10 + 0.05)
-        pace.add(n / 10, n / 10 + 0.09)  # drawn again, larger
-    latency, rate = pace.now(1.2)  # type: ignore[misc]
+        timing.add(n / 10, n / 10 + 0.05)
+        timing.add(n / 10, n / 10 + 0.09)  # drawn again, larger
+    latency, rate = timing.now(1.2)  # type: ignore[misc]
     assert latency == pytest.approx(50) and rate == pytest.approx(10)
-    assert pace.now(10.0) is None
+    assert timing.now(10.0) is None

@@ -11,7 +11,7 @@ from some_tracks import track
 
 from data_prep.check.check_tracking import _camera
 from data_prep.check.coverage import Coverage, measure_coverage
-from data_prep.check.motion import head_angles, suddenness
+from data_prep.check.motion import head_angles, measure_jumps
 from data_prep.formats.frame_track import FrameTrack
 
 TRAIN, TEST = 20, 5
@@ -67,10 +67,10 @@ def test_a_frame_is_compared_with_its_neighbours_in_time() -> None:
     """A head that turns evenly is never sudden; nothing is said beside a frame that is missing."""
     tracks = [track((0.0, 2.0 * n, 0.0), t=np.array([0.001 * n, 0.0, 0.8])) for n in range(6)]
     tracks[3] = track((0.0, 11.0, 0.0), t=np.array([0.013, 0.0, 0.8]))
-    found = suddenness([0, 1, 2, 3, 4, 5], tracks)
+    found = measure_jumps([0, 1, 2, 3, 4, 5], tracks)
     np.testing.assert_allclose(found.rotation, [np.nan, 0.0, 2.5, 5.0, 2.5, np.nan], atol=1e-4)
     np.testing.assert_allclose(found.translation, [np.nan, 0.0, 5.0, 10.0, 5.0, np.nan], atol=1e-4)
-    gap = suddenness([0, 1, 2, 4, 5, 6], tracks)
+    gap = measure_jumps([0, 1, 2, 4, 5, 6], tracks)
     assert np.isnan(gap.rotation).tolist() == [True, False, True, True, False, True]
 
 

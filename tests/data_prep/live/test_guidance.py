@@ -32,21 +32,21 @@ PICTURE = picture()
 def test_what_is_wrong_is_said(image: np.ndarray, face: Face | None, advice: str) -> None:
     adviser = Adviser()
     for _ in range(20):
-        assert adviser.advice(PICTURE, posed()) == ""
-    assert adviser.advice(image, face) == advice
+        assert adviser.problem(PICTURE, posed()) == ""
+    assert adviser.problem(image, face) == advice
 
 
 def test_a_camera_out_of_focus_is_told_from_a_movement() -> None:
     adviser = Adviser()
-    assert {adviser.advice(picture(blur=8.0), posed()) for _ in range(5)} == {"focus the camera, or wipe its lens"}
+    assert {adviser.problem(picture(blur=8.0), posed()) for _ in range(5)} == {"focus the camera, or wipe its lens"}
 
 
 def test_advice_waits_for_half_a_second_and_ends_at_once() -> None:
     adviser, small = Adviser(), posed(height=150)
-    said = [adviser.hear(PICTURE, small if 10 <= n < 30 else posed(), n / 20) for n in range(40)]
+    said = [adviser.advise(PICTURE, small if 10 <= n < 30 else posed(), n / 20) for n in range(40)]
     wait = round(20 * PATIENCE)
     assert said == [""] * (10 + wait) + ["come closer"] * (20 - wait) + [""] * 10
-    flicker = [adviser.hear(PICTURE, small if n % 2 else None, 2 + n / 20) for n in range(40)]
+    flicker = [adviser.advise(PICTURE, small if n % 2 else None, 2 + n / 20) for n in range(40)]
     assert set(flicker) == {""}, "each of them is there for one picture"
 
 

@@ -14,7 +14,7 @@ from videos import encode, spot
 from waiting import until
 
 from avatar.errors import UserError
-from data_prep.live.pictures import FILMED, FOLLOWED, Camera, LivePicture, Newest, Played, open_source
+from data_prep.live.pictures import FILMED, FOLLOWED, Camera, LivePicture, Newest, VideoFile, open_source
 from data_prep.track.footage.pictures import open_footage
 
 WIDTH, HEIGHT = 80, 64
@@ -189,7 +189,7 @@ class Hand:
 
 def test_a_video_is_played_at_its_own_rate(video: Path) -> None:
     hand = Hand()
-    played = Played(open_footage(video), lambda: hand.now)
+    played = VideoFile(open_footage(video), lambda: hand.now)
     assert played.size == (WIDTH, HEIGHT)
     played._closed = hand  # type: ignore[assignment]
     seen = [(picture.taken, hand.now) for picture in played.pictures()]
@@ -198,7 +198,7 @@ def test_a_video_is_played_at_its_own_rate(video: Path) -> None:
 
 def test_a_decoder_that_is_late_makes_no_old_pictures(video: Path) -> None:
     seconds = iter(range(100, 200))
-    played = Played(open_footage(video), lambda: float(next(seconds)))
+    played = VideoFile(open_footage(video), lambda: float(next(seconds)))
     assert [picture.taken for picture in played.pictures()] == [100.0 + n for n in range(12)]
 
 

@@ -13,7 +13,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.bench.figures import Figures
 from avatar.bench.placement import Placement, in_parts, placement
-from avatar.bench.track import Result, paired, report, truly_tracked
+from avatar.bench.track import Result, paired, report, with_true_tracking
 from avatar.cli import main
 from avatar.config import load_config
 from avatar.data.recording import Recording
@@ -53,7 +53,7 @@ def test_frames_are_paired_by_their_numbers(truth: Recording) -> None:
 
 def test_the_true_tracking_goes_to_the_videos_frames(truth: Recording) -> None:
     own = replace(truth, names=("00001", "00003"), intrinsics=(1.0, 1.0, 1.0, 1.0))
-    given = truly_tracked(own, truth, paired(own, FRAMES))
+    given = with_true_tracking(own, truth, paired(own, FRAMES))
     assert given.names == own.names and given.intrinsics == truth.intrinsics
     assert torch.equal(given.tracks["t"], truth.tracks["t"][[1, 3]])
     assert torch.equal(given.identity, truth.identity)

@@ -156,9 +156,9 @@ def test_a_file_that_was_added_has_the_video_tracked_again(
     monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(track, "open_footage", lambda _: footage())
     monkeypatch.setattr(track, "track", lambda video, out, *_, seal, **__: (out.mkdir(parents=True), seal(out)))
-    first = track.tracked_once(tmp_path / "me.mp4", head)
+    first = track.cached_tracking(tmp_path / "me.mp4", head)
     add_names(head)
-    assert track.tracked_once(tmp_path / "me.mp4", head) != first
+    assert track.cached_tracking(tmp_path / "me.mp4", head) != first
 
 
 def test_the_fit_of_a_folder_that_is_not_finished_is_made_again_too(head: Path, tmp_path: Path) -> None:

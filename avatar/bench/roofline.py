@@ -32,7 +32,7 @@ def measured_copy_bandwidth(threads: int) -> float:
     return 2 * COPIED / _seconds(lambda: target.copy_(source), threads)
 
 
-def floor_ms(operations: float, moved: float, threads: int) -> float:
+def roofline_ms(operations: float, moved: float, threads: int) -> float:
     """Milliseconds for so many floating-point operations and moved bytes, whichever takes longer."""
     return 1e3 * max(operations / measured_flops(threads), moved / measured_copy_bandwidth(threads))
 

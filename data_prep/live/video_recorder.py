@@ -18,7 +18,7 @@ COMMON = (5, 7.5, 10, 12.5, 15, 20, 24, 25, 30, 50, 60, 120)  # pictures a secon
 _NEAR = 0.04  # relative, to a common rate
 
 
-class Film:
+class VideoRecorder:
     """A source whose pictures also go into a video, between `begin` and `end`. Implements `Source`.
 
     `pictures` runs in a thread of its own, the rest in another. Of a video at `rate` frames a second, a picture becomes

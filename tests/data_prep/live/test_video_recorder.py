@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pytest
 
-from data_prep.live.film import SLACK, Film
 from data_prep.live.pictures import LivePicture
+from data_prep.live.video_recorder import SLACK, VideoRecorder
 
 RATE = 30.0
 
@@ -29,9 +29,9 @@ class Timed:
         pass
 
 
-def filmed(times: Sequence[float], rate: float = RATE) -> tuple[Film, list[int]]:
+def filmed(times: Sequence[float], rate: float = RATE) -> tuple[VideoRecorder, list[int]]:
     """The film, and the number of the picture in each of its frames."""
-    film, frames = Film(Timed(times)), []
+    film, frames = VideoRecorder(Timed(times)), []
     film.begin(lambda image: frames.append(int(image[0, 0, 0])), rate)
     assert len(list(film.pictures())) == len(times), "all pictures go on to who watches"
     assert film.frames == len(frames)
@@ -70,7 +70,7 @@ def test_every_picture_is_shown_at_its_time(rate: float) -> None:
 
 
 def test_nothing_is_written_before_it_begins_and_after_it_ends() -> None:
-    film, frames = Film(Timed(np.arange(9) / RATE)), []
+    film, frames = VideoRecorder(Timed(np.arange(9) / RATE)), []
     for n, _ in enumerate(film.pictures()):
         if n == 2:
             film.begin(lambda image: frames.append(int(image[0, 0, 0])), RATE)
@@ -86,13 +86,13 @@ def test_the_rate_is_the_cameras_own(rate: float, told: float) -> None:
     """Whatever its jitter, and with a picture missing in between; a common rate where it is near."""
     count = int(3 * rate)
     times = (np.arange(count) + np.random.default_rng(2).uniform(-0.1, 0.1, count)) / rate
-    film = Film(Timed(np.delete(times, count // 2)))
+    film = VideoRecorder(Timed(np.delete(times, count // 2)))
     for _ in film.pictures():
         pass
     assert film.measured_rate() == pytest.approx(told, rel=0.02)
 
 
 def test_a_rate_takes_two_seconds() -> None:
-    film = Film(Timed(np.arange(61) / RATE))
+    film = VideoRecorder(Timed(np.arange(61) / RATE))
     rates = [film.measured_rate() for _ in film.pictures()]
     assert rates[:60] == [None] * 60 and rates[60] == 30
