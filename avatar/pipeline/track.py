@@ -82,5 +82,5 @@ def can_track(say: Callable[[str], object]) -> bool:
 
 
 def progress_bar(items: Iterable[Item], total: int | None, title: str, unit: str = "frames") -> Iterable[Item]:
-    """A progress progress_bar with a rate, which leaves its line."""
+    """A progress bar with a rate, which leaves its line."""
     return tqdm(items, total=total, desc=title, unit=f" {unit}")
