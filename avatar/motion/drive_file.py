@@ -41,8 +41,13 @@ from avatar.types import IDENTITY_6D, Camera, HeadParams
 MAX_FRAMES = 1_000_000
 CAMERA_KEYS = ("R", "t", "K", "size")
 FLAME_KEYS = {
-    "expr": "expression", "jaw_pose": "jaw", "eyes_pose": "eyes", "neck_pose": "neck",
-    "expression_params": "expression", "jaw_params": "jaw", "eyelid_params": "eyelids",
+    "expr": "expression",
+    "jaw_pose": "jaw",
+    "eyes_pose": "eyes",
+    "neck_pose": "neck",
+    "expression_params": "expression",
+    "jaw_params": "jaw",
+    "eyelid_params": "eyelids",
 }
 KEYS = ("expression", "jaw", "eyes", "eyelids", "neck", "fps", *CAMERA_KEYS, "shape", "names", "head")
 

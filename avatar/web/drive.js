@@ -95,7 +95,7 @@ export class FaceDriver {
     return { parameters, ...camera };
   }
 
-  /** `departed` of avatar/motion/transfer.py, no farther than training has shown. */
+  /** `retargeted` of avatar/motion/transfer.py, no farther than training has shown. */
   #parameters(scores) {
     const { drive, rest, sizes } = this.#header, E = sizes.expressions, at = places(E);
     const moved = new Float64Array(drive.low.length);

@@ -32,7 +32,7 @@ from avatar.bench.hyper import (
     TOLERANCE,
     WAYS,
     Leaves,
-    Way,
+    Method,
     by_covariance,
     by_substitution,
     compare,
@@ -60,7 +60,7 @@ class Point:
     bytes: float | None  # None: not Linux
 
 
-NAIVE = {TEXTBOOK: Way(by_covariance, covariance_leaves)}
+NAIVE = {TEXTBOOK: Method(by_covariance, covariance_leaves)}
 TRICKS = {TRICK: WAYS["slope"], FUSED: WAYS["fused"]}
 
 
@@ -132,7 +132,7 @@ def say_peaks(asked: str) -> None:
     print(json.dumps(found))
 
 
-def peak_bytes(way: Way, leaves: Leaves) -> int:
+def peak_bytes(way: Method, leaves: Leaves) -> int:
     gc.collect()
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # glibc's
         trim(0)  # else what was freed before, and is still the process's, would hide what is taken
@@ -142,7 +142,7 @@ def peak_bytes(way: Way, leaves: Leaves) -> int:
     return high_water() - before + sum(leaf.nbytes for leaf in leaves.values())
 
 
-def one_pass(way: Way, leaves: Leaves) -> None:
+def one_pass(way: Method, leaves: Leaves) -> None:
     offsets = way.offsets(leaves)
     torch.autograd.grad(offsets, list(leaves.values()), torch.ones_like(offsets))
 

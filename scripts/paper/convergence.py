@@ -31,6 +31,7 @@ from avatar.config import Config, load_config
 from avatar.data.frame import Frame
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation.measure import to_8_bit
@@ -136,6 +137,8 @@ def main(words: Sequence[str]) -> int:
     rows = {row["name"]: [*row["overrides"], *overrides] for row in systems(given.systems)}
     source = Source(folders[0], find_head(folders[0], given.head), frame_offset=given.frame_offset)
     configs = {name: load_config(words) for name, words in rows.items()}
+    if any(config.trainer.pose_rate or config.trainer.condition_noise for config in configs.values()):
+        parser.error("systems are trained without pose corrections and noise, as published: leave both keys at 0")
     subject, assets = open_subject(source, next(iter(configs.values())).data.test_frames)
     place = given.out / "convergence" / subject.name
     learners = [Learner(n, place / re.sub(r"\W+", "_", n), subject, assets, c) for n, c in configs.items()]
@@ -157,10 +160,8 @@ def marks(seconds: Sequence[float], between: int = BETWEEN) -> list[float]:
 
 def held_out(subject: Subject, config: Config, count: int) -> list[Frame]:
     """As the tracker left them, where the tracking was refined."""
-    test = subject.split.test
-    chosen = [test[i] for i in np.unique(np.linspace(0, len(test) - 1, count).round().astype(int))]
     with FrameLoader(subject.as_tracked(), config.data.size) as loader:
-        return list(loader.frames(chosen))
+        return list(loader.frames(evenly_spread(subject.split.test, count)))
 
 
 def take_turns(learners: Sequence[Learner], at: Sequence[float], frames: Sequence[Frame]) -> None:

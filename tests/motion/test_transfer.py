@@ -11,7 +11,7 @@ from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.expression_space import fit_expressions
 from avatar.motion.rest import RestPose, find_mean, find_neutral
 from avatar.motion.statistics import MotionStatistics, learn_statistics
-from avatar.motion.transfer import TRANSFERS, departed, transfer_motion
+from avatar.motion.transfer import TRANSFERS, retargeted, transfer_motion
 from avatar.pose_refinement.motion import rotation
 from avatar.types import HeadParams
 
@@ -93,9 +93,9 @@ def test_a_jaw_turns_from_the_targets_rest_by_the_drivers_departure() -> None:
     goal = RestPose(torch.zeros(5), about((0, 1, 0), -15.0), None)
     departure = about((0, 0, 1), 12.0)
     driver = replace(rest_params(), jaw=(source.jaw @ departure)[:2].reshape(6))
-    (moved,) = departed([driver], source, goal, 1.0)
+    (moved,) = retargeted([driver], source, goal, 1.0)
     torch.testing.assert_close(matrix_from_6d(moved.jaw), goal.jaw @ departure, rtol=0, atol=1e-6)
-    (half,) = departed([driver], source, goal, 0.5)
+    (half,) = retargeted([driver], source, goal, 0.5)
     expected = goal.jaw @ about((0, 0, 1), 6.0)
     torch.testing.assert_close(matrix_from_6d(half.jaw), expected, rtol=0, atol=1e-6)
 

@@ -78,13 +78,13 @@ def test_conditioning_is_measured_once(tmp_path: Path, monkeypatch: pytest.Monke
 
 HOLDS = """
 import torch
-from conditioning import Way, covariance_leaves, one_pass, peak_bytes
+from conditioning import Method, covariance_leaves, one_pass, peak_bytes
 
 def holds(megabytes):
     def offsets(leaves):
         torch.zeros(megabytes * 2**18).add_(1)
         return leaves["latents"] * 2
-    return Way(offsets, covariance_leaves)
+    return Method(offsets, covariance_leaves)
 
 leaves = {"latents": torch.zeros(4, 4, requires_grad=True)}
 one_pass(holds(1), leaves)  # what a library makes once

@@ -215,7 +215,7 @@ def test_a_gradient_that_is_not_finite_stops_and_leaves_the_last_checkpoint(
     with pytest.raises(UserError) as caught:
         train(avatar, subject, config, tmp_path / "run", PerceptualTerm("none"))
     message = str(caught.value)
-    assert "non_finite_error at step 7, frame " in message
+    assert "stopped at step 7, frame " in message
     assert "the gradient of opacity_logits has 1 non-finite of" in message and "the first at [3] (nan)" in message
     files = list_checkpoints(tmp_path / "run" / "checkpoints")
     assert [load_checkpoint(p).step for p in files] == [4]

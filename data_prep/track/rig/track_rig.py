@@ -130,8 +130,11 @@ class _Rig:
         choices = Choices(span=span, rotate=0, camera=(fx, fy, cx, cy))
 
         def make(folder: Path) -> dict[str, Any]:
+            def say_front(words: str) -> None:
+                say(words.replace(str(folder), FRONT))  # not the hidden folder
+
             folder.rmdir()
-            track(camera.footage, folder, self._head_path, self._head, choices, say, progress)
+            track(camera.footage, folder, self._head_path, self._head, choices, say_front, progress)
             return {}
 
         inputs = {"of": tracking_key(camera.footage, choices.to_json(), self._head_path, self._head)}

@@ -71,6 +71,7 @@ def test_the_head_lies_where_it_is_in_every_camera(truth: Path, tracked: Path, h
         assert np.mean(errors) < 0.012 * SIZE, camera
     said = (tracked.parent / "said.txt").read_text()
     assert "5 cameras; the front one is 222200002" in said and "median error falls from" in said
+    assert "frames in front\n" in said and ".partial" not in said
 
 
 def test_pictures_mattes_and_lenses(truth: Path, tracked: Path) -> None:
