@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from avatar.version import __version__
 
 if TYPE_CHECKING:
-    from avatar.runs.trained import TrainedAvatar
+    from avatar.runs.trained_avatar import TrainedAvatar
 
 __all__ = ["__version__", "load"]
 

@@ -23,7 +23,7 @@ from playwright.sync_api import sync_playwright
 from avatar.export.default_view import with_faded_neck
 from avatar.export.web_page import write_page
 from avatar.runs.run import open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat.cpu import thread_count
 from avatar.view.view_renderer import Look, Setting, ViewRenderer
 

@@ -23,9 +23,9 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
 from avatar.head.model import matrix_from_6d
-from avatar.runs.clips import own_clip
+from avatar.runs.motion_clip import own_clip
 from avatar.runs.run import open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.packets import BLENDSHAPES, LIVE_LINK, LIVE_LINK_VERSION
 from avatar.view.player import Player

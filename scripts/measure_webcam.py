@@ -20,13 +20,13 @@ import torch
 from avatar.commands.reenact import head_of
 from avatar.head.assets import HeadAssets
 from avatar.runs.run import open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.live import LiveFrame, LiveTiming
 from avatar.view.player import WEBCAM, Player
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.viewer import Viewer
 from avatar.view.webcam import Webcam
-from data_prep.live.follow import FaceFollower
+from data_prep.live.face_tracker import FaceFollower
 from data_prep.live.frame_fit import FrameFit
 from data_prep.live.pictures import LONGEST, open_source
 from data_prep.track.faces.detect import Face, FaceDetector
@@ -35,7 +35,7 @@ from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import find_embedding
 from data_prep.track.fit.focal import choose_focal
 from data_prep.track.fit.landmark_fit import eye_distance, fit_landmarks
-from data_prep.track.fit.levenberg import concatenated
+from data_prep.track.fit.levenberg_marquardt import concatenated
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Span, whole
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from small_runs import train_small
 
-from avatar.runs.trained import TrainedAvatar, load_avatar
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 
 
 def lively_run(folder: Path, run: Path, *overrides: str) -> Path:

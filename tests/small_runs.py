@@ -18,7 +18,7 @@ from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import start_run
 from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
-from data_prep.prepare.open import open_subject
+from data_prep.prepare.open_subject import open_subject
 
 SMALL = (
     "model.uv_size=20",

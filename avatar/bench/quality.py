@@ -21,7 +21,7 @@ from avatar.data.loader import FrameLoader
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.evaluation.find_lpips import find_lpips
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run
 from avatar.train.objective import perceptual_start

@@ -30,10 +30,10 @@ from avatar.head.model import HeadModel
 from avatar.pipeline.refine_plan import round_steps
 from avatar.pose_refinement.refine import refine_subject
 from avatar.runs.model_registry import make_avatar
+from avatar.train.frame_order import planned_steps, within_epochs
 from avatar.train.objective import choose_perceptual
-from avatar.train.order import planned_steps, within_epochs
 from avatar.train.trainer import train
-from data_prep.prepare.open import find_head, open_subject
+from data_prep.prepare.open_subject import find_head, open_subject
 
 SEED = 0
 MEASURED_EVERY = 2  # held-out frames

@@ -28,7 +28,7 @@ from avatar.errors import UserError
 from avatar.model import FlashAvatar
 from avatar.render import Renderer
 from avatar.runs.run import open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams, Rendering
 
 SIZES, QUICK_SIZES = (256, 512), (32,)

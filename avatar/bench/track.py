@@ -20,8 +20,8 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.figures import Figures
-from avatar.bench.placement import Placement, placement
 from avatar.bench.refine import MEASURED_EVERY, Trial, driven_figures
+from avatar.bench.reprojection import Placement, placement
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config
 from avatar.data.recording import TRACK_SHAPES, Recording
@@ -33,9 +33,9 @@ from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.pipeline.track import progress_bar
-from avatar.train.order import planned_steps
+from avatar.train.frame_order import planned_steps
 from data_prep.formats.avatar_track import LANDMARKS_FILE
-from data_prep.prepare.open import find_head, open_subject
+from data_prep.prepare.open_subject import find_head, open_subject
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fitting import as_tracks, find_embedding

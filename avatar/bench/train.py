@@ -33,7 +33,7 @@ from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import GradientCheck, TrainState
 from avatar.train.step_monitor import Guard
 from avatar.train.step_runner import WARM, StepRunner
-from data_prep.prepare.open import find_head, open_subject
+from data_prep.prepare.open_subject import find_head, open_subject
 
 REPEATS, QUICK_REPEATS, FULL_REPEATS = 15, 2, 41
 RECIPES = {"paper": ("experiment=paper", "data.size=null", "trainer.perceptual=auto"), "default": ()}

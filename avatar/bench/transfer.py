@@ -39,7 +39,7 @@ from avatar.head.model import HeadModel
 from avatar.motion.statistics import learn_statistics
 from avatar.motion.transfer import TRANSFERS, transfer_motion
 from avatar.types import Camera, HeadParams
-from data_prep.prepare.open import open_subject
+from data_prep.prepare.open_subject import open_subject
 
 TARGET_SEED, DRIVER_SEED = 1, 2
 NEUTRAL_BIAS = 0.15  # standard deviation of a tracked coefficient at rest

@@ -12,11 +12,11 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.config import load_config
 from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
-from avatar.pipeline.open import source_options
+from avatar.pipeline.open_inputs import source_options
 from avatar.train.cost_estimate import measure_cost
 from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
-from data_prep.prepare.open import find_head
+from data_prep.prepare.open_subject import find_head
 
 
 def run_check(arguments: Namespace) -> int:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands.arguments import parse
-from avatar.commands.finish import discard, figures, measured
+from avatar.commands.held_out_figures import discard, figures, measured
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.train import check_rounds, config_overrides, train_as_asked
 from avatar.compute.device import free_bytes
@@ -38,8 +38,8 @@ from avatar.pipeline.track import head_for_video, progress_bar, tracking_lacks
 from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
+from avatar.train.frame_order import within_epochs
 from avatar.train.objective import choose_perceptual
-from avatar.train.order import within_epochs
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.track.first_pass import MAX_PICTURES
 from data_prep.track.footage.pictures import open_footage

@@ -6,7 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
 
-from avatar.commands.finish import figures, measured
+from avatar.commands.held_out_figures import figures, measured
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
@@ -14,7 +14,7 @@ from avatar.errors import UserError
 from avatar.export.web_page import write_page
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
-from avatar.pipeline.open import open_driver
+from avatar.pipeline.open_inputs import open_driver
 from avatar.pipeline.reenact import reenact
 from avatar.pipeline.track import can_track, progress_bar
 from avatar.pipeline.train_refined import continue_or_begin, is_begun

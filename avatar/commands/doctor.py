@@ -12,8 +12,8 @@ from typing import NamedTuple
 from avatar.compute.availability import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError, install
-from avatar.files.opening import check_file, is_there
-from avatar.files.places import named_path
+from avatar.files.environment import named_path
+from avatar.files.read import check_file, is_there
 from avatar.files.third_party import (
     FETCHED_LPIPS,
     HEAD_VARIABLE,

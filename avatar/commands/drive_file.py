@@ -8,8 +8,8 @@ from avatar.commands.outputs import check_file, check_outputs
 from avatar.motion.drive import subject_drive
 from avatar.motion.drive_file import write_drive
 from avatar.pipeline import OK
-from avatar.pipeline.open import source_of
-from data_prep.prepare.open import open_subject
+from avatar.pipeline.open_inputs import source_of
+from data_prep.prepare.open_subject import open_subject
 
 
 def run_drive_file(arguments: Namespace) -> int:

@@ -13,7 +13,7 @@ from avatar.evaluation.protocol import choose_protocols
 from avatar.files.lock import locked
 from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 
 
 def run_eval(arguments: Namespace) -> int:

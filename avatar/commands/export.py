@@ -21,12 +21,12 @@ from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
 from avatar.files.numbered import numbered, remove_longer
 from avatar.pipeline import OK
-from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file
+from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
-from avatar.runs.clips import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.model_registry import refuse_features
+from avatar.runs.motion_clip import OWN, Clip, Own, driven_clip, own_clip
 from avatar.runs.run import open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams
 
 MIB = 2**20

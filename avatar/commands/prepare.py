@@ -8,7 +8,7 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
-from avatar.pipeline.open import source_of
+from avatar.pipeline.open_inputs import source_of
 from data_prep.prepare.prepare import prepare
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from avatar.pipeline import OK
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 
 
 def run_report(arguments: Namespace) -> int:

@@ -10,9 +10,9 @@ from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.track import head_for_video, progress_bar
+from data_prep.track.camera_rig import track_rig
 from data_prep.track.crop import parse_crop
 from data_prep.track.footage.source import Span
-from data_prep.track.rig import track_rig
 from data_prep.track.track import Choices, track
 
 

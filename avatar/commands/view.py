@@ -23,18 +23,18 @@ from avatar.commands.reenact import head_of
 from avatar.errors import UserError, check_installed
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.open import DRIVE_SUFFIXES, open_drive_file, open_run
-from avatar.runs.clips import Clip, driven_clip, own_clip
+from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file, open_run
 from avatar.runs.curves import read_curves
+from avatar.runs.motion_clip import Clip, driven_clip, own_clip
 from avatar.runs.run import RUN_FILE, Run, open_trained
-from avatar.runs.trained import TrainedAvatar, avatar_path
+from avatar.runs.trained_avatar import TrainedAvatar, avatar_path
 from avatar.view.auth import LOCAL
-from avatar.view.newest import NewestAvatar, progress
+from avatar.view.newest_checkpoint import NewestAvatar, progress
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.webcam import Webcam
-from data_prep.live.follow import FaceFollower
+from data_prep.live.face_tracker import FaceFollower
 from data_prep.live.pictures import open_source
 
 if TYPE_CHECKING:

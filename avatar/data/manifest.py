@@ -12,13 +12,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+from avatar.data.camera_rig import CameraRig, parse_rig
 from avatar.data.images import EVERY_LABEL
 from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
 from avatar.data.refinement import Refinement
-from avatar.data.rig import Rig, parse_rig
 from avatar.errors import UserError
 from avatar.files.names import safe_name
-from avatar.files.opening import MissingFile, read_json
+from avatar.files.read import MissingFile, read_json
 
 MANIFEST_VERSION = 7
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
@@ -63,7 +63,7 @@ class Manifest:
     input_hash: str  # of names, sizes and times of the inputs, and the options: decides whether to prepare again
     data_hash: str  # of the contents: the same data gives the same hash on every machine
     refinement: Refinement | None = None  # of the tracking; None where it is the tracker's own
-    rig: Rig | None = None  # of several cameras; None: one. Size and intrinsics above are of its first camera
+    rig: CameraRig | None = None  # of several cameras; None: one. Size and intrinsics above are of its first camera
     labels: dict[str, int] = field(default_factory=dict)  # of masks that are label images: what is read as 255
 
     def to_json(self) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.data.rig import Rig, RigCamera
+from avatar.data.camera_rig import CameraRig, RigCamera
 from avatar.data.split import Split
 from avatar.tensors import check_finite, check_shapes
 from avatar.types import Camera, HeadParams
@@ -39,7 +39,7 @@ class Recording:
     tracks: Mapping[str, Tensor]  # float32, of TRACK_SHAPES; a row for each frame, with a rig for each time
     data_hash: str  # of pictures and tracking
     head_fingerprint: str
-    rig: Rig | None = None  # of several cameras; size and intrinsics above are of its first one
+    rig: CameraRig | None = None  # of several cameras; size and intrinsics above are of its first one
 
     def __repr__(self) -> str:
         return f"<recording of {self.name}: {len(self)} frames of {self.width}x{self.height}, {self.fps:g} a second>"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avatar.compute.memory import available_bytes
 from avatar.errors import UserError
-from avatar.files.opening import check_file, shown_size
+from avatar.files.read import check_file, shown_size
 from avatar.tensors import describe_non_finite
 
 DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")  # PyTorch computes with no others

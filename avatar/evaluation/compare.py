@@ -23,7 +23,7 @@ from avatar.evaluation.evaluate import RESULTS_FORMAT
 from avatar.evaluation.previous_results import MAX_TABLE_BYTES
 from avatar.evaluation.protocol import NAME
 from avatar.evaluation.tracking_source import Drive, Part, is_marked, legend, parts
-from avatar.files.opening import MissingFile, read_bytes, read_json
+from avatar.files.read import MissingFile, read_bytes, read_json
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "perceptual", "protocols", "tracking"}  # of results.json
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree

@@ -16,7 +16,7 @@ from avatar.evaluation.pictures import clear_pictures
 from avatar.evaluation.protocol import NAME, Protocol, builtin_protocols
 from avatar.evaluation.results import FrameResult
 from avatar.evaluation.tracking_source import FRAMES_FILE, TRACKED_FILE, Drive, parts
-from avatar.files.opening import read_bytes, read_json, read_text
+from avatar.files.read import read_bytes, read_json, read_text
 
 MAX_TABLE_BYTES = 2**28  # of a table of frames
 # Of results.json: where these agree, figures by different protocols may stand side by side.

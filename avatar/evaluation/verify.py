@@ -29,7 +29,7 @@ from avatar.evaluation.previous_results import MAX_TABLE_BYTES
 from avatar.evaluation.protocol import column
 from avatar.evaluation.tracking_source import Part, parts
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import read_bytes, read_json
+from avatar.files.read import read_bytes, read_json
 
 TOLERANCE = 2e-6  # frames.csv is rounded to 5e-7; both sides compute in float64
 _LEVELS = 255

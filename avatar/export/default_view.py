@@ -15,7 +15,7 @@ from torch import Tensor
 from avatar.head.assets import JOINT_NAMES
 from avatar.model import FlashAvatar
 from avatar.motion.orbit import EDGE, orbited, seen_from
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera
 
 DEPTH = 8.0  # layers of Gaussians that stop the light

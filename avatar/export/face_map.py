@@ -12,7 +12,7 @@ from avatar.head.expression_names import plain
 from avatar.head.model import matrix_from_6d
 from avatar.motion.controls import shown_range
 from avatar.motion.drive_csv import from_blendshapes
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.packets import BLENDSHAPES
 
 DIGITS = 6

@@ -15,9 +15,9 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from avatar.export.bake import bake_texture
+from avatar.export.bake_texture import bake_texture
 from avatar.motion.controls import JOINT_FIELD, expression_controls, joint_ranges, posed
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 
 LEAST = 1e-6  # metres: a target that moves nothing so far is left out

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, distribution
 
 from avatar.errors import UserError
-from avatar.files.opening import read_bytes
+from avatar.files.read import read_bytes
 from avatar.files.third_party import FACE_LANDMARKER, TASKS_VISION, TASKS_VISION_VERSION, require
 
 PACK = "face-landmarker.js"

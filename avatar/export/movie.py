@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from avatar.files.video import write_video
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
-from avatar.runs.clips import Clip
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.motion_clip import Clip
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams
 
 CameraPath = Literal["recorded", "still", "turntable", "orbit"]

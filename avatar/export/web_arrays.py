@@ -15,7 +15,7 @@ from avatar.export.default_view import with_faded_neck
 from avatar.gaussians.deformation import FoldedNetwork
 from avatar.head.assets import JOINT_NAMES, HeadAssets
 from avatar.model import FlashAvatar
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 # The arrays of csrc/web/web_avatar.h, in its order.
 ARRAYS = (

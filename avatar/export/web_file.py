@@ -27,7 +27,7 @@ from avatar.export.web_arrays import ARRAYS, WebArrays, reduce_avatar
 from avatar.gaussians.head_rotation import LIMIT
 from avatar.motion.controls import expression_controls, joint_ranges
 from avatar.motion.orbit import orbit_limits
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 FORMAT = "AVW4"
 Precision = Literal["float", "small"]

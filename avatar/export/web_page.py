@@ -14,16 +14,25 @@ from avatar.errors import UserError
 from avatar.export.licence import SKINNING, licence_of
 from avatar.export.web_file import Precision, encode_avatar
 from avatar.files.atomic import write_atomically
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
 PAGE_MODULES = (
-    *("core.js", "motion.js", "canvas.js", "webgl_renderer.js", "drive.js", "settings.js", "view.js", "steer.js"),
-    *("landmarker.js", "camera.js", "controls.js", "gaze.js", "stage.js", "panel.js", "page.js"),
+    *(
+        "core.js",
+        "motion.js",
+        "canvas.js",
+        "webgl_renderer.js",
+        "drive.js",
+        "settings.js",
+        "view.js",
+        "orbit_controls.js",
+    ),
+    *("landmarker.js", "camera.js", "controls.js", "gaze.js", "page_display.js", "camera_panel.js", "page.js"),
 )
 WORKER_MODULES = ("core.js", "worker.js")
-WATCHER_MODULES = ("watcher.js",)
+LANDMARKER_WORKER_MODULES = ("landmarker_worker.js",)
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
         "style": read("page.css"),
         "script": f"(() => {{\n{bundle(PAGE_MODULES)}\n}})();",
         "worker": script_text(json.dumps(bundle(WORKER_MODULES), allow_nan=False)),
-        "watcher": script_text(json.dumps(bundle(WATCHER_MODULES), allow_nan=False)),
+        "watcher": script_text(json.dumps(bundle(LANDMARKER_WORKER_MODULES), allow_nan=False)),
         "module": base64.b64encode(gzip.compress((WEB / "avatar.wasm").read_bytes(), 9, mtime=0)).decode(),
         "data": base64.b64encode(encoded.data).decode(),
     }

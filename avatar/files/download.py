@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from tqdm import tqdm
 
-from avatar.files.opening import shown_size
+from avatar.files.read import shown_size
 
 PATIENCE = 30.0  # seconds without a byte, and before the pace is judged
 SLOWEST = 2_000  # bytes a second on average

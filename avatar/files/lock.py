@@ -12,7 +12,7 @@ from pathlib import Path
 
 from avatar.errors import UserError
 from avatar.files.atomic import is_running
-from avatar.files.opening import read_json
+from avatar.files.read import read_json
 
 LOCK_FILE = ".lock"
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.data_unpickler import DataUnpickler
-from avatar.files.opening import open_file, read_bytes
 from avatar.files.pickled_data import Budget, Refused, is_unicode, plain
+from avatar.files.read import open_file, read_bytes
 
 MAX_FILE_BYTES = 2**30  # FLAME's largest pickle has 53 MB
 MIN_BUDGET_BYTES = 2**26

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from avatar.errors import UserError
-from avatar.files.opening import read_text
+from avatar.files.read import read_text
 
 MAX_NODES = 50_000  # values and keys
 MAX_DIGITS = 25  # of a whole number

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from avatar.errors import UserError
 from avatar.files.download import DownloadFailed, downloaded
-from avatar.files.opening import is_there, open_file
-from avatar.files.places import cache_folder, named_path
+from avatar.files.environment import cache_folder, named_path
+from avatar.files.read import is_there, open_file
 
 FOLDER_VARIABLE, HEAD_VARIABLE = "AVATAR_MODELS", "AVATAR_HEAD"
 FETCHED_LPIPS = ("squeeze",)  # what training and evaluation use; vgg is 528 MB and alex 233

@@ -13,8 +13,8 @@ from torch import Tensor
 from avatar.data.frame import Frame
 from avatar.errors import UserError
 from avatar.gaussianheadavatar.start_points import knn_log_scales, mouth_box, spread_points, visual_hull
+from avatar.gaussians.initial_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.mesh_embedding import Embedding
-from avatar.gaussians.seen_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.uv import UVTexels
 from avatar.head.model import HeadModel
 

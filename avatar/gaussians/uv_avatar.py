@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from avatar.config import OPACITY_RATE, ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
 from avatar.gaussians.base_model import Avatar, Groups
+from avatar.gaussians.initial_colours import mean_colours
 from avatar.gaussians.mesh_embedding import Embedding, knn_scales
-from avatar.gaussians.seen_colours import mean_colours
 from avatar.gaussians.uv import UVTexels, bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel

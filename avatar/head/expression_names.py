@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.errors import UserError
-from avatar.files.opening import is_there, read_json
+from avatar.files.read import is_there, read_json
 
 NAMES_FILE = "expression_names.json"
 JAW_TARGETS = ("jaw_x", "jaw_y", "jaw_z")

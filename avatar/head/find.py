@@ -6,7 +6,7 @@ import zipfile
 from pathlib import Path
 
 from avatar.errors import UserError
-from avatar.files.opening import is_there
+from avatar.files.read import is_there
 
 NAMED = ("generic_model.pkl", "generic_model.npz")  # FLAME's own name for the model of no gender
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.opening import read_bytes
+from avatar.files.read import read_bytes
 
 MAX_BYTES, MAX_LINE = 2**25, 10_000  # FLAME's template has 1.5 MB
 

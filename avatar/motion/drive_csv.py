@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.opening import read_bytes
+from avatar.files.read import read_bytes
 from avatar.head.expression_names import JAW_TARGETS, NAMES_FILE, ExpressionNames, plain
 from avatar.motion.csv_table import Table, parse_table
 from avatar.motion.drive_times import Rate, find_rate, is_time

@@ -13,7 +13,7 @@ import numpy as np
 
 from avatar.data.json_values import parse_number
 from avatar.errors import UserError
-from avatar.files.opening import read_json
+from avatar.files.read import read_json
 from avatar.head.expression_names import ExpressionNames, plain
 from avatar.motion.drive_csv import LARGEST_SHAPE, from_arkit
 

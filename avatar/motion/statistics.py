@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from avatar.head.model import HeadModel
 from avatar.motion.expression_space import ExpressionSpace, fit_expressions
-from avatar.motion.rest import RestPose, find_mean, find_neutral
+from avatar.motion.neutral_pose import RestPose, find_mean, find_neutral
 from avatar.types import HeadParams
 
 

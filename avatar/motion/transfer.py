@@ -18,7 +18,7 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 
 from avatar.head.model import HeadModel
-from avatar.motion.rest import RestPose, find_mean, find_neutral, stacked
+from avatar.motion.neutral_pose import RestPose, find_mean, find_neutral, stacked
 from avatar.motion.statistics import MotionStatistics
 from avatar.types import HeadParams
 

@@ -31,12 +31,12 @@ from avatar.files.numbered import numbered, remove_longer
 from avatar.files.video import Sound, side_by_side, write_video
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
-from avatar.motion.rest import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
+from avatar.motion.neutral_pose import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
 from avatar.motion.training_distance import DistanceStrip, distances_csv
 from avatar.motion.transfer import NEUTRAL_MODES, Transfer, transfer_motion
 from avatar.pipeline.backdrop import Backdrop
 from avatar.runs.run import versions
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera
 
 FOCAL_TOLERANCE = 0.1  # relative difference of the field of view from which a warning is worth its line

@@ -17,7 +17,7 @@ from avatar.pose_refinement.record import frames_csv, sheet, summary
 from avatar.pose_refinement.refine import fingerprint, refine_subject
 from avatar.runs.model_registry import refuse_features
 from avatar.runs.run import Run
-from data_prep.formats.refined import check_target, frame_numbers, write_folder
+from data_prep.formats.refined_folder import check_target, frame_numbers, write_folder
 
 REFINED_FOLDER = "refined"
 MANY_PASSES = 2 * FIRST_PASSES

@@ -16,13 +16,13 @@ from avatar.data.json_values import parse_number
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import read_json
+from avatar.files.read import read_json
 from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.train.cost_estimate import measure_cost
+from avatar.train.frame_order import within_epochs
 from avatar.train.objective import choose_perceptual
-from avatar.train.order import within_epochs
-from data_prep.prepare.open import open_subject
+from data_prep.prepare.open_subject import open_subject
 
 ROUNDS_FOLDER = "rounds"
 PLAN_FORMAT = 1

@@ -10,19 +10,19 @@ from pathlib import Path
 from tqdm import tqdm
 
 from avatar.errors import UserError
+from avatar.files.environment import cache_folder, named_path
 from avatar.files.names import safe_name
-from avatar.files.places import cache_folder, named_path
 from avatar.files.third_party import TRACKING_FILES, require
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.formats.avatar_track import recognise
-from data_prep.prepare.contents import find_damage, write_contents
-from data_prep.prepare.open import HEAD_VARIABLE
+from data_prep.prepare.checksums import find_damage, write_contents
+from data_prep.prepare.open_subject import HEAD_VARIABLE
 from data_prep.progress import Item
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.pictures import is_footage, open_footage
 from data_prep.track.inputs import tracking_key
-from data_prep.track.segmentation import matte_network
-from data_prep.track.soft_mattes import check_matting
+from data_prep.track.mattes.matting_network import check_matting
+from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.track import Choices, track
 
 

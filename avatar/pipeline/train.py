@@ -16,22 +16,22 @@ from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.files.lock import locked
-from avatar.files.opening import shown_size
+from avatar.files.read import shown_size
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.open import check_data, moved_source
+from avatar.pipeline.open_inputs import check_data, moved_source
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.curves import CURVES_FILE
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
+from avatar.train.frame_order import within_epochs
 from avatar.train.objective import PerceptualTerm, choose_perceptual
-from avatar.train.order import within_epochs
 from avatar.train.trainer import save_avatar, train
-from data_prep.prepare.open import open_subject
+from data_prep.prepare.open_subject import open_subject
 
 # Adam's epsilon makes whole steps of gradients that are nothing but rounding.
 OTHER_ROUNDING = "pictures come out alike, not to the bit, and parameters that they hardly depend on may differ"

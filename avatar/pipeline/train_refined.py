@@ -16,7 +16,7 @@ from avatar.data.source import Source
 from avatar.files.lock import locked
 from avatar.files.names import safe_name
 from avatar.pipeline import OK
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 from avatar.pipeline.refine import refine_run
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, RoundTimes, steps_in_time
 from avatar.pipeline.train import resume_run, train_new

@@ -20,20 +20,20 @@ from torch import Tensor
 
 from avatar.compute.memory import check_memory
 from avatar.config import Config, config_from_dict
+from avatar.data.camera_rig import parse_rig
 from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
 from avatar.data.recording import TRACK_SHAPES, Recording, checked_tracks
-from avatar.data.rig import parse_rig
 from avatar.data.split import Split
 from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import safe_name
-from avatar.files.opening import MissingFile, open_file
+from avatar.files.read import MissingFile, open_file
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames, parse_expression_names
 from avatar.head.head_tensors import head_from_tensors, head_tensors
-from avatar.motion.rest import RestPose
+from avatar.motion.neutral_pose import RestPose
 from avatar.runs.checkpoint import check_fit, load_module, module_tensors
 from avatar.runs.memory_estimate import count_gaussians, drawing_needs
 from avatar.runs.model_registry import MODELS, make_avatar

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import read_text
+from avatar.files.read import read_text
 
 CURVES_FILE = "curves.csv"
 LOSSES = ("total", "frame", "mouth", "perceptual")  # weighted; the first is the sum of the others

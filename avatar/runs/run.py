@@ -23,11 +23,11 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import is_there, read_json
+from avatar.files.read import is_there, read_json
 from avatar.gaussians.base_model import Avatar
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.runs.trained import TrainedAvatar, load_avatar, runs_in
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar, runs_in
 from avatar.version import __version__
 
 RUN_FILE = "run.json"

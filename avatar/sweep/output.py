@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 
 from avatar.errors import UserError
-from avatar.files.opening import open_file
+from avatar.files.read import open_file
 
 MAX_BYTES = 2**22  # of each of the two files
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from avatar.config import load_config
 from avatar.errors import UserError
-from avatar.files.places import expanded
+from avatar.files.environment import expanded
 from avatar.files.plain_yaml import read_yaml
 
 MAX_BYTES, MAX_JOBS = 2**20, 100_000

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import MissingFile, read_json
+from avatar.files.read import MissingFile, read_json
 from avatar.sweep.output import end_of
 from avatar.sweep.spec import Job, Resources, Spec
 

@@ -16,15 +16,15 @@ from avatar.data.loader import FrameLoader
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
-from avatar.motion.rest import find_neutral
+from avatar.motion.neutral_pose import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
 from avatar.runs.checkpoint import Checkpoint, load_module, module_tensors, save_checkpoint
 from avatar.splat import CannotDraw, checked_drawings
 from avatar.train.condition_noise import make_noise
+from avatar.train.frame_order import frame_order
 from avatar.train.log import TrainingLog
 from avatar.train.objective import Objective, PerceptualTerm
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
-from avatar.train.order import frame_order
 from avatar.train.pose_corrections import PREFIX, make_pose_corrections
 from avatar.train.step import TrainState, non_finite_error
 from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor

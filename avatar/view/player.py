@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from avatar.runs.clips import Clip
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.motion_clip import Clip
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams
 from avatar.view.live import LiveFrame
 

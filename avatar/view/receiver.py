@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 from avatar.errors import UserError
 from avatar.head.model import matrix_from_6d
-from avatar.motion.rest import RestPose
+from avatar.motion.neutral_pose import RestPose
 from avatar.motion.transfer import retargeted
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.auth import equal_tokens
 from avatar.view.live import LiveFrame

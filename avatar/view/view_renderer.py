@@ -17,7 +17,7 @@ from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.controls import JOINT_FIELD, ExpressionControl, expression_controls, joint_ranges, posed
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import checked_drawings
 from avatar.types import Camera, HeadParams, Rendering
 

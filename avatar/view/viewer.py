@@ -19,7 +19,7 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.auth import LOCAL, AccessCheck
 from avatar.view.live import LiveTiming
 from avatar.view.messages import MessageCheck

@@ -17,9 +17,9 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.controls import joint_ranges
-from avatar.motion.rest import RestPose, find_neutral
+from avatar.motion.neutral_pose import RestPose, find_neutral
 from avatar.motion.transfer import retargeted
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams
 from avatar.view.live import LiveFrame
 from avatar.view.player import WEBCAM

@@ -17,7 +17,7 @@ const REFUSALS = {
 
 /** Events: "state", when `state` or `sentence` have changed. */
 export class FaceCamera extends EventTarget {
-  /** @param view  an AvatarView that is ready  @param worker  of watcher.js, no module  @param video  shows the camera */
+  /** @param view  an AvatarView that is ready  @param worker  of landmarker_worker.js, no module  @param video  shows the camera */
   constructor(view, worker, video = document.createElement("video")) {
     super();
     Object.assign(video, { muted: true, playsInline: true });

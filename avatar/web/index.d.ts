@@ -68,7 +68,7 @@ export class AvatarView extends EventTarget {
   screenshot(width?: number): Promise<Blob>; // a PNG of what is shown, drawn anew where a width is given
   close(): void;
 }
-/** A camera that drives a view, once. Event: "state". `worker` is of watcher.js, a classic one. Nothing leaves the page. */
+/** A camera that drives a view, once. Event: "state". `worker` is of landmarker_worker.js, a classic one. Nothing leaves the page. */
 export class FaceCamera extends EventTarget {
   constructor(view: AvatarView, worker: Worker, video?: HTMLVideoElement);
   readonly video: HTMLVideoElement; // the camera's picture

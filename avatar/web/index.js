@@ -1,10 +1,10 @@
 // <avatar-view src="anna.avatar">: an avatar in any page. README.md and index.d.ts describe the whole interface.
 import { FaceCamera } from "./camera.js";
 import { AvatarError } from "./core.js";
-import { steer } from "./steer.js";
+import { orbitControls } from "./orbit_controls.js";
 import { AvatarView } from "./view.js";
 
-export { AvatarError, AvatarView, FaceCamera, steer };
+export { AvatarError, AvatarView, FaceCamera, orbitControls };
 
 const BASE = new URL(".", import.meta.url);
 const INSIDE = `<style>:host{display:inline-block;width:256px;max-width:100%}
@@ -83,7 +83,7 @@ export class AvatarViewElement extends HTMLElement {
       const header = await view.ready;
       view.resize(header.size, canvas.clientWidth * devicePixelRatio);
       canvas.setAttribute("aria-label", `Avatar of ${header.name}. Arrow keys turn it.`);
-      this.#letGo = steer(view, canvas);
+      this.#letGo = orbitControls(view, canvas);
       view.addEventListener("drawn", () => this.dispatchEvent(new Event("drawn")));
       view.addEventListener("failed", ({ detail }) => this.#say(detail));
       this.dispatchEvent(new Event("load"));
@@ -129,7 +129,7 @@ export class AvatarViewElement extends HTMLElement {
   async startCamera(source) {
     this.#loaded; // throws
     this.#camera?.stop();
-    const camera = (this.#camera = new FaceCamera(this.#view, new Worker(new URL("watcher.js", BASE))));
+    const camera = (this.#camera = new FaceCamera(this.#view, new Worker(new URL("landmarker_worker.js", BASE))));
     await camera.start(source);
     return camera;
   }

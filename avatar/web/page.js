@@ -1,9 +1,9 @@
 // The page around a view: sliders, the recorded motion, pictures. Works from a file, without a network. The address may ask for
 // ?noui (the picture alone), ?autoplay, ?background=%23rrggbb, ?renderer=wasm or webgl, and ?width= in pixels.
 import { makeControls } from "./controls.js";
-import { connectCamera } from "./panel.js";
-import { connectStage } from "./stage.js";
-import { steer } from "./steer.js";
+import { connectCamera } from "./camera_panel.js";
+import { connectPageDisplay } from "./page_display.js";
+import { orbitControls } from "./orbit_controls.js";
 import { AvatarView } from "./view.js";
 
 const MOST_PIXELS = 640, LEAST_PIXELS = 160; // of a picture that moves
@@ -21,10 +21,10 @@ async function start() {
   window.avatar = view; // for the curious, and for tests
   view.addEventListener("failed", ({ detail }) => say(detail));
   const header = await view.ready;
-  steer(view, find("canvas"));
+  orbitControls(view, find("canvas"));
   const [presets, first, more] = ["presets", "first", "more"].map(find);
   const { putBack, isGazeHeld } = makeControls(view, header, { presets, first, more });
-  const putStageBack = connectStage(view, header, isGazeHeld, () => find("play").click());
+  const putStageBack = connectPageDisplay(view, header, isGazeHeld, () => find("play").click());
   view.addEventListener("drawn", () => say(""), { once: true });
   view.addEventListener("view", () => (find("guess").hidden = view.isSupported));
   connectBar(view, header, putBack, putStageBack);

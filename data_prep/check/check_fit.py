@@ -8,8 +8,8 @@ import numpy as np
 
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
+from data_prep.prepare.check_alignment import ADVICE
 from data_prep.prepare.mask_polarity import polarity_problems
-from data_prep.prepare.misfit import ADVICE
 
 # Of the size of the projected head. On clips whose tracking error is known (0.15 degrees, 0.4 mm, 2%) lips are off by less
 # than 0.018 and the mesh sticks out of the mask by less than 0.01.

@@ -9,8 +9,8 @@ import numpy as np
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, Severity
 from data_prep.check.motion import head_angles
-from data_prep.prepare.misfit import CUT_OFF, MAX_OUTSIDE
-from data_prep.prepare.still_parts import StillPart, still_parts
+from data_prep.prepare.check_alignment import CUT_OFF, MAX_OUTSIDE
+from data_prep.prepare.constant_parameters import StillPart, still_parts
 
 MAX_ROLL = 60.0  # degrees; people tilt their heads by 40
 MAX_CUT = 0.03  # of the upper edge; a mask that ends there is rounded

@@ -19,16 +19,16 @@ from avatar.head.model import HeadModel
 from data_prep.check.findings import Severity, frames_phrase
 from data_prep.check.view import View, look_at
 from data_prep.formats.detect import METRICAL_TRACKER, open_tracked_folder
-from data_prep.formats.division import ALL, FRONT
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, TRACKING, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder
+from data_prep.formats.train_test_split import ALL, FRONT
+from data_prep.prepare.check_alignment import SAMPLED_FRAMES, Judgement, judge
 from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
 from data_prep.prepare.masks import read_masks
-from data_prep.prepare.misfit import SAMPLED_FRAMES, Judgement, judge
 from data_prep.prepare.pairing import unusable
 from data_prep.progress import Progress, silent
 

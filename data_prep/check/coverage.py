@@ -12,7 +12,7 @@ from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.motion import HeadAngles, head_angles
-from data_prep.formats.division import divide
+from data_prep.formats.train_test_split import divide
 
 SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120
 NARROW_YAW = 20.0  # degrees; with less, ears and the sides of the nose are never seen

@@ -12,12 +12,12 @@ import numpy as np
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
+from data_prep.check.check_cameras import check_cameras
 from data_prep.check.check_files import check_files, lost_frames
 from data_prep.check.check_fit import check_fit
 from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
 from data_prep.check.check_motion import check_motion
-from data_prep.check.check_rig import check_rig
 from data_prep.check.check_tracking import check_tracking
 from data_prep.check.clip import Clip, read_clip
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
@@ -86,7 +86,7 @@ def check_tracked_folder(
     findings += check_files(clip) + check_tracking(clip) + check_motion(clip) + check_fit(clip)
     findings += check_images(clip)
     if assets is not None and (size := clip.size()) is not None:
-        findings += check_rig(clip, assets, size)
+        findings += check_cameras(clip, assets, size)
     findings += [Finding("note", "format", note, "nothing, if that is meant") for note in clip.source.notes]
     if not any(finding.severity == "error" for finding in findings):
         findings += lost_frames(clip)

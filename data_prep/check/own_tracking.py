@@ -6,7 +6,7 @@ import base64
 from pathlib import Path
 
 from avatar.errors import UserError
-from avatar.files.opening import read_bytes
+from avatar.files.read import read_bytes
 from avatar.html import Markup, data_table, element, section
 from data_prep.formats.avatar_track import read_info, recognise
 

@@ -25,8 +25,8 @@ import numpy as np
 
 from avatar.errors import UserError, refuse
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
+from avatar.files.read import is_there
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_files import FrameFiles, KindNames, find_numbered
 from data_prep.formats.frame_track import FrameTrack, Tracking, nearest_rotation, read_frames, vector

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from avatar.errors import UserError, refuse
-from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, nha, refined, vhap
-from data_prep.formats.division import ALL, FRONT
+from data_prep.formats import avatar_track, blendshapes, imavatar, insta, nersemble, nha, refined_folder, vhap
 from data_prep.formats.frame_files import find_frame_files
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, matte_notes
+from data_prep.formats.train_test_split import ALL, FRONT
 from data_prep.formats.transforms import ListedFrame, read_listings
 
 METRICAL_TRACKER = "metrical-tracker"
@@ -40,7 +40,7 @@ def open_tracked_folder(
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
         if cameras not in (None, ALL, FRONT):
             raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
-        return refined.open_folder(folder)
+        return refined_folder.open_folder(folder)
     is_listed = folder.is_dir() and (format is None or format in _LISTED)
     frames = read_listings(folder) if is_listed else []
     name = format or detect_format(folder, frames)

@@ -17,7 +17,7 @@ import numpy as np
 
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
-from avatar.files.opening import is_there, read_text
+from avatar.files.read import is_there, read_text
 from avatar.head.assets import HeadAssets
 from avatar.head.model import FLAME_PARENTS
 from avatar.types import IDENTITY_6D

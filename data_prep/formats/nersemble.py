@@ -20,17 +20,17 @@ from typing import NamedTuple
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.environment import cache_folder
 from avatar.files.names import safe_name
-from avatar.files.places import cache_folder
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK
-from data_prep.formats.division import ALL, chosen_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames
 from data_prep.formats.frame_track import FrameTrack, Tracking, read_frames
 from data_prep.formats.nersemble_cameras import CALIBRATION, CalibratedCamera, read_cameras
 from data_prep.formats.nersemble_tracking import FILES, SequenceTracking, find_tracking, read_tracking
 from data_prep.formats.root_pose import Joint
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
+from data_prep.formats.train_test_split import ALL, chosen_cameras
 from data_prep.formats.video_frames import WantedVideo, decode_videos, look_into
 
 NAME = "NeRSemble"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.opening import read_text
+from avatar.files.read import read_text
 from data_prep.formats.frame_track import BadFrame, pinhole_of, rigid_motion, vector
 
 CALIBRATION = Path("calibration", "camera_params.json")

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
+from avatar.files.read import is_there
 from data_prep.formats.frame_track import BadFrame, FrameTrack, nearest_rotation, rows_of, vector
 from data_prep.formats.nersemble_cameras import CalibratedCamera
 from data_prep.formats.root_pose import Joint, rotation_matrix, six_d, turned_with_neck

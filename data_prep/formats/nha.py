@@ -24,8 +24,8 @@ import numpy as np
 
 from avatar.data.images import EVERY_LABEL
 from avatar.errors import UserError
-from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
+from avatar.files.read import is_there
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK, ROOT
 from data_prep.formats.frame_files import ALPHA, FrameFiles, KindNames, transparent

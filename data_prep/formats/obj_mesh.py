@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from avatar.errors import UserError
-from avatar.files.opening import read_bytes
+from avatar.files.read import read_bytes
 from data_prep.formats.frame_track import BadFrame, vector
 
 MAX_BYTES = 2**24  # FLAME's meshes have 0.5 MB

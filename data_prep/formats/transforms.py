@@ -20,7 +20,7 @@ import numpy as np
 from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS
 from avatar.errors import UserError
-from avatar.files import opening
+from avatar.files import read
 from avatar.files.names import natural_order
 from data_prep.formats.frame_track import BadFrame, rigid_motion, vector
 
@@ -117,9 +117,9 @@ def read_listings(folder: Path) -> list[ListedFrame]:
         split: path
         for split in SPLITS
         for path in (folder / f"transforms_{split}.json", folder / split / "flame_params.json")
-        if opening.is_there(path)
+        if read.is_there(path)
     }
-    whole = [path for path in (folder / "transforms.json", folder / "flame_params.json") if opening.is_there(path)]
+    whole = [path for path in (folder / "transforms.json", folder / "flame_params.json") if read.is_there(path)]
     frames: dict[Path, ListedFrame] = {}
     for split in sorted(divided, key=("val", "train", "test").index):
         frames |= _read_listing(divided[split], split, folder)
@@ -164,7 +164,7 @@ def _read_listing(file: Path, split: str | None, root: Path) -> dict[Path, Liste
 def read_json(file: Path) -> Any:
     """Raises UserError when the file is unreadable, larger than a listing can be, or nested like no listing is."""
     try:
-        return opening.read_json(file, MAX_BYTES)
+        return read.read_json(file, MAX_BYTES)
     except UserError as error:
         raise UserError(f"{error}; copy or export it again") from None
 

@@ -30,11 +30,11 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK, ROOT
-from data_prep.formats.division import ALL, chosen_cameras
 from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, read_frames, vector
 from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
 from data_prep.formats.tracked_folder import Shot, TrackedFolder, existing, listings_of, matte_notes
+from data_prep.formats.train_test_split import ALL, chosen_cameras
 from data_prep.formats.transforms import (
     OPENCV_FROM_OPENGL,
     ListedFrame,

@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from avatar.errors import UserError
-from avatar.files import opening
+from avatar.files import read
 from avatar.files.atomic import temporary_name
 from data_prep.ffmpeg import Decoder, count_pictures, describe, first_picture, rate_of
 
@@ -49,7 +49,7 @@ def look_into(path: Path, folder: Path) -> VideoFacts:
 
     Raises UserError where no picture can be had from it.
     """
-    opening.check_file(path, None)
+    read.check_file(path, None)
     noted = _noted(folder)
     if noted is not None and noted[0] == _identity(path):
         return noted[1]
@@ -98,9 +98,9 @@ def _check_room(root: Path, videos: Sequence[WantedVideo], total: int) -> None:
             sizes[kind] = len(_png(video, next(_pictures(video))[1]))
         needed += sizes[kind] * len(video.pictures)
     free = shutil.disk_usage(root).free
-    sentence = f"{total} pictures of {len(videos)} videos take about {opening.shown_size(needed)} in {root}"
+    sentence = f"{total} pictures of {len(videos)} videos take about {read.shown_size(needed)} in {root}"
     if needed > free:
-        raise UserError(f"{sentence}, where {opening.shown_size(free)} are free; name another cache with AVATAR_CACHE")
+        raise UserError(f"{sentence}, where {read.shown_size(free)} are free; name another cache with AVATAR_CACHE")
     print(sentence, file=sys.stderr)
 
 
@@ -164,7 +164,7 @@ def _stamp(video: WantedVideo) -> str:
 def _noted(folder: Path) -> tuple[list[int | str], VideoFacts, tuple[int, ...]] | None:
     """The video that a folder's pictures are of, its facts, and which pictures; None where that is not known."""
     try:
-        raw = opening.read_json(folder / _STAMP_FILE)
+        raw = read.read_json(folder / _STAMP_FILE)
         return raw["video"], VideoFacts(*raw["facts"]), tuple(raw["pictures"])
     except (UserError, KeyError, TypeError):
         return None

@@ -23,7 +23,7 @@ from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.expression_kind import is_statistical
 from data_prep.track.fit.landmark_fit import LandmarkFit, faded, is_rigid, point_units, weighted_landmarks
-from data_prep.track.fit.levenberg import Term, concatenated, minimise
+from data_prep.track.fit.levenberg_marquardt import Term, concatenated, minimise
 from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.priors import expected, score_targets

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from avatar.data.manifest import MANIFEST_VERSION
+from avatar.files.environment import cache_folder
 from avatar.files.names import safe_name
-from avatar.files.places import cache_folder
 from data_prep.formats.frame_files import FrameFiles
 
 

@@ -11,7 +11,7 @@ from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, FrameFiles
 from data_prep.formats.tracked_folder import Shot
-from data_prep.prepare.misfit import SAMPLED_OF_A_CAMERA
+from data_prep.prepare.check_alignment import SAMPLED_OF_A_CAMERA
 
 DARK = 0.1  # of the median camera's brightness, inside the mattes
 

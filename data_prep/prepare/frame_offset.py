@@ -19,9 +19,9 @@ from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.check_alignment import judge_sample
 from data_prep.prepare.image_motion import motion_residuals
 from data_prep.prepare.masks import read_masks
-from data_prep.prepare.misfit import judge_sample
 from data_prep.prepare.projection import filled_lips, lip_faces, project_head, silhouette
 
 RADIUS = 4  # offsets tried on each side; the outermost ones only serve to see that the best is a minimum

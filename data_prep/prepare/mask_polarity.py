@@ -16,9 +16,9 @@ from avatar.data.split import evenly_spread
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles, describe_numbers
 from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.check_alignment import SAMPLED_FRAMES
 from data_prep.prepare.mask_overlap import MeshProjector, measured_size
 from data_prep.prepare.mask_values import WHAT, place_of
-from data_prep.prepare.misfit import SAMPLED_FRAMES
 from data_prep.prepare.projection import silhouette
 
 MAX_ON_HEAD, MIN_IN_CORNERS, MIN_COVERED = 0.25, 0.75, 0.35  # of an inverted mask, mean opacity; the last of all of it

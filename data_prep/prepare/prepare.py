@@ -18,22 +18,22 @@ from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.formats.detect import open_tracked_folder
-from data_prep.formats.division import divide
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
+from data_prep.formats.train_test_split import divide
 from data_prep.prepare.cache import default_location, input_hash
+from data_prep.prepare.camera_rig import FoundCameras, Pose, find_rig
+from data_prep.prepare.check_alignment import judge_sample, refuse_misplaced_cameras
+from data_prep.prepare.constant_parameters import still_parts
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import detect_offset
 from data_prep.prepare.inspect_images import Inspection, composited_background, inspect_images
 from data_prep.prepare.mask_polarity import polarity_problems
 from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.masks import derive_masks
-from data_prep.prepare.misfit import judge_sample, refuse_misplaced_cameras
 from data_prep.prepare.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from data_prep.prepare.projection import lip_faces
-from data_prep.prepare.rig import FoundRig, Pose, find_rig
-from data_prep.prepare.still_parts import still_parts
 from data_prep.prepare.write_prepared import is_current, write_prepared
 
 HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
@@ -280,7 +280,7 @@ def _data_hash(
     pairing: Pairing,
     arrays: dict[str, np.ndarray],
     intrinsics: np.ndarray,
-    found: FoundRig | None,
+    found: FoundCameras | None,
 ) -> str:
     digest = hashlib.sha256(intrinsics.tobytes())
     if found is not None:

@@ -15,7 +15,7 @@ from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_mani
 from avatar.errors import UserError
 from avatar.files.atomic import whole_folder
 from avatar.files.names import safe_name
-from data_prep.prepare.contents import find_damage, write_contents
+from data_prep.prepare.checksums import find_damage, write_contents
 
 
 def is_current(target: Path, input_hash: str, is_chosen: bool, say: Callable[[str], object] = lambda _: None) -> bool:

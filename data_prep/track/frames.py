@@ -14,11 +14,11 @@ from avatar.compute.workers import in_order
 from avatar.errors import UserError
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress
-from data_prep.track.despill import despilled
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.first_pass import FirstPass
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View
-from data_prep.track.user_mattes import OPAQUE, OwnMattes, share_on
+from data_prep.track.mattes.despill import despilled
+from data_prep.track.mattes.user_mattes import OPAQUE, OwnMattes, share_on
 
 # JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]

@@ -10,7 +10,7 @@ from avatar.head.assets import HeadAssets
 from data_prep.track.faces.embedding import official_file
 from data_prep.track.faces.rendered_embedding import RECIPE
 from data_prep.track.footage.source import Footage
-from data_prep.track.segmentation import matte_network
+from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.stage_folder import hash_of
 
 STAGES_VERSION = 13  # raised when what a stage makes changes

@@ -15,7 +15,7 @@ from data_prep.track.faces.landmark_groups import BROWS, IRISES, LEFT_IRIS, LIDS
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.result import Fit
-from data_prep.track.outline import Outline
+from data_prep.track.mattes.steadiness import Outline
 
 GRADES = ("good", "fair", "poor")
 GROUPS = {"lips": LIPS, "lids": LIDS, "brows": BROWS, "nose": NOSE}

@@ -18,7 +18,7 @@ from typing import Any
 from avatar.errors import UserError
 from avatar.files.lock import LOCK_FILE, locked
 from avatar.files.names import shortened
-from avatar.files.opening import read_json
+from avatar.files.read import read_json
 
 RECORD = ".stage.json"
 _MAX_RECORD = 2**24

@@ -41,13 +41,13 @@ from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, View, check_span
 from data_prep.track.frames import in_view
 from data_prep.track.inputs import look_inputs, tracking_key
+from data_prep.track.mattes.matting_network import check_matting
+from data_prep.track.mattes.segmentation_network import matte_network
+from data_prep.track.mattes.user_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 from data_prep.track.quality import judge
-from data_prep.track.segmentation import matte_network
-from data_prep.track.soft_mattes import check_matting
 from data_prep.track.stage_folder import StageFolder, growing
 from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
 from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
-from data_prep.track.user_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
 
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"

@@ -13,9 +13,6 @@ from avatar.files.third_party import ThirdPartyFile
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.progress import Progress
-from data_prep.track import despill
-from data_prep.track.clip_mattes import write_mattes
-from data_prep.track.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.first_pass import FirstPass
@@ -35,13 +32,16 @@ from data_prep.track.frames import (
     write_masks,
 )
 from data_prep.track.inputs import head_inputs
-from data_prep.track.masks import head_mask, mouth_mask, neck_ring
-from data_prep.track.neck_zones import Zones, zones_of
-from data_prep.track.outline import Outline, measure_outline
+from data_prep.track.masks.clothes import CLIP_FRAMES, learn_colours
+from data_prep.track.masks.head_and_mouth import head_mask, mouth_mask, neck_ring
+from data_prep.track.masks.neck_zones import Zones, zones_of
+from data_prep.track.mattes import despill
+from data_prep.track.mattes.clip_mattes import write_mattes
+from data_prep.track.mattes.steadiness import Outline, measure_outline
+from data_prep.track.mattes.user_mattes import OwnMattes
 from data_prep.track.overlay import FrameParts, write_overlay
 from data_prep.track.stage_folder import StageFolder
 from data_prep.track.torso import LEAST_FOLLOWED, Picture, TorsoTracker, neck_of, with_torso
-from data_prep.track.user_mattes import OwnMattes
 
 DESPILLED = "despilled"  # the stage that stands in for the frames
 

@@ -48,12 +48,12 @@ from avatar.runs.checkpoint import (
     save_checkpoint,
 )
 from avatar.runs.model_registry import make_avatar
+from avatar.train.frame_order import frame_order
 from avatar.train.objective import Objective, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
-from avatar.train.order import frame_order
 from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
-from data_prep.prepare.open import find_head, open_subject
+from data_prep.prepare.open_subject import find_head, open_subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,7 +11,7 @@ PYTHONPATH=scripts/paper "$bin/python" - "$folder" <<'PYTHON'
 import sys
 from pathlib import Path
 
-import conditioning, convergence, cross, slicing, table, uncertainty
+import conditioning, convergence, cross_reenactment, slicing, table, uncertainty
 
 folder = Path(sys.argv[1])
 out = ["--out", str(folder / "paper")]
@@ -22,13 +22,13 @@ statuses = [
     table.main(["table1", *together]),
     table.main(["ablation", *together, "--systems", "HyperGaussians n=2"]),
     uncertainty.main([*together, "--frames", "2"]),
-    cross.main([*together, "--frames", "2"]),
+    cross_reenactment.main([*together, "--frames", "2"]),
     convergence.main([*small, "--seconds", "0.2", "0.5", "--frames", "2"]),
     conditioning.main([*out, "--sizes", "1", "8", "--gaussians", "300", "--repeats", "3"]),
     slicing.main(out),
 ]
 sys.exit(max(statuses))
 PYTHON
-for name in table1 ablation slicing conditioning convergence uncertainty cross; do
+for name in table1 ablation slicing conditioning convergence uncertainty cross_reenactment; do
   for suffix in md csv png; do test -s "$folder/paper/$name.$suffix"; done
 done

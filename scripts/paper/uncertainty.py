@@ -35,7 +35,7 @@ from avatar.data.loader import FrameLoader
 from avatar.gaussians.hyper import HyperHead
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.losses.metrics import squared_error
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 from avatar.runs.run import RUN_FILE, Run
 from avatar.splat.sh import C0
 

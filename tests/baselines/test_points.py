@@ -16,7 +16,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.gaussians.encoding import positional_encoding
 from avatar.runs.checkpoint import load_module, module_tensors, newest_checkpoint
 from avatar.runs.model_registry import make_avatar
-from avatar.runs.trained import load_avatar
+from avatar.runs.trained_avatar import load_avatar
 from avatar.train.optimizer import make_optimizer
 from avatar.types import HeadParams
 

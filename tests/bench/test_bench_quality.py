@@ -17,7 +17,7 @@ from avatar.errors import UserError
 from avatar.evaluation.evaluate import evaluate
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 
 pytestmark = pytest.mark.slow
 

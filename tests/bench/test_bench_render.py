@@ -13,7 +13,7 @@ from avatar.cli import main
 from avatar.errors import UserError
 from avatar.render import Renderer
 from avatar.runs.run import open_trained
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ from avatar.files.video import Sound, write_video
 from avatar.motion.drive import Drive
 from avatar.pipeline.backdrop import parse_backdrop
 from avatar.pipeline.reenact import drive_sound
-from avatar.runs.trained import load_avatar
+from avatar.runs.trained_avatar import load_avatar
 
 FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
 

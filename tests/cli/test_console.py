@@ -91,7 +91,7 @@ def test_a_user_without_a_home_and_without_a_name_has_a_cache(tmp_path: Path) ->
     enter = ["unshare", "--user", "--map-user=12345", "--map-group=12345"]
     if shutil.which("unshare") is None or subprocess.run([*enter, "true"], capture_output=True).returncode != 0:
         pytest.skip("unshare makes no users here")
-    script = "from avatar.files.places import cache_folder; print(cache_folder())"
+    script = "from avatar.files.environment import cache_folder; print(cache_folder())"
     where = {"PATH": os.environ["PATH"], "TMPDIR": str(tmp_path)}
     done = subprocess.run([*enter, sys.executable, "-c", script], env=where, capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == (f"{tmp_path / 'avatar-12345'}\n", "")

@@ -23,7 +23,7 @@ from avatar.config import Config
 from avatar.files.third_party import FOLDER_VARIABLE
 from avatar.files.video import video_writer
 from data_prep.formats.avatar_track import TrackingInfo
-from data_prep.prepare.open import HEAD_VARIABLE
+from data_prep.prepare.open_subject import HEAD_VARIABLE
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.quality import Figure
 
@@ -106,7 +106,7 @@ def test_one_command_makes_the_page_and_again_does_nothing_twice(
     first = page.read_bytes()
     assert b"<title>me" in first
     figures = (page.parent / "run" / "eval" / "results.json").stat().st_mtime_ns
-    monkeypatch.setattr("avatar.commands.finish.evaluate", None)  # it is not called
+    monkeypatch.setattr("avatar.commands.held_out_figures.evaluate", None)  # it is not called
     again = avatar("create", video, "--head", tracked_folder / "head_model", "--anyway")
     assert "is complete (12 steps)" in again and page.read_bytes() == first
     assert (page.parent / "run" / "eval" / "results.json").stat().st_mtime_ns == figures

@@ -9,13 +9,13 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from rig_folder import SEQUENCES, write_listings, write_sequence
+from camera_rig_folder import SEQUENCES, write_listings, write_sequence
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from avatar.data.subject import Subject
-from avatar.runs.trained import load_avatar
+from avatar.runs.trained_avatar import load_avatar
 
 
 @pytest.fixture(scope="module")

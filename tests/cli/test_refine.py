@@ -19,7 +19,7 @@ from tracked_folder import write_tracked_folder
 from avatar.commands import train
 from avatar.data.source import Source
 from avatar.pipeline import refine_plan, train_refined
-from avatar.pipeline.open import source_of
+from avatar.pipeline.open_inputs import source_of
 from avatar.pose_refinement import refine as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from rig_folder import CENTRE, axis_angle, frame
+from camera_rig_folder import CENTRE, axis_angle, frame
 from tracked_folder import SHAPE_COEFFICIENTS, motion, render, rotation, write_head_model
 
 from avatar.data.source import Source

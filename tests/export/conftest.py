@@ -11,7 +11,7 @@ from browsers import chromium
 from lively import lively_avatar
 
 from avatar.export.web_page import write_page
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from lively import lively_avatar
 from avatar.export.default_view import front_camera
 from avatar.export.web_page import write_web_avatar
 from avatar.head.model import matrix_from_6d
-from avatar.motion.rest import RestPose
+from avatar.motion.neutral_pose import RestPose
 from avatar.motion.transfer import retargeted
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 from avatar.view.packets import BLENDSHAPES, FrameReader
 from avatar.view.webcam import moved_camera

@@ -18,12 +18,12 @@ import trimesh
 from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
 
-from avatar.export.bake import bake_texture
+from avatar.export.bake_texture import bake_texture
 from avatar.export.glb import encode_glb
 from avatar.export.movie import limits_of, path_camera
 from avatar.export.ply import FIELDS, encode_ply
 from avatar.motion.orbit import seen_from
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, Gaussians
 
 

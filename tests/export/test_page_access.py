@@ -11,7 +11,7 @@ from access import OPEN, SIZES, violations
 from pages import until
 
 from avatar.export.web_page import write_page
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 # All that the page shows at one time or another; the shade over the picture hides from axe-core what lies below.
 SHOW_ALL = f"""() => {{

@@ -20,7 +20,7 @@ from pages import says, shown, until
 
 from avatar.export.mediapipe_pack import PACK, encode_pack
 from avatar.export.web_page import write_page, write_web_avatar
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 FAKE = {
     "vision_bundle.mjs": (Path(__file__).parent / "fake_landmarker.mjs").read_bytes(),

@@ -11,7 +11,7 @@ from pages import shown, until
 
 from avatar.export import default_view
 from avatar.export.default_view import front_camera, neck_fade, neck_heights
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 CHANGED = "(name) => Math.abs(document.querySelector(`input[name='${name}']`).value - 0)"
 

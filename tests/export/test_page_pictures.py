@@ -17,7 +17,7 @@ from pages import until
 
 from avatar.export.default_view import front_camera, with_faded_neck
 from avatar.export.web_page import write_page
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 WIDTHS = """() => {
   window.widths = [];

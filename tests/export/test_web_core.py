@@ -19,7 +19,7 @@ from avatar.errors import UserError
 from avatar.export.default_view import with_faded_neck
 from avatar.export.web_page import write_web_avatar
 from avatar.motion.orbit import orbited
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams
 
 pytestmark = pytest.mark.slow
@@ -171,4 +171,6 @@ def test_the_package_lists_every_module_that_it_needs() -> None:
         text = (WEB / name).read_text()
         named = re.findall(r'from "\./([\w.]+)"|new URL\("([\w.]+)", BASE\)', text)
         needed += [a or b for a, b in named if (a or b).endswith(".js") and (a or b) not in found]
-    assert found | {"avatar.wasm", "index.d.ts"} == listed and {"camera.js", "watcher.js", "worker.js"} <= found
+    assert (
+        found | {"avatar.wasm", "index.d.ts"} == listed and {"camera.js", "landmarker_worker.js", "worker.js"} <= found
+    )

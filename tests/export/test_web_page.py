@@ -19,7 +19,7 @@ from avatar.export.default_view import front_camera, with_faded_neck
 from avatar.export.web_page import bundle, script_text, write_page, write_web_avatar
 from avatar.motion.controls import expression_controls, joint_ranges, posed
 from avatar.motion.orbit import orbited
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 # A pose that blends is drawn anew in every frame of the browser; what has been still for so long has come to rest.
 NEW_PICTURE = """async () => {

@@ -17,7 +17,7 @@ from tracked_folder import write_tracked_folder
 from avatar.errors import refuse
 from avatar.head.assets import load_head_assets
 from avatar.runs.avatar_file import AVATAR_FILE, read_avatar_file, write_avatar_file
-from avatar.runs.trained import load_avatar
+from avatar.runs.trained_avatar import load_avatar
 from avatar.sweep.spec import read_spec
 from data_prep.formats import avatar_track
 from data_prep.track.faces.embedding import OFFICIAL_FILE, official_embedding

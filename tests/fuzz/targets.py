@@ -45,7 +45,7 @@ from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras
 from data_prep.formats.obj_mesh import read_mesh
 from data_prep.formats.root_pose import Joint
 from data_prep.prepare.prepare import prepare
-from data_prep.track.rig.gha_folder import read_calibration
+from data_prep.track.camera_rig.gha_folder import read_calibration
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
 

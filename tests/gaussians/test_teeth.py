@@ -14,7 +14,7 @@ from avatar.head.model import HeadModel
 from avatar.head.teeth import GRID, ROWS
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.memory_estimate import count_gaussians
-from avatar.runs.trained import TrainedAvatar, load_avatar
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 
 TEETH = "model.teeth=true"
 PLAIN = "model.teeth=false"

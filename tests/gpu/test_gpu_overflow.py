@@ -29,7 +29,7 @@ from avatar.evaluation.protocol import ImageFormat
 from avatar.pose_refinement import refine as refine_module
 from avatar.pose_refinement.refine import _Work, frozen
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import CannotDraw, gpu_buffers
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module

@@ -13,7 +13,7 @@ from lively import lively_avatar
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.view_renderer import Setting, ViewRenderer
 
 

@@ -19,7 +19,7 @@ from avatar.head import assets
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.rasterize import rasterize_mesh
 from avatar.head.unwrap import NoLayout, unwrap
-from avatar.runs.trained import load_avatar
+from avatar.runs.trained_avatar import load_avatar
 
 EYES = np.array([[0.03, 0.03, 0.06], [-0.03, 0.03, 0.06]])
 RASTER = 512

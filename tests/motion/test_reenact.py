@@ -4,7 +4,7 @@ import torch
 from heads import OPEN, grid_head, mouth_head, rest_params
 
 from avatar.head.model import HeadModel
-from avatar.motion.rest import RestPose, find_mean, frame_rest
+from avatar.motion.neutral_pose import RestPose, find_mean, frame_rest
 from avatar.pipeline.reenact import say_open_lips
 
 

@@ -9,7 +9,7 @@ from heads import grid_head, rest_params
 
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.expression_space import fit_expressions
-from avatar.motion.rest import RestPose, find_mean, find_neutral
+from avatar.motion.neutral_pose import RestPose, find_mean, find_neutral
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.motion.transfer import TRANSFERS, retargeted, transfer_motion
 from avatar.pose_refinement.motion import rotation

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import conditioning
 import convergence
-import cross
+import cross_reenactment
 import numpy as np
 import pytest
 import slicing
@@ -21,7 +21,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.errors import UserError
 from avatar.losses.metrics import squared_error
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
 
 pytestmark = pytest.mark.slow
@@ -142,7 +142,7 @@ def test_maps_are_blended_as_colours_are_and_the_variance_is_arbitrary(folder: P
 
 
 @pytest.mark.slow
-def test_uncertainty_and_cross_leave_what_they_say(folder: Path, tmp_path: Path) -> None:
+def test_uncertainty_and_cross_reenactment_leave_what_they_say(folder: Path, tmp_path: Path) -> None:
     words = [*words_of(folder, tmp_path), "--side-by-side"]
     assert uncertainty.main([*words, "--frames", "2"]) == 0
     found = lines(tmp_path / "uncertainty.csv")
@@ -150,20 +150,20 @@ def test_uncertainty_and_cross_leave_what_they_say(folder: Path, tmp_path: Path)
     assert {line["run"] for line in found} == {"someone, seed 0"}
     assert "| someone, seed 0 | the error itself | +1.00 |" in (tmp_path / "uncertainty.md").read_text()
 
-    assert cross.main([*words, "--frames", "2", "--systems", "HyperGaussians n=8"]) == 0
-    shown = lines(tmp_path / "cross.csv")
+    assert cross_reenactment.main([*words, "--frames", "2", "--systems", "HyperGaussians n=8"]) == 0
+    shown = lines(tmp_path / "cross_reenactment.csv")
     assert [(line["driver"], line["avatar"]) for line in shown] == [("someone", "someone, HyperGaussians n=8")] * 2
     assert len(list((tmp_path / "jobs").iterdir())) == 1  # trained once for both
-    for name in ("uncertainty", "cross"):
+    for name in ("uncertainty", "cross_reenactment"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit, match="there is no system 'NDGS'; there are FlashAvatar"):
-        cross.main([*words, "--systems", "NDGS"])
+        cross_reenactment.main([*words, "--systems", "NDGS"])
 
 
 def test_frames_of_a_driver_differ() -> None:
     expressions = torch.tensor([[0.0, 0.0], [0.1, 0.3], [5.0, 0.0], [4.9, 0.0], [0.0, 2.0]])
-    assert cross.farthest(expressions, 3) == [0, 2, 4]
-    assert cross.farthest(expressions, 9) == [0, 1, 2, 3, 4]
+    assert cross_reenactment.farthest(expressions, 3) == [0, 2, 4]
+    assert cross_reenactment.farthest(expressions, 9) == [0, 1, 2, 3, 4]
 
 
 def test_convergence_goes_on_from_its_last_mark(folder: Path, tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from avatar.export.glb import encode_glb
 from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.motion.expression_space import fit_expressions
-from avatar.motion.rest import find_mean
+from avatar.motion.neutral_pose import find_mean
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 
 @pytest.fixture(scope="module")

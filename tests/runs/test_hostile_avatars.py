@@ -26,7 +26,7 @@ from avatar.export.web_file import encode_avatar
 from avatar.files.names import MAX_NAME_BYTES, safe_name, shortened
 from avatar.runs.avatar_file import AVATAR_FILE, read_avatar_file, write_avatar_file
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
-from avatar.runs.trained import load_avatar
+from avatar.runs.trained_avatar import load_avatar
 
 HOSTILE_NAMES = {
     "a folder above": "../outside/index",

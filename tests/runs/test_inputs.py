@@ -13,7 +13,7 @@ from small_runs import train_small
 
 import avatar
 from avatar.errors import UserError
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from lively import lively_avatar
 from avatar.errors import UserError
 from avatar.motion.controls import expression_controls, posed
 from avatar.motion.orbit import orbited
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Rendering
 
 

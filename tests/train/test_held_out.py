@@ -14,10 +14,10 @@ from avatar.data.split import Split
 from avatar.data.subject import FramePixels, Subject
 from avatar.gaussians.head_rotation import learned_turning
 from avatar.head.assets import HeadAssets
-from avatar.motion.rest import find_neutral
+from avatar.motion.neutral_pose import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import newest_checkpoint
-from avatar.runs.trained import TrainedAvatar, load_avatar
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 from avatar.train.objective import choose_perceptual
 from avatar.train.trainer import train
 from avatar.types import IDENTITY_6D

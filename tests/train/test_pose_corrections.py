@@ -11,7 +11,7 @@ from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, scr
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from small_runs import small_config, train_small
 
-from avatar.data.rig import RigCamera
+from avatar.data.camera_rig import RigCamera
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.motion import HeadPose, moved_pose

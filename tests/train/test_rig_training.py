@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from rig_folder import write_single
+from camera_rig_folder import write_single
 from small_runs import SMALL
 
 from avatar.cli import main
 from avatar.data.recording import Recording
-from avatar.pipeline.open import open_run
+from avatar.pipeline.open_inputs import open_run
 from avatar.runs.avatar_file import read_avatar_file
 from avatar.runs.checkpoint import newest_checkpoint
 

@@ -12,8 +12,8 @@ import torch
 from lively import lively_avatar, lively_run
 
 from avatar.head.expression_names import ExpressionNames
-from avatar.runs.clips import own_clip
-from avatar.runs.trained import TrainedAvatar, load_avatar
+from avatar.runs.motion_clip import own_clip
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 
 
 @pytest.fixture(scope="session")

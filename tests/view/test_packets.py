@@ -12,7 +12,7 @@ import pytest
 import torch
 from stream_packets import bundle, live_link, osc
 
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.packets import LIVE_LINK, FrameReader, PacketError
 
 

@@ -20,7 +20,7 @@ from lively import lively_run
 from view_client import TOKEN, WIDTH, Page, Started, started
 from waiting import until
 
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.view_renderer import ViewRenderer

@@ -14,7 +14,7 @@ from stream_packets import live_link
 from waiting import until
 
 from avatar.errors import UserError
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view import receiver as receiver_module
 from avatar.view.packets import MAX_LINE, FrameReader
 from avatar.view.receiver import MAX_SENDERS, SHARE, Receiver, Throttle

@@ -12,8 +12,8 @@ from lively import lively_avatar
 
 from avatar.motion.controls import posed
 from avatar.motion.orbit import orbited
-from avatar.runs.clips import own_clip
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.motion_clip import own_clip
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.live import LiveFrame
 from avatar.view.player import NEUTRAL, STREAM, Player
 from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer, to_bytes

@@ -22,7 +22,7 @@ from waiting import until
 
 from avatar.commands.view import address, checked_url
 from avatar.motion.orbit import orbited
-from avatar.runs.trained import TrainedAvatar
+from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.player import Player
 from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 from avatar.view.viewer import LARGEST, Viewer, padded

@@ -16,7 +16,7 @@ from waiting import until
 
 from avatar.errors import UserError
 from avatar.head.model import matrix_from_6d
-from avatar.runs.trained import TrainedAvatar, load_avatar
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 from avatar.types import HeadParams
 from avatar.view.live import LiveFrame, LiveTiming
 from avatar.view.player import WEBCAM, Player

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
-from avatar.files.opening import is_there
 from avatar.files.pickles import load_npz
+from avatar.files.read import is_there
 from avatar.head.assets import HeadAssets
 from avatar.head.find import find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE

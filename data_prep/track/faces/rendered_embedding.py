@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from avatar.errors import UserError
-from avatar.files.places import cache_folder
+from avatar.files.environment import cache_folder
 from avatar.files.third_party import FACE_LANDMARKER
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces.embedding import LandmarkEmbedding, load_embedding, save_embedding
 from data_prep.track.faces.landmark_groups import NUM_MESH
-from data_prep.track.faces.tinted_heads import render_tinted_heads
+from data_prep.track.faces.synthetic_heads import render_tinted_heads
 
 Landmarker = Callable[[UInt8[np.ndarray, "H W 3"]], Float32[np.ndarray, "478 3"] | None]
 """One picture in, its landmarks in pixels out; None where there is no face."""

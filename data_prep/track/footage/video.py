@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from avatar.errors import UserError
-from avatar.files.opening import open_file
+from avatar.files.read import open_file
 from data_prep.ffmpeg import Decoder, Shown, describe, first_picture, rate_of
 from data_prep.track.footage.source import (
     LAID_OVER_GREY,

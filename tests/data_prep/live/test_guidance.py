@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posing import picture, posed
 
-from data_prep.live.guidance import ENDS, PATIENCE, PROMPTS, Adviser, Seen, measures, reaches
+from data_prep.live.recording_guidance import ENDS, PATIENCE, PROMPTS, Adviser, Seen, measures, reaches
 from data_prep.track.faces.detect import Face
 
 PICTURE = picture()

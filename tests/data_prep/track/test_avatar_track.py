@@ -19,7 +19,7 @@ from avatar.head.assets import load_head_assets
 from data_prep.check.folder import check_tracked_folder
 from data_prep.formats import avatar_track
 from data_prep.formats.avatar_track import read_info, write_tracking
-from data_prep.prepare.open import find_head
+from data_prep.prepare.open_subject import find_head
 from data_prep.prepare.prepare import prepare
 
 FRAMES, SIZE = 24, 64

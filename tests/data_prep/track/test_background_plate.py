@@ -12,9 +12,9 @@ from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, make_room
 from avatar.demo.render import Renderer
-from data_prep.track import closed_form_matting
-from data_prep.track.background_plate import learn_plate, shown
-from data_prep.track.matting import sharpened
+from data_prep.track.mattes import closed_form_matting
+from data_prep.track.mattes.background_plate import learn_plate, shown
+from data_prep.track.mattes.refine_segmentation import sharpened
 
 SIZE, NOISE = 160, 1.5
 HAIR = (40, 30, 25)

@@ -12,7 +12,7 @@ import torch
 from tracked_folder import write_tracked_folder
 
 from avatar.bench.figures import Figures
-from avatar.bench.placement import Placement, in_parts, placement
+from avatar.bench.reprojection import Placement, in_parts, placement
 from avatar.bench.track import Result, paired, report, with_true_tracking
 from avatar.cli import main
 from avatar.config import load_config

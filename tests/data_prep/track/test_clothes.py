@@ -9,9 +9,9 @@ import torch
 from avatar.demo.identity import sample_identity
 from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer
-from data_prep.track.clothes import learn_colours
-from data_prep.track.masks import head_mask, neck_ring
-from data_prep.track.neck_zones import Zones, zones_of
+from data_prep.track.masks.clothes import learn_colours
+from data_prep.track.masks.head_and_mouth import head_mask, neck_ring
+from data_prep.track.masks.neck_zones import Zones, zones_of
 
 SIZE = 256
 COLLAR = (-0.1, 0.14)  # heights above the neck ring

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from data_prep.progress import silent
-from data_prep.track.despill import despilled, spill_width
 from data_prep.track.frames import frame_file, mask_file
+from data_prep.track.mattes.despill import despilled, spill_width
 from data_prep.track.stage_folder import StageFolder
 from data_prep.track.tracking_stages import DESPILLED, TrackingStages
 

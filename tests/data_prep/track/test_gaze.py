@@ -17,7 +17,7 @@ from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.fitting import as_tracks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.fit.levenberg import minimise
+from data_prep.track.fit.levenberg_marquardt import minimise
 from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.result import Fit
 from data_prep.track.quality import judge, landmark_figures

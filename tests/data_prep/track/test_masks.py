@@ -17,10 +17,10 @@ from avatar.demo.render import Renderer
 from avatar.errors import UserError
 from data_prep.check.overlay import draw_mesh, outline
 from data_prep.prepare.mask_overlap import Mesh
-from data_prep.track.clothes import learn_colours
 from data_prep.track.faces.landmark_groups import OUTER_LIPS
-from data_prep.track.masks import head_mask, mouth_mask, neck_ring
-from data_prep.track.neck_zones import zones_of
+from data_prep.track.masks.clothes import learn_colours
+from data_prep.track.masks.head_and_mouth import head_mask, mouth_mask, neck_ring
+from data_prep.track.masks.neck_zones import zones_of
 
 SIZE = 256
 

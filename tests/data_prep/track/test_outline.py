@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from data_prep.track.outline import Outline, measure_outline
+from data_prep.track.mattes.steadiness import Outline, measure_outline
 
 SIZE, RADIUS = 256, 60.0
 RIM = np.exp(1j * np.linspace(0, 2 * np.pi, 40, endpoint=False))

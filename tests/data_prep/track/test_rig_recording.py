@@ -15,11 +15,11 @@ from rig_recording import FILMED, write_plain_gha, write_plain_raw
 from avatar.cli import main
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
+from data_prep.track.camera_rig import gha_folder, recording, track_rig
+from data_prep.track.camera_rig.camera_pictures import Times
+from data_prep.track.camera_rig.recording import Recording
 from data_prep.track.footage.pictures import PictureFolder
 from data_prep.track.footage.source import Span, stride, whole
-from data_prep.track.rig import gha_folder, recording, track_rig
-from data_prep.track.rig.look import Times
-from data_prep.track.rig.recording import Recording
 
 SERIALS = list(FILMED)
 

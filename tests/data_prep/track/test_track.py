@@ -18,7 +18,7 @@ from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import check_tracked_folder
 from data_prep.formats.avatar_track import read_info
-from data_prep.prepare.open import find_head
+from data_prep.prepare.open_subject import find_head
 from data_prep.track import tracking_stages
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.footage.pictures import is_footage

@@ -18,8 +18,8 @@ from avatar.errors import UserError
 from data_prep.formats.avatar_track import read_info
 from data_prep.track.footage.pictures import open_footage
 from data_prep.track.footage.source import Span, View, whole
+from data_prep.track.mattes.user_mattes import open_mattes, share_on
 from data_prep.track.track import Choices, track
-from data_prep.track.user_mattes import open_mattes, share_on
 
 FRAMES = 12
 Write = Callable[[Path, np.ndarray], object]

@@ -1,0 +1,40 @@
+"""What follows a training where one command does everything: the figures, and their line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from avatar.commands.eval import writing_figures
+from avatar.evaluation.evaluate import evaluate, facts_of
+from avatar.evaluation.previous_results import read_earlier
+from avatar.evaluation.tracking_source import LABELS, parts
+from avatar.files.read import read_json
+from avatar.pipeline.open_inputs import open_run
+
+
+def measured(path: Path) -> Path:
+    """RUN/eval/results.json of a run, by all protocols; what was measured already is not measured again.
+
+    Raises UserError as `evaluate` does.
+    """
+    run, folder = open_run(path, say=discard), path / "eval"
+    if read_earlier(folder, facts_of(run), ()).entries:
+        return folder / "results.json"
+    with writing_figures(path):
+        return evaluate(run, None, write_frames=False, say=discard)
+
+
+def discard(_: str) -> None:
+    """What `avatar eval` prints is a screen of its own."""
+
+
+def figures(results: Path) -> str:
+    """Of the protocol that masks nothing away; after a refinement by each tracking, the tracker's first."""
+    strict = read_json(results)["protocols"]["strict"]
+    own = parts(strict)
+    told = [
+        f"PSNR {part.figures['means']['psnr']:.2f}, SSIM {part.figures['means']['ssim']:.4f}"
+        + (f" ({LABELS[drive]})" if len(own) > 1 else "")
+        for drive, part in own.items()
+    ]
+    return f"{'; '.join(told)} over {len(strict['frames'])} of them"
