@@ -19,7 +19,7 @@ from avatar.gaussians.hyper import HyperHeads
 from avatar.gaussians.hyper_cpu import OFFSETS
 from avatar.gaussians.latent_grid import latent_grid
 from avatar.gaussians.skull_binding import INITIAL_LOGIT, Skull, SkullBinding, bind_to_skull
-from avatar.gaussians.uv_avatar import UVAvatar
+from avatar.gaussians.uv_base_model import UVAvatar
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams
 

@@ -37,7 +37,7 @@ from avatar.kernels.launch import watched
 from avatar.losses.photometric import dssim
 from avatar.splat import splat, splat_features
 from avatar.splat.scenes import head_camera, head_shell
-from avatar.train.objective import PerceptualTerm, Weighted
+from avatar.train.loss import PerceptualTerm, Weighted
 from avatar.types import Gaussians
 
 TARGETS = {

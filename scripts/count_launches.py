@@ -31,7 +31,7 @@ from avatar.losses.photometric import dssim, masked_lpips, on_head
 from avatar.render import Renderer
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.scenes import head_camera
-from avatar.train.objective import SPARSE_EVERY, Objective, PerceptualTerm, Weighted
+from avatar.train.loss import SPARSE_EVERY, PerceptualTerm, TrainingLoss, Weighted
 from avatar.train.optimizer import make_optimizer, schedule, set_rates
 from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import TrainState, train_step
@@ -130,7 +130,7 @@ class Rehearsal:
         train_step(self.state(perceptual), step, self.steps.inputs(step, self.frame), self.guard.check_gradients)
 
     def state(self, perceptual: PerceptualTerm) -> TrainState:
-        objective = Objective(self.trainer, self.background, perceptual)
+        objective = TrainingLoss(self.trainer, self.background, perceptual)
         return TrainState(self.avatar, self.optimizer, objective, self.corrections)
 
     def number(self, late: bool) -> int:

@@ -30,7 +30,7 @@ from avatar.pipeline.choose_device import choose_device
 from avatar.render import Renderer
 from avatar.splat import gpu_draw, splat
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
-from avatar.train.objective import PerceptualTerm, Weighted
+from avatar.train.loss import PerceptualTerm, Weighted
 from avatar.train.step_runner import WARM, StepRunner
 from avatar.types import Gaussians
 

@@ -25,7 +25,7 @@ from avatar.export.web_page import write_page
 from avatar.runs.run import open_trained
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat.cpu import thread_count
-from avatar.view.view_renderer import Look, Setting, ViewRenderer
+from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 FRAMES, SIZE, SECONDS, MIB = 20, 256, 6, 2**20
@@ -105,7 +105,7 @@ def measure_viewer(trained: TrainedAvatar) -> None:
         times = []
         for k, i in enumerate(frames):
             begin = time.perf_counter()
-            renderer.draw((trained.recording.params(i), trained.recording.camera(i)), Setting(Look(0.1 * k)), width)
+            renderer.draw((trained.recording.params(i), trained.recording.camera(i)), Setting(ViewOffset(0.1 * k)), width)
             times.append(1000 * (time.perf_counter() - begin))
         print(f"viewer   {width}x{width}: {statistics.median(times):.1f} ms a picture, {thread_count()} threads")
 

@@ -32,7 +32,7 @@ def shared_dir() -> Path:
 def _short_training() -> Iterator[None]:
     """Within the dozen steps of a training in a test, colours reach their full degree and curves get their points."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("avatar.train.objective.SH_INTERVAL", 3)
+        patch.setattr("avatar.train.loss.SH_INTERVAL", 3)
         patch.setattr("avatar.train.log.LOG_EVERY", 2)
         yield
 

@@ -16,7 +16,7 @@ from avatar.head.assets import HeadAssets
 from avatar.runs.checkpoint import Checkpoint
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import start_run
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from avatar.train.trainer import train
 from data_prep.prepare.open_subject import open_subject
 

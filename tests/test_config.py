@@ -23,8 +23,8 @@ from avatar.config_values import Range
 from avatar.errors import UserError
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import FREQUENCIES
-from avatar.gaussians.uv_avatar import SH_DEGREE
-from avatar.train.objective import perceptual_start
+from avatar.gaussians.uv_base_model import SH_DEGREE
+from avatar.train.loss import perceptual_start
 
 
 def test_the_papers_recipe() -> None:

@@ -114,6 +114,16 @@ def test_files_stay_small() -> None:
     assert not long
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "scripts").rglob("*.py")) + modules("tests/gpu"), ids=lambda p: p.name)
+def test_names_imported_by_scripts_and_gpu_tests_are_there(path: Path) -> None:
+    """What needs Triton or a browser is not imported on every machine that runs the tests."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("avatar", "data_prep"):
+            text = MODULES[str(node.module)].read_text(encoding="utf-8")
+            for name in (alias.name for alias in node.names if alias.name != "_core"):
+                assert f"{node.module}.{name}" in MODULES or re.search(rf"\b{name}\b", text), f"{path}: {name}"
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "scripts").rglob("*.sh")), ids=lambda p: p.name)
 def test_scripts_name_tests_that_are_there(path: Path) -> None:
     for name in re.findall(r"\btests/[\w/.]*\w", path.read_text(encoding="utf-8")):

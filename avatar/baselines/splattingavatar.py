@@ -14,7 +14,7 @@ from avatar.baselines.mesh_points import MeshPoints
 from avatar.config import HYPER_RATE, ModelConfig, TrainerConfig
 from avatar.gaussians.apply_offsets import quaternion_product
 from avatar.gaussians.base_model import Groups
-from avatar.gaussians.uv_avatar import UVAvatar
+from avatar.gaussians.uv_base_model import UVAvatar
 from avatar.head.assets import HeadAssets
 from avatar.types import Gaussians, HeadParams
 

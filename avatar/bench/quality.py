@@ -24,7 +24,7 @@ from avatar.evaluation.find_lpips import find_lpips
 from avatar.pipeline.open_inputs import open_run
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, load_module
 from avatar.runs.run import Run
-from avatar.train.objective import perceptual_start
+from avatar.train.loss import perceptual_start
 
 FRAMES, FULL_FRAMES, QUICK_FRAMES = 50, 10_000, 2
 REPEATS, QUICK_REPEATS = 11, 1

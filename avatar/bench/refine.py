@@ -31,7 +31,7 @@ from avatar.pipeline.refine_plan import round_steps
 from avatar.pose_refinement.refine import refine_subject
 from avatar.runs.model_registry import make_avatar
 from avatar.train.frame_order import planned_steps, within_epochs
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from avatar.train.trainer import train
 from data_prep.prepare.open_subject import find_head, open_subject
 

@@ -27,7 +27,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.model import FlashAvatar
 from avatar.runs.model_registry import make_avatar
 from avatar.train import step as train_step
-from avatar.train.objective import Objective, choose_perceptual, perceptual_start
+from avatar.train.loss import TrainingLoss, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import GradientCheck, TrainState
@@ -130,7 +130,7 @@ def make_learner(
     with FrameLoader(subject, config.data.size, frame_cache=frame_cache) as loader:
         frames = list(loader.frames(chosen))
     term = choose_perceptual(config.trainer, say, perceptual, size=subject.image_size(config.data.size), device=device)
-    objective = Objective(config.trainer, torch.tensor(config.data.background).to(device), term)
+    objective = TrainingLoss(config.trainer, torch.tensor(config.data.background).to(device), term)
     corrections = make_pose_corrections(avatar, subject.recording.times(train), config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     state = TrainState(avatar, optimizer, objective, corrections)
@@ -182,7 +182,7 @@ def per_step(time: Time, steps: int) -> Time:
 def stages(learner: Learner, repeats: int) -> dict[str, Time]:
     """Of a step on a CPU, forward and backward."""
     avatar, stopwatch = learner.avatar, Stopwatch()
-    watched = [(avatar, "draw", "splat"), (Objective, "loss", "loss"), (train_step, "check_step", "check")]
+    watched = [(avatar, "draw", "splat"), (TrainingLoss, "loss", "loss"), (train_step, "check_step", "check")]
     watched.append((learner.state.optimizer, "step", "optimizer"))
     if isinstance(avatar, FlashAvatar):
         watched += [(avatar, "points", "embedding"), (avatar.deformation, "forward", "network")]

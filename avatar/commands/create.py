@@ -39,7 +39,7 @@ from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
 from avatar.train.frame_order import within_epochs
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.track.first_pass import MAX_PICTURES
 from data_prep.track.footage.pictures import open_footage

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files import read
+from avatar.files.read import read_bytes as read_bounded
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 OTHER_PICTURES = (".webp", ".bmp", ".tif", ".tiff", ".gif", ".heic", ".avif", ".jp2", ".ppm", ".exr", ".tga", ".jxl")
@@ -127,7 +127,7 @@ def _palette_indices(data: bytes, path: Path) -> np.ndarray | None:
 
 def read_bytes(path: Path) -> bytes:
     """The bytes of an image file. Raises UserError naming it."""
-    return read.read_bytes(path, MAX_BYTES)
+    return read_bounded(path, MAX_BYTES)
 
 
 def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import painted, uv_texels
-from avatar.gaussians.uv_avatar import UVAvatar
+from avatar.gaussians.uv_base_model import UVAvatar
 from avatar.head.rasterize import rasterize_mesh
 from avatar.head.sample_image import sample_image
 from avatar.motion.orbit import orbited

@@ -32,7 +32,7 @@ class Avatar(nn.Module):
 
     A model is a subclass. It makes its parameters in `make_parameters`, gives `forward`, `count_gaussians`,
     `initialize_from` and `parameter_groups`, and of the other methods those in which it differs.
-    `avatar.runs.model_registry` lists the models by name; most are an `avatar.gaussians.uv_avatar.UVAvatar`.
+    `avatar.runs.model_registry` lists the models by name; most are an `avatar.gaussians.uv_base_model.UVAvatar`.
 
     `mesh` is `head`, or goes on after its vertices and triangles. `to(device)` moves all that drawing needs. `head` and
     `mesh` stay on the CPU; cameras and head parameters may be on either side.

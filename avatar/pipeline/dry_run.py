@@ -17,7 +17,7 @@ from avatar.pose_refinement.refine import estimated_seconds
 from avatar.runs.checkpoint import KEPT
 from avatar.runs.memory_estimate import training_needs
 from avatar.train.cost_estimate import measure_cost
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from data_prep.prepare.open_subject import open_subject
 
 DISK_COPIES = 1 + 3 * (KEPT + 1)  # of the parameters: the avatar; the checkpoints, with one more while it is written

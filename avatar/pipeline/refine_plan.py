@@ -21,7 +21,7 @@ from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.train.cost_estimate import measure_cost
 from avatar.train.frame_order import within_epochs
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from data_prep.prepare.open_subject import open_subject
 
 ROUNDS_FOLDER = "rounds"

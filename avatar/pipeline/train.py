@@ -29,7 +29,7 @@ from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.train.frame_order import within_epochs
-from avatar.train.objective import PerceptualTerm, choose_perceptual
+from avatar.train.loss import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import save_avatar, train
 from data_prep.prepare.open_subject import open_subject
 

@@ -16,7 +16,7 @@ from avatar.data.frame import Frame
 from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.runs.model_registry import make_avatar
-from avatar.train.objective import Objective, choose_perceptual, perceptual_start
+from avatar.train.loss import TrainingLoss, choose_perceptual, perceptual_start
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import TrainState
@@ -57,7 +57,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     size = frame.camera.width, frame.camera.height
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
-    objective = Objective(config.trainer, torch.tensor(config.data.background), term)
+    objective = TrainingLoss(config.trainer, torch.tensor(config.data.background), term)
     steps = StepRunner(TrainState(avatar, optimizer, objective, corrections))
 
     def seconds(step: int) -> float:

@@ -19,7 +19,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.losses.photometric import PhotometricLoss
 from avatar.splat import CannotDraw
 from avatar.tensors import describe_non_finite
-from avatar.train.objective import Objective, sh_degree
+from avatar.train.loss import TrainingLoss, sh_degree
 from avatar.train.pose_corrections import PoseCorrections
 from avatar.types import HeadParams
 
@@ -78,7 +78,7 @@ class TrainState:
 
     avatar: Avatar
     optimizer: torch.optim.Adam
-    objective: Objective
+    objective: TrainingLoss
     pose_corrections: PoseCorrections | None = None
 
     def named_parameters(self) -> dict[str, nn.Parameter]:

@@ -22,7 +22,7 @@ from avatar.compute.gpu_functions import gpu_function
 from avatar.data.frame import Frame
 from avatar.losses.photometric import crop_of_few_sizes
 from avatar.train.condition_noise import ConditionNoise
-from avatar.train.objective import Weighted, sh_degree
+from avatar.train.loss import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import GradientCheck, StepInputs, StepOutputs, TrainState, train_step
 from avatar.types import Camera

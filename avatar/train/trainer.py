@@ -23,7 +23,7 @@ from avatar.splat import CannotDraw, checked_drawings
 from avatar.train.condition_noise import make_noise
 from avatar.train.frame_order import frame_order
 from avatar.train.log import TrainingLog
-from avatar.train.objective import Objective, PerceptualTerm
+from avatar.train.loss import PerceptualTerm, TrainingLoss
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.pose_corrections import PREFIX, make_pose_corrections
 from avatar.train.step import TrainState, non_finite_error
@@ -64,7 +64,7 @@ def train(
     corrections = make_pose_corrections(avatar, recording.times(recording.split.train), trainer)
     optimizer = make_optimizer(avatar, trainer, corrections)
     background = torch.tensor(config.data.background).to(device)
-    state = TrainState(avatar, optimizer, Objective(trainer, background, perceptual), corrections)
+    state = TrainState(avatar, optimizer, TrainingLoss(trainer, background, perceptual), corrections)
     if resume is not None:
         if corrections is not None:
             corrections.load(resume.tensors)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from avatar.head.assets import HeadAssets
 
 SAME = 1e-5  # metres: rounding
-MAX_CHANGE = 2e-3  # metres: what a tracked head may be off without being another's (see `misfit`)
+MAX_CHANGE = 2e-3  # metres: what a tracked head may be off without being another's (see `check_alignment`)
 _USUAL = 90  # percentile of the frames that has to be below
 
 

@@ -49,7 +49,7 @@ from avatar.runs.checkpoint import (
 )
 from avatar.runs.model_registry import make_avatar
 from avatar.train.frame_order import frame_order
-from avatar.train.objective import Objective, choose_perceptual
+from avatar.train.loss import TrainingLoss, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors
 from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
@@ -73,7 +73,7 @@ class Learner:
         self.optimizer = make_optimizer(self.avatar, config.trainer)
         self.background = torch.tensor(config.data.background)
         term = choose_perceptual(config.trainer, print, size=subject.image_size(config.data.size))
-        self.objective = Objective(config.trainer, self.background, term)
+        self.objective = TrainingLoss(config.trainer, self.background, term)
         self.steps = StepRunner(TrainState(self.avatar, self.optimizer, self.objective))
         self.step, self.points = 0, [{"mark": 0.0, "seconds": 0.0, "step": 0}]
         recorded = {"data_hash": subject.data_hash, "config": config.to_dict(), "perceptual": term.name}

@@ -145,7 +145,7 @@ def test_resume_after_kill_9_loses_at_most_the_steps_since_the_last_checkpoint(
     """Killed without warning and resumed, the run ends with the bits of one that was never disturbed."""
     options = ["--frame-offset", "1", *SMALL, "trainer.iterations=60", "trainer.checkpoint_every=5"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    monkeypatch.setattr("avatar.train.objective.SH_INTERVAL", 500)  # as in the process that is killed
+    monkeypatch.setattr("avatar.train.loss.SH_INTERVAL", 500)  # as in the process that is killed
     avatar("train", tracked_folder, "--out", whole, *options)
     command = [sys.executable, "-m", "avatar.cli", "train", str(tracked_folder), "--out", str(killed), *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -15,7 +15,7 @@ from heads import grid_head
 from avatar.losses.photometric import dssim
 from avatar.splat import splat
 from avatar.splat.scenes import head_camera, head_shell
-from avatar.train.objective import PerceptualTerm, Weighted
+from avatar.train.loss import PerceptualTerm, Weighted
 from avatar.types import Gaussians
 
 pytest.importorskip("triton", reason="Triton is not installed")
@@ -38,7 +38,7 @@ def counting() -> ModuleType:
 @pytest.fixture(scope="module")
 def counts(counting: ModuleType) -> dict[str, Counter[str]]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("avatar.train.objective.SH_INTERVAL", 500)  # as outside of the tests
+        patch.setattr("avatar.train.loss.SH_INTERVAL", 500)  # as outside of the tests
         return counting.count_all(grid_head(), 32, 64)
 
 

@@ -33,7 +33,7 @@ from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import CannotDraw, gpu_buffers
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from avatar.train.trainer import train
 from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 

@@ -22,10 +22,10 @@ from avatar.compute.cuda_graph import Replay, own_stream
 from avatar.losses.lpips_network import Lpips
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
-from avatar.train import objective as objective_module
+from avatar.train import loss as loss_module
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from avatar.train.step_runner import Kind, StepRunner
 from avatar.train.trainer import train
 from avatar.types import Gaussians
@@ -61,7 +61,7 @@ def trained(
             return outcome
 
     with monkeypatch.context() as patch:
-        patch.setattr(objective_module, "SH_INTERVAL", degree_every)
+        patch.setattr(loss_module, "SH_INTERVAL", degree_every)
         patch.setattr(trainer_module, "StepRunner", Noting)
         patch.setattr(step_runner_module, "WARM", warm)
         term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
@@ -99,8 +99,8 @@ def test_steps_with_lpips_of_the_heads_box_are_replayed(
 ) -> None:
     torch.manual_seed(0)
     lpips = Lpips("squeeze").on(DEVICE)
-    monkeypatch.setattr(objective_module, "load_lpips", lambda *_, **__: lpips)
-    monkeypatch.setattr(objective_module, "SPARSE_EVERY", 2)
+    monkeypatch.setattr(loss_module, "load_lpips", lambda *_, **__: lpips)
+    monkeypatch.setattr(loss_module, "SPARSE_EVERY", 2)
     tiny = ("data.size=40", "trainer.perceptual=lpips-squeeze", "trainer.checkpoint_every=12")
     expected, _, losses = trained(tracked_folder, tmp_path / "launched", monkeypatch, *TINY, *tiny, warm=99)
     found, replaying, same = trained(tracked_folder, tmp_path / "replayed", monkeypatch, *TINY, *tiny, warm=1)

@@ -16,10 +16,10 @@ pytest.importorskip("triton", reason="Triton is not installed")
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
-from avatar.train import objective as objective_module
+from avatar.train import loss as loss_module
 from avatar.train import step_runner as step_runner_module
 from avatar.train import trainer as trainer_module
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from avatar.train.trainer import train
 
 TINY = (
@@ -63,7 +63,7 @@ def test_steps_have_the_losses_of_the_cpu(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Across the steps where a spherical-harmonics degree, the perceptual term and a checkpoint come in."""
-    monkeypatch.setattr(objective_module, "SH_INTERVAL", 4)
+    monkeypatch.setattr(loss_module, "SH_INTERVAL", 4)
     steps = ("trainer.iterations=12", "trainer.checkpoint_every=5")
     _, expected = trained(tracked_folder, tmp_path / "cpu", *steps, on_cpu=True)
     avatar, found = trained(tracked_folder, tmp_path / "gpu", *steps)

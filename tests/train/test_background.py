@@ -11,7 +11,7 @@ from small_runs import new_avatar, open_small, small_config
 from torch import Tensor
 
 from avatar.splat.sh import C0
-from avatar.train.objective import Objective, PerceptualTerm
+from avatar.train.loss import PerceptualTerm, TrainingLoss
 from avatar.train.optimizer import make_optimizer
 from avatar.train.step import StepInputs, TrainState, gradients_of, train_step
 from avatar.train.step_runner import StepRunner
@@ -24,18 +24,18 @@ WHITE, BLACK = torch.ones(3), torch.zeros(3)
     [(WHITE, WHITE - 1), (BLACK, BLACK + 1), (torch.tensor([0.0, 0.7, 0.5]), torch.tensor([1.0, 0.0, 0.0]))],
 )
 def test_every_third_step_is_over_the_opposite_background(background: Tensor, opposite: Tensor) -> None:
-    every_third = Objective(small_config().trainer, background, PerceptualTerm("none"))
+    every_third = TrainingLoss(small_config().trainer, background, PerceptualTerm("none"))
     found = [every_third.background_of(step) for step in range(6)]
     for colour, expected in zip(found, [background, background, opposite] * 2, strict=True):
         assert torch.equal(colour, expected)
     never = small_config("trainer.opposite_background_every=null").trainer
-    assert torch.equal(Objective(never, background, PerceptualTerm("none")).background_of(2), background)
+    assert torch.equal(TrainingLoss(never, background, PerceptualTerm("none")).background_of(2), background)
 
 
 def test_a_step_makes_white_gaussians_beside_the_head_fade_over_black_alone(tracked_folder: Path) -> None:
     config = small_config()
     _, subject, assets = open_small(tracked_folder, config)
-    objective = Objective(config.trainer, WHITE, PerceptualTerm("none"))
+    objective = TrainingLoss(config.trainer, WHITE, PerceptualTerm("none"))
     frame = subject.frame(subject.split.train[0], config.data.size)
     beside = replace(frame, head_mask=torch.zeros_like(frame.head_mask))
 
@@ -59,7 +59,7 @@ def test_features_in_place_of_colours_keep_one_background(tracked_folder: Path) 
     config = small_config("model=gaussianheadavatar")
     _, subject, assets = open_small(tracked_folder, config)
     avatar = new_avatar(assets, subject, config)
-    objective = Objective(config.trainer, WHITE, PerceptualTerm("none"))
+    objective = TrainingLoss(config.trainer, WHITE, PerceptualTerm("none"))
     steps = StepRunner(TrainState(avatar, make_optimizer(avatar, config.trainer), objective))
     frame = subject.frame(subject.split.train[0], config.data.size)
     assert torch.equal(steps.inputs(2, frame).background, WHITE)

@@ -11,7 +11,7 @@ from small_runs import open_small, small_config
 
 from avatar.losses.photometric import dssim
 from avatar.train.cost_estimate import kinds_of_steps, measure_cost
-from avatar.train.objective import PerceptualTerm, Weighted
+from avatar.train.loss import PerceptualTerm, Weighted
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 9, 10, 11, 40, 41, 53])
@@ -20,7 +20,7 @@ from avatar.train.objective import PerceptualTerm, Weighted
 def test_steps_are_counted_by_what_their_loss_takes(
     iterations: int, start: float, every: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("avatar.train.objective.PERCEPTUAL_START", start)
+    monkeypatch.setattr("avatar.train.loss.PERCEPTUAL_START", start)
     trainer = small_config(f"trainer.iterations={iterations}").trainer
     term = PerceptualTerm("x", Weighted(dssim, 3.0), every, Weighted(dssim, 2.0), Weighted(dssim, 1.0))
     begin = round(start * iterations)

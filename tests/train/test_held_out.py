@@ -18,7 +18,7 @@ from avatar.motion.neutral_pose import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.checkpoint import newest_checkpoint
 from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
-from avatar.train.objective import choose_perceptual
+from avatar.train.loss import choose_perceptual
 from avatar.train.trainer import train
 from avatar.types import IDENTITY_6D
 

@@ -13,7 +13,7 @@ from small_runs import new_avatar, open_small, small_config
 from avatar.data.frame import Frame
 from avatar.data.subject import Subject
 from avatar.gaussians import initial_colours
-from avatar.gaussians.uv_avatar import UVAvatar
+from avatar.gaussians.uv_base_model import UVAvatar
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
 from avatar.train.trainer import initialize_from_frames

@@ -8,8 +8,8 @@ from avatar.config import load_config
 from avatar.errors import UserError
 from avatar.losses.lpips import MissingWeights
 from avatar.losses.lpips_network import Net
-from avatar.train import objective
-from avatar.train.objective import choose_perceptual
+from avatar.train import loss as loss_module
+from avatar.train.loss import choose_perceptual
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +17,7 @@ def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(net: Net, **_: object) -> None:
         raise MissingWeights(net, f"no LPIPS weights for {net!r} in /a/folder: put " + "https://somewhere/ " * 9)
 
-    monkeypatch.setattr(objective, "load_lpips", missing)
+    monkeypatch.setattr(loss_module, "load_lpips", missing)
 
 
 @pytest.mark.parametrize("name", ["paper", "mlp_256x40", "mlp_512x11", "gha_paper"])

@@ -16,7 +16,7 @@ from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.motion import HeadPose, moved_pose
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
-from avatar.train.objective import Objective, choose_perceptual
+from avatar.train.loss import TrainingLoss, choose_perceptual
 from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import (
     PREFIX,
@@ -43,7 +43,7 @@ def corrected(avatar: Avatar, clip: Clip) -> tuple[PoseCorrections, Clip]:
     train = clip.split.train
     corrections = make_pose_corrections(avatar, train, config.trainer)
     assert corrections is not None
-    objective = Objective(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
+    objective = TrainingLoss(config.trainer, BACKGROUND, choose_perceptual(config.trainer, lambda _: None))
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     for group in optimizer.param_groups[:-1]:
         group["full_lr"] = 0.0

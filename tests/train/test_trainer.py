@@ -18,9 +18,9 @@ from avatar.losses.metrics import psnr
 from avatar.losses.photometric import dssim
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint, newest_checkpoint
 from avatar.runs.model_registry import MODELS
-from avatar.train import objective as objective_module
+from avatar.train import loss as loss_module
 from avatar.train import trainer as trainer_module
-from avatar.train.objective import Objective, PerceptualTerm, Weighted, choose_perceptual
+from avatar.train.loss import PerceptualTerm, TrainingLoss, Weighted, choose_perceptual
 from avatar.train.trainer import interruption, train
 from avatar.types import Camera, HeadParams
 
@@ -125,7 +125,7 @@ def test_dssim_may_begin_before_the_perceptual_term() -> None:
 def test_dssim_weighs_in_each_half_what_the_configuration_says(early: float, share: list[float]) -> None:
     overrides = f"trainer.dssim_early={early}", "trainer.dssim_weight=0.2", "trainer.perceptual=dssim"
     config = small_config(*overrides, "trainer.iterations=8").trainer
-    objective = Objective(config, torch.ones(3), choose_perceptual(config, print))
+    objective = TrainingLoss(config, torch.ones(3), choose_perceptual(config, print))
     image, mask = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)), torch.ones(16, 16)
     camera = Camera(torch.eye(3), torch.zeros(3), 1.0, 1.0, 8.0, 8.0, 16, 16)
     params = HeadParams(torch.zeros(1), torch.zeros(6), torch.zeros(12), torch.zeros(2), torch.zeros(6))
@@ -135,7 +135,7 @@ def test_dssim_weighs_in_each_half_what_the_configuration_says(early: float, sha
 
 
 def test_lpips_lets_dssim_begin_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(objective_module, "load_lpips", lambda *_, **__: Lpips("squeeze"))
+    monkeypatch.setattr(loss_module, "load_lpips", lambda *_, **__: Lpips("squeeze"))
     term = choose_perceptual(small_config("trainer.dssim_early=0.3").trainer, print)
     assert term.name == "lpips-squeeze" and term.before == Weighted(dssim, 0.3)
 
@@ -277,7 +277,7 @@ def test_a_learning_rate_that_is_far_too_high_ends_in_a_sentence(tracked_folder:
 
 def test_lpips_by_name_without_weights_fails_before_training(tracked_folder: Path, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(objective_module, "load_lpips", _no_weights)
+        patch.setattr(loss_module, "load_lpips", _no_weights)
         with pytest.raises(UserError, match="no weights"):
             train_small(tracked_folder, tmp_path / "run", ["trainer.perceptual=lpips-squeeze"])
     assert not (tmp_path / "run" / "checkpoints").exists()

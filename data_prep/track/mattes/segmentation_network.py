@@ -1,7 +1,7 @@
 """Networks that tell a person from the background: which one there is, and MediaPipe's, which are coarse.
 
 `selfie_segmentation` gives the probability of the foreground at 256x256, of the picture and of its mirror image;
-`selfie_multiclass` is taken instead where its file is. `soft_mattes` has the others.
+`selfie_multiclass` is taken instead where its file is. `matting_network` has the others.
 """
 
 from __future__ import annotations

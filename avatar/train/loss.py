@@ -17,7 +17,7 @@ from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
 from avatar.data.frame import Frame
 from avatar.errors import UserError
-from avatar.gaussians.uv_avatar import SH_DEGREE
+from avatar.gaussians.uv_base_model import SH_DEGREE
 from avatar.losses.lpips import MissingWeights, load_lpips
 from avatar.losses.lpips_network import MIN_SIZE, Net
 from avatar.losses.metrics import SSIM_WINDOW
@@ -74,7 +74,7 @@ def perceptual_start(config: TrainerConfig) -> int:
 
 
 @dataclass(frozen=True)
-class Objective:
+class TrainingLoss:
     """What a step minimises, for any frame."""
 
     config: TrainerConfig
