@@ -105,7 +105,9 @@ def measure_viewer(trained: TrainedAvatar) -> None:
         times = []
         for k, i in enumerate(frames):
             begin = time.perf_counter()
-            renderer.draw((trained.recording.params(i), trained.recording.camera(i)), Setting(ViewOffset(0.1 * k)), width)
+            renderer.draw(
+                (trained.recording.params(i), trained.recording.camera(i)), Setting(ViewOffset(0.1 * k)), width
+            )
             times.append(1000 * (time.perf_counter() - begin))
         print(f"viewer   {width}x{width}: {statistics.median(times):.1f} ms a picture, {thread_count()} threads")
 

@@ -26,7 +26,7 @@ from avatar.view.player import WEBCAM, Player
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.viewer import Viewer
 from avatar.view.webcam import Webcam
-from data_prep.live.face_tracker import FaceFollower
+from data_prep.live.face_tracker import LiveFaceTracker
 from data_prep.live.frame_fit import FrameFit
 from data_prep.live.pictures import LONGEST, open_source
 from data_prep.track.faces.detect import Face, FaceDetector
@@ -76,7 +76,7 @@ def page(port: int, wanted: bool) -> Iterator[None]:
 
 def measure_live(trained: TrainedAvatar, head: Path, video: Path, with_page: bool) -> None:
     said: list[str] = []
-    follower = FaceFollower(open_source(str(video)), trained.assets, head, print)
+    follower = LiveFaceTracker(open_source(str(video)), trained.assets, head, print)
     webcam = Webcam(trained, follower, said.append)
     parts: list[dict[str, float]] = []
 

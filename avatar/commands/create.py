@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands.arguments import parse
-from avatar.commands.held_out_figures import discard, figures, measured
+from avatar.commands.held_out_figures import discard, evaluate_or_read, figures_line
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.commands.train import check_rounds, config_overrides, train_as_asked
 from avatar.compute.device import free_bytes
@@ -82,9 +82,9 @@ def run_create(arguments: Namespace) -> int:
         print("Start the same command again to go on.")
         return status
     say_stage(4, "the avatar is measured, and its page written")
-    results, trained = measured(paths.run), open_trained(paths.run)
+    results, trained = evaluate_or_read(paths.run), open_trained(paths.run)
     write_page(replace(trained, recording=replace(trained.recording, name=safe_name(video.stem))), paths.page)
-    print(f"Held-out frames: {figures(results)}")
+    print(f"Held-out frames: {figures_line(results)}")
     print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {paths.page}, the avatar in a browser.")
     print(f"  {paths.subject / 'overlay'}   the tracked mesh on the video")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")

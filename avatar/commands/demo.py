@@ -6,7 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import NamedTuple
 
-from avatar.commands.held_out_figures import figures, measured
+from avatar.commands.held_out_figures import evaluate_or_read, figures_line
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
@@ -51,12 +51,14 @@ def run_demo(arguments: Namespace) -> int:
         return status
     trained = open_trained(run)
     video = reenact(trained, open_driver(driver, trained), run / "reenact" / "driver-relative.mp4")
-    results = measured(run)
+    results = evaluate_or_read(run)
     page = write_page(trained, out / "avatar.html")
     print("\nThe demo is done.")
     if (film := out / f"{ACTOR.name}.mp4").is_file():
         print(f"  {film}   the video that the avatar was made from")
-    print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error; {figures(results)}")
+    print(
+        f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error; {figures_line(results)}"
+    )
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
     print(f"  avatar eval {run}   prints all its figures, avatar view {run} moves it by hand")

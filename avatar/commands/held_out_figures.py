@@ -12,7 +12,7 @@ from avatar.files.read import read_json
 from avatar.pipeline.open_inputs import open_run
 
 
-def measured(path: Path) -> Path:
+def evaluate_or_read(path: Path) -> Path:
     """RUN/eval/results.json of a run, by all protocols; what was measured already is not measured again.
 
     Raises UserError as `evaluate` does.
@@ -28,7 +28,7 @@ def discard(_: str) -> None:
     """What `avatar eval` prints is a screen of its own."""
 
 
-def figures(results: Path) -> str:
+def figures_line(results: Path) -> str:
     """Of the protocol that masks nothing away; after a refinement by each tracking, the tracker's first."""
     strict = read_json(results)["protocols"]["strict"]
     own = parts(strict)

@@ -16,7 +16,7 @@ from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.pipeline import OK
 from data_prep.live.pictures import FILMED, Newest, open_source
-from data_prep.live.recording_guidance import ENDS, PROMPTS, Adviser, Seen, measures, reaches
+from data_prep.live.recording_guidance import ENDS, PROMPTS, RecordingAdvice, Seen, measures, reaches
 from data_prep.live.video_recorder import WARM_UP, VideoRecorder
 from data_prep.track.faces.detect import FaceDetector
 
@@ -103,7 +103,7 @@ def follow_prompts(
     interrupted: Callable[[], bool],
 ) -> None:
     """Say each prompt in its time and what is wrong with the pictures; `seen` and `wrong` get what was seen and told."""
-    adviser, begin, shown = Adviser(), None, -1
+    adviser, begin, shown = RecordingAdvice(), None, -1
     while True:
         between_pictures(interrupted)
         picture = newest.take()

@@ -34,7 +34,7 @@ from avatar.view.player import Player
 from avatar.view.receiver import Receiver
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.webcam import Webcam
-from data_prep.live.face_tracker import FaceFollower
+from data_prep.live.face_tracker import LiveFaceTracker
 from data_prep.live.pictures import open_source
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def open_live(arguments: Namespace, trained: TrainedAvatar, token: str) -> Recei
     source = open_source(arguments.webcam)
     say(f"{source.name}, {source.size[0]} x {source.size[1]} pixels")
     try:
-        follower = FaceFollower(source, trained.assets, head_of(arguments, trained), say, arguments.fov)
+        follower = LiveFaceTracker(source, trained.assets, head_of(arguments, trained), say, arguments.fov)
     except BaseException:
         source.close()
         raise

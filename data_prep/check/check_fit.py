@@ -41,9 +41,9 @@ def _polarity(clip: Clip) -> Iterator[Finding]:
 
 
 def _misfit(clip: Clip) -> Iterator[Finding]:
-    if clip.judgement is not None and clip.judgement.problem is not None:
+    if clip.alignment is not None and clip.alignment.problem is not None:
         severity, advice = ("warning", IGNORED) if clip.given.ignore_misfit else ("error", ADVICE)
-        yield Finding(severity, "residual", clip.judgement.problem, advice)
+        yield Finding(severity, "residual", clip.alignment.problem, advice)
 
 
 def _distances(clip: Clip) -> Iterator[Finding]:

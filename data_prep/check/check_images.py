@@ -126,7 +126,7 @@ def _matte(clip: Clip) -> Iterator[Finding]:
 
 def _mask_area(clip: Clip) -> Iterator[Finding]:
     ratios = {n: fit.mask_ratio for n, fit in clip.fits.items() if np.isfinite(fit.mask_ratio)}
-    if not ratios or clip.judgement is None or clip.judgement.problem is not None:
+    if not ratios or clip.alignment is None or clip.alignment.problem is not None:
         return  # the mesh lies elsewhere: its area says nothing about the mask's
     usual = float(np.median(list(ratios.values())))
     if usual > MAX_MASK_RATIO:

@@ -10,7 +10,7 @@ from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, Severity
 from data_prep.check.motion import head_angles
 from data_prep.prepare.check_alignment import CUT_OFF, MAX_OUTSIDE
-from data_prep.prepare.constant_parameters import StillPart, still_parts
+from data_prep.prepare.constant_parameters import ConstantParameter, constant_parameters
 
 MAX_ROLL = 60.0  # degrees; people tilt their heads by 40
 MAX_CUT = 0.03  # of the upper edge; a mask that ends there is rounded
@@ -25,8 +25,8 @@ def _flaws(clip: Clip) -> Iterator[Finding]:
     yield from (Finding("warning", "tracking-changes", flaw, advice) for flaw in clip.tracking.flaws)
 
 
-def _parts(clip: Clip) -> list[StillPart]:
-    return [] if clip.head is None else still_parts([track for _, track in clip.tracked()], clip.head.assets)
+def _parts(clip: Clip) -> list[ConstantParameter]:
+    return [] if clip.head is None else constant_parameters([track for _, track in clip.tracked()], clip.head.assets)
 
 
 def _still(clip: Clip) -> Iterator[Finding]:

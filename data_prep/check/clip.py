@@ -24,7 +24,7 @@ from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder
 from data_prep.formats.train_test_split import ALL, FRONT
-from data_prep.prepare.check_alignment import SAMPLED_FRAMES, Judgement, judge
+from data_prep.prepare.check_alignment import SAMPLED_FRAMES, Alignment, measure_alignment
 from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
@@ -61,12 +61,12 @@ class Clip:
         return self.given.fps or self.source.fps or DEFAULT_FPS
 
     @cached_property
-    def judgement(self) -> Judgement | None:
+    def alignment(self) -> Alignment | None:
         """What `prepare` says of head and lips against their masks; None where nothing was measured."""
         if not self.fits:
             return None
         measured = [pair for pair in self.pairs() if pair[0] in self.fits]
-        return judge([self.fits[image] for image, _ in evenly_spread(measured, SAMPLED_FRAMES)], self.files)
+        return measure_alignment([self.fits[image] for image, _ in evenly_spread(measured, SAMPLED_FRAMES)], self.files)
 
     @cached_property
     def _listed_names(self) -> dict[int, str]:

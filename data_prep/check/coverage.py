@@ -12,7 +12,7 @@ from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.motion import HeadAngles, head_angles
-from data_prep.formats.train_test_split import divide
+from data_prep.formats.train_test_split import split_frames_of
 
 SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120
 NARROW_YAW = 20.0  # degrees; with less, ears and the sides of the nose are never seen
@@ -38,7 +38,7 @@ class Coverage:
 def measure_coverage(clip: Clip, usable: list[int], test_frames: int | None) -> Coverage | Finding:
     """`usable` are image numbers. A Finding where they cannot be split."""
     try:
-        split, _ = divide(clip.source, usable, test_frames)
+        split, _ = split_frames_of(clip.source, usable, test_frames)
         check_divided(split)
     except UserError as error:
         return from_sentence("too-few-frames", str(error))

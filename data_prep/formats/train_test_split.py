@@ -13,7 +13,7 @@ ALL, FRONT = "all", "front"  # what --cameras may say beside names
 NO_CAMERA = "none"
 
 
-def divide(
+def split_frames_of(
     tracked: TrackedFolder, numbers: Sequence[int], test_frames: int | None = None, test_cameras: str | None = None
 ) -> tuple[Split, list[str]]:
     """Positions in `numbers` by the folder's own division, where it has one and no number of test frames is asked for, else

@@ -34,7 +34,7 @@ _SAME_PERSON = 0.1  # overlap (IoU) with the last place of the face
 
 
 @dataclass(frozen=True)
-class FollowedFace:
+class TrackedFace:
     """The face in one picture."""
 
     params: HeadParams
@@ -46,10 +46,10 @@ class FollowedFace:
 @dataclass(frozen=True)
 class Calibration:
     identity: Float[Tensor, " S"]
-    faces: list[FollowedFace]  # that it was made from
+    faces: list[TrackedFace]  # that it was made from
 
 
-class FaceFollower:
+class LiveFaceTracker:
     """A face in the newest pictures of a source. Use from one thread, but for `close`."""
 
     def __init__(
@@ -115,7 +115,7 @@ class FaceFollower:
         tell("Fitting the face.")
         return self._calibrated(evenly_spread(found, MOST))
 
-    def follow(self) -> FollowedFace | None:
+    def follow(self) -> TrackedFace | None:
         """The face in the newest picture, waited for; None without a face. Raises UserError when the pictures end.
 
         Raises RuntimeError before `calibrate`.
@@ -182,13 +182,13 @@ def _identity(fit: LandmarkFit) -> Float[Tensor, " S"]:
     return identity
 
 
-def _as_faces(motion: Motion, times: list[float], expressions: Tensor, assets: HeadAssets) -> list[FollowedFace]:
+def _as_faces(motion: Motion, times: list[float], expressions: Tensor, assets: HeadAssets) -> list[TrackedFace]:
     T = len(motion)
     expression = torch.zeros(T, assets.num_expressions)
     expression[:, expressions] = motion.expression.float()
     jaw, eyes, neck = (values.float() for values in six_d(motion).values())
     lids, R, t = motion.eyelids.float(), motion.R.float(), motion.t.float()
     return [
-        FollowedFace(HeadParams(expression[n], jaw[n], eyes[n], lids[n], neck[n]), R[n], t[n], times[n])
+        TrackedFace(HeadParams(expression[n], jaw[n], eyes[n], lids[n], neck[n]), R[n], t[n], times[n])
         for n in range(T)
     ]

@@ -94,7 +94,7 @@ def reaches(seen: Sequence[Seen]) -> list[dict[str, float] | None]:
     return found
 
 
-class Adviser:
+class RecordingAdvice:
     """The one thing that is wrong with the pictures, once it has been so for `PATIENCE` seconds."""
 
     def __init__(self) -> None:

@@ -48,7 +48,7 @@ ADVICE = (
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Alignment:
     """What head and lips say, for people."""
 
     evidence: str  # `head overlap 0.940, lips overlap 0.820, 0.4% of the head's size away`, or that there are no masks
@@ -61,16 +61,16 @@ class Judgement:
             raise UserError(f"{self.problem}; {ADVICE}")
 
 
-def judge_sample(
+def check_sample(
     head: HeadModel, tracks: Mapping[int, FrameTrack], files: FrameFiles, pairs: Sequence[tuple[int, int]]
-) -> Judgement:
-    """The judgement on a few frames spread over `pairs` of image number and tracking number, all of which can be read."""
+) -> Alignment:
+    """The alignment in a few frames spread over `pairs` of image number and tracking number, all of which can be read."""
     if not pairs:
-        return judge([], files)
+        return measure_alignment([], files)
     project = MeshProjector(head)
     chosen = evenly_spread(pairs, SAMPLED_FRAMES)
     fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in chosen]
-    return judge([fit for fit in fits if fit is not None], files)
+    return measure_alignment([fit for fit in fits if fit is not None], files)
 
 
 def refuse_misplaced_cameras(
@@ -86,7 +86,7 @@ def refuse_misplaced_cameras(
         seen = [pair for pair in pairs if shots[pair[0]].camera == camera]
         own = evenly_spread(seen, SAMPLED_OF_A_CAMERA)
         fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in own]
-        problem = judge([fit for fit in fits if fit is not None], files).problem
+        problem = measure_alignment([fit for fit in fits if fit is not None], files).problem
         if problem is not None:
             raise UserError(
                 f"camera {camera}: {problem}; is its calibration right? Leave it out with --cameras, or say "
@@ -94,7 +94,7 @@ def refuse_misplaced_cameras(
             )
 
 
-def judge(fits: Sequence[Fit], files: FrameFiles) -> Judgement:
+def measure_alignment(fits: Sequence[Fit], files: FrameFiles) -> Alignment:
     """From how each frame's mesh lies on the masks of `files`."""
     head, inside, lips, pixels = (
         _median([getattr(f, name) for f in fits]) for name in ("overlap", "inside", "lips", "mouth")
@@ -120,7 +120,7 @@ def judge(fits: Sequence[Fit], files: FrameFiles) -> Judgement:
     notes = (
         (f"{outside:.0%} of the tracked head lies outside the pictures: {CUT_OFF}",) if outside > MAX_OUTSIDE else ()
     )
-    return Judgement(", ".join(f"{what} {how}" for what, how in seen.items()) or NO_MASKS, problem, notes)
+    return Alignment(", ".join(f"{what} {how}" for what, how in seen.items()) or NO_MASKS, problem, notes)
 
 
 def _median(values: Sequence[float]) -> float:

@@ -16,13 +16,13 @@ STILL = 1e-4  # range over the clip, of coefficients and of rotation matrices' e
 _JAW = JOINT_NAMES.index("jaw")
 
 
-class StillPart(NamedTuple):
+class ConstantParameter(NamedTuple):
     part: str
     is_absent: bool  # at rest, as trackers leave it that have no place for it
     sentence: str
 
 
-def still_parts(tracks: Sequence[FrameTrack], head: HeadAssets) -> list[StillPart]:
+def constant_parameters(tracks: Sequence[FrameTrack], head: HeadAssets) -> list[ConstantParameter]:
     """The parts that are the same in all frames while others move; all of them that the head model can move are judged."""
     if len(tracks) < FEWEST:
         return []
@@ -56,7 +56,9 @@ def still_parts(tracks: Sequence[FrameTrack], head: HeadAssets) -> list[StillPar
         verb = "are" if name == "eyelids" else "is"
         place = "at rest" if is_absent else "the same"
         found.append(
-            StillPart(name, is_absent, f"the tracked {name} {verb} {place} in all {len(tracks)} frames: {consequence}")
+            ConstantParameter(
+                name, is_absent, f"the tracked {name} {verb} {place} in all {len(tracks)} frames: {consequence}"
+            )
         )
     return found
 

@@ -19,7 +19,7 @@ from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.frame_track import FrameTrack
-from data_prep.prepare.check_alignment import judge_sample
+from data_prep.prepare.check_alignment import check_sample
 from data_prep.prepare.image_motion import motion_residuals
 from data_prep.prepare.masks import read_masks
 from data_prep.prepare.projection import filled_lips, lip_faces, project_head, silhouette
@@ -107,7 +107,7 @@ def detect_offset(
     if t < MIN_T or is_edge:
         if not ignore_misfit:
             pairs = [(n + best, n) for n in tracks if n + best in images]
-            judge_sample(head, tracks, files, pairs).refuse()  # the likelier reason
+            check_sample(head, tracks, files, pairs).refuse()  # the likelier reason
         raise UserError(
             f"the offset between images and tracking is not clear (best is {estimate.sentence()}); look at the frames and "
             f"{GIVE_OFFSET}"

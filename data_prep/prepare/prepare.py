@@ -21,11 +21,11 @@ from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
-from data_prep.formats.train_test_split import divide
+from data_prep.formats.train_test_split import split_frames_of
 from data_prep.prepare.cache import default_location, input_hash
 from data_prep.prepare.camera_rig import FoundCameras, Pose, find_rig
-from data_prep.prepare.check_alignment import judge_sample, refuse_misplaced_cameras
-from data_prep.prepare.constant_parameters import still_parts
+from data_prep.prepare.check_alignment import check_sample, refuse_misplaced_cameras
+from data_prep.prepare.constant_parameters import constant_parameters
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import detect_offset
 from data_prep.prepare.inspect_images import Inspection, composited_background, inspect_images
@@ -51,7 +51,7 @@ def prepare(
     """Prepare a tracked folder and return the prepared subject's folder; nothing is done when it is up to date.
 
     `head` is the head model that `source.head` names; `out` defaults to a folder in the cache (see `cache_folder`). `say`
-    receives one sentence per finding. `test_frames` and `test_cameras` say what is held out, as in `divide`. Raises
+    receives one sentence per finding. `test_frames` and `test_cameras` say what is held out (`split_frames_of`). Raises
     UserError with the file or frame and what to do when the folder cannot be used.
     """
     folder = Path(source.folder).resolve()
@@ -100,17 +100,19 @@ def prepare(
     offset, evidence = _find_offset(replace(tracked, files=files), model, tracks, inspection, source)
     centre = model.neutral_vertices().mean(0).numpy()
     pairing = pair_frames(files, inspection, tracks, offset, centre, source.max_left_out, tracked.shots)
-    judgement = judge_sample(model, tracks.frames, files, pairing.pairs)
+    alignment = check_sample(model, tracks.frames, files, pairing.pairs)
     if not source.ignore_misfit:
-        judgement.refuse()
+        alignment.refuse()
         refuse_misplaced_cameras(model, tracks.frames, files, pairing.pairs, tracked.shots)
     refuse_dark_cameras(files, pairing.pairs, tracked.shots)
-    evidence = f"{evidence}: {judgement.evidence}"
+    evidence = f"{evidence}: {alignment.evidence}"
     say(evidence)
     has_lips = len(lip_faces(model)) > 0
-    frames_split, split_notes = divide(tracked, [number for _, number in pairing.pairs], test_frames, test_cameras)
-    ignored = [f"{judgement.problem}: taken regardless, as --ignore-misfit says"] if judgement.problem else []
-    parts = still_parts(_of_one_camera(tracks, pairing, tracked.shots), head)
+    frames_split, split_notes = split_frames_of(
+        tracked, [number for _, number in pairing.pairs], test_frames, test_cameras
+    )
+    ignored = [f"{alignment.problem}: taken regardless, as --ignore-misfit says"] if alignment.problem else []
+    parts = constant_parameters(_of_one_camera(tracks, pairing, tracked.shots), head)
     still = [part.sentence for part in parts if not part.is_absent]
     assumed = _assumptions(files, inspection, has_lips)
     notes = [
@@ -122,7 +124,7 @@ def prepare(
         *tracks.flaws,
         *pairing.notes,
         *still,
-        *judgement.notes,
+        *alignment.notes,
         *assumed,
         *split_notes,
     ]

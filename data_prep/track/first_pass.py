@@ -17,7 +17,7 @@ from data_prep.track.footage.cuts import CutFinder, Shot
 from data_prep.track.footage.source import Footage, Span, stride, whole
 from data_prep.track.footage.timing import regular_timing
 
-LOOKED_AT = 1920  # pixels of the longer side; the landmarks come from 256 pixels around the face
+DETECTION_SIDE = 1920  # pixels of the longer side; the landmarks come from 256 pixels around the face
 MAX_PICTURES = 3600  # two minutes at 30 a second
 MIN_PICTURES = 10
 _PAUSE = 1.0  # seconds without a picture that count as a cut, if they are also several times the usual distance
@@ -41,7 +41,7 @@ class FirstPass:
 def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
     """Find one person's face in the clip's longest shot. Raises UserError, with what to do, where there is none."""
     notes: list[str] = []
-    view = whole(footage.width, footage.height, LOOKED_AT)
+    view = whole(footage.width, footage.height, DETECTION_SIDE)
     scale = np.array([footage.width / view.width, footage.height / view.height, footage.width / view.width], np.float32)
     times: list[float] = []
     found: list[list[Face]] = []

@@ -70,7 +70,9 @@ class Quality:
         return {"figures": figures, "worst_frames": list(self.worst_frames), "focal": self.focal}
 
 
-def judge(landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline | None, focal: Focal) -> Quality:
+def grade_tracking(
+    landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline | None, focal: Focal
+) -> Quality:
     """The figures of a finished tracking. `fit.figures` holds what `landmark_figures` made of it."""
     own = fit.figures
     shots = {name: float(value) for name, value in own["errors"].items()}

@@ -44,7 +44,7 @@ from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.mattes.matting_network import check_matting
 from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.mattes.user_mattes import OwnMattes, open_mattes, refuse_mattes_of_others
-from data_prep.track.quality import judge
+from data_prep.track.quality import grade_tracking
 from data_prep.track.stage_folder import StageFolder, growing
 from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
 from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
@@ -119,7 +119,7 @@ def track(
         overlaps, outline = work.masks(landmarks, fit)
         fit = work.torso(fit)
         work.overlay(fit, look)
-        quality = judge(landmarks, fit, overlaps, outline, focal)
+        quality = grade_tracking(landmarks, fit, overlaps, outline, focal)
         for line in quality.lines():
             say(line)
         save_landmarks(stages.path / LANDMARKS_FILE, landmarks)

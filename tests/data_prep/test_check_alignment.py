@@ -25,7 +25,7 @@ from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.check.folder import check_tracked_folder
 from data_prep.formats.frame_files import FrameFiles
-from data_prep.prepare.check_alignment import judge
+from data_prep.prepare.check_alignment import measure_alignment
 from data_prep.prepare.mask_overlap import Fit
 from data_prep.prepare.prepare import prepare
 
@@ -96,12 +96,12 @@ def test_where_the_limits_are(
     good, bad = Fit(1.0, 1.0, 0.0, 1.0, 0.0, 1.0, size), Fit(0.0, 0.0, 9.0, 0.0, size, 1.0, size)
     strays = [good, bad] if np.isfinite([head, lips, away]).all() else []
     for fits in ([usual], [usual, *strays, usual, usual]):  # single frames do not decide
-        judgement = judge(fits, files)
+        alignment = measure_alignment(fits, files)
         assert (
-            None if judgement.problem is None else judgement.problem.split()[0 if found == "neither" else 2]
+            None if alignment.problem is None else alignment.problem.split()[0 if found == "neither" else 2]
         ) == found
-        assert ("head overlap" in judgement.evidence) == np.isfinite(head)
-        assert ("lips overlap" in judgement.evidence) == np.isfinite(lips)
+        assert ("head overlap" in alignment.evidence) == np.isfinite(head)
+        assert ("lips overlap" in alignment.evidence) == np.isfinite(lips)
 
 
 @pytest.mark.parametrize("options", [{}, {"frame_offset": 1}], ids=["offset found", "offset given"])

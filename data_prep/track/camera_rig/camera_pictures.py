@@ -13,7 +13,7 @@ import numpy as np
 from avatar.errors import UserError
 from data_prep.track.camera_rig.recording import Recording
 from data_prep.track.faces.detect import Face, FaceDetector
-from data_prep.track.first_pass import LOOKED_AT
+from data_prep.track.first_pass import DETECTION_SIDE
 from data_prep.track.footage.pictures import resampled
 from data_prep.track.footage.source import Box, Footage, Span, View, whole
 from data_prep.track.frames import JPEG, frame_file, mask_file, write_image
@@ -51,7 +51,7 @@ def find_front(recording: Recording, span: Span) -> str:
     with FaceDetector() as detector:
         for serial, camera in recording.cameras.items():
             footage = camera.footage
-            pictures = footage.read(whole(footage.width, footage.height, LOOKED_AT), span, lambda _: None)
+            pictures = footage.read(whole(footage.width, footage.height, DETECTION_SIDE), span, lambda _: None)
             faces = [detector.anywhere(picture.image) for _, picture in zip(range(_SAMPLES), pictures, strict=False)]
             if seen := [_frontality(face) for face in faces if face is not None]:
                 facing[serial] = float(np.median(seen))
@@ -70,9 +70,9 @@ def _frontality(face: Face) -> float:
     return float(abs(normal[2]) / max(np.linalg.norm(normal), 1e-9))
 
 
-def looked_at(view: View, footage: Footage) -> View:
+def detection_view(view: View, footage: Footage) -> View:
     """The size at which pictures are read: enough for the landmarks and for the view."""
-    return whole(footage.width, footage.height, max(LOOKED_AT, view.width, view.height))
+    return whole(footage.width, footage.height, max(DETECTION_SIDE, view.width, view.height))
 
 
 def write_pictures(

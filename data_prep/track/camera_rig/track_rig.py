@@ -28,7 +28,7 @@ from data_prep.prepare.camera_rig import Pose
 from data_prep.prepare.projection import head_params, project_head
 from data_prep.progress import Progress, silent
 from data_prep.track.camera_rig import gha_folder, recording
-from data_prep.track.camera_rig.camera_pictures import Times, copy_mattes, find_front, looked_at, write_pictures
+from data_prep.track.camera_rig.camera_pictures import Times, copy_mattes, detection_view, find_front, write_pictures
 from data_prep.track.camera_rig.head_mattes import MatteClip, front_colours, write_head_mattes
 from data_prep.track.camera_rig.place_head import Points, View, place_head, refuse_misfit
 from data_prep.track.camera_rig.recording import MAX_DIFFERENCE, Camera, Recording
@@ -151,7 +151,7 @@ class _RigTracking:
 
         def make(folder: Path) -> dict[str, Any]:
             timed = progress(
-                times.pick(camera.footage, looked_at(view, camera.footage)), len(times.numbers), f"camera {serial}"
+                times.pick(camera.footage, detection_view(view, camera.footage)), len(times.numbers), f"camera {serial}"
             )
             return {"found": write_pictures(folder, timed, view, landmarks)}
 

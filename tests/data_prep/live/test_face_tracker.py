@@ -23,7 +23,7 @@ from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import matrix_from_6d
 from data_prep.live import face_tracker
-from data_prep.live.face_tracker import FaceFollower
+from data_prep.live.face_tracker import LiveFaceTracker
 from data_prep.live.pictures import open_source
 from data_prep.track.fit.fitting import find_embedding
 
@@ -47,7 +47,7 @@ def test_the_mouth_is_followed(video: Path, head: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(face_tracker, "CALIBRATION_SECONDS", 2.0)
     assets = load_head_assets(head)
     said: list[str] = []
-    with contextlib.closing(FaceFollower(open_source(str(video)), assets, head, said.append)) as follower:
+    with contextlib.closing(LiveFaceTracker(open_source(str(video)), assets, head, said.append)) as follower:
         with pytest.raises(RuntimeError, match="comes after calibrate"):
             follower.follow()
         calibration = follower.calibrate(said.append)
@@ -72,18 +72,18 @@ def test_the_field_of_view_says_how_far_the_face_is(video: Path, head: Path, mon
     monkeypatch.setattr(face_tracker, "CALIBRATION_SECONDS", 1.0)
     assets, distances = load_head_assets(head), []
     for degrees in (15.0, 30.0):
-        with contextlib.closing(FaceFollower(open_source(str(video)), assets, head, print, degrees)) as follower:
+        with contextlib.closing(LiveFaceTracker(open_source(str(video)), assets, head, print, degrees)) as follower:
             faces = follower.calibrate(lambda _: None).faces
         distances.append(float(np.median([float(face.t_cam_head[2]) for face in faces])))
     expected = math.tan(math.radians(15.0)) / math.tan(math.radians(7.5))
     assert distances[0] / distances[1] == pytest.approx(expected, rel=0.1)
     with pytest.raises(UserError, match="--fov must be from 1 to 150 degrees"):
-        FaceFollower(open_source(str(video)), assets, head, print, 180.0)
+        LiveFaceTracker(open_source(str(video)), assets, head, print, 180.0)
 
 
 def test_a_video_that_is_too_short_to_calibrate(video: Path, head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(face_tracker, "CALIBRATION_SECONDS", 60.0)
-    follower = FaceFollower(open_source(str(video)), load_head_assets(head), head, print)
+    follower = LiveFaceTracker(open_source(str(video)), load_head_assets(head), head, print)
     with pytest.raises(UserError, match=r"has ended.*; \d+ pictures showed the face, calibration takes 20 and 60 s"):
         follower.calibrate(lambda _: None)
     follower.close()
@@ -92,7 +92,7 @@ def test_a_video_that_is_too_short_to_calibrate(video: Path, head: Path, monkeyp
 def test_a_picture_without_a_face(tmp_path: Path, head: Path) -> None:
     grey = encode(tmp_path / "grey.mp4", [np.full((96, 96, 3), 90, np.uint8)] * 4, fps=25)
     said: list[str] = []
-    follower = FaceFollower(open_source(str(grey)), load_head_assets(head), head, print)
+    follower = LiveFaceTracker(open_source(str(grey)), load_head_assets(head), head, print)
     with pytest.raises(UserError, match="has ended after 4 pictures; 0 pictures showed the face"):
         follower.calibrate(said.append)
     assert said == [face_tracker.NO_FACE]

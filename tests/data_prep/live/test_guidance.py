@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posing import picture, posed
 
-from data_prep.live.recording_guidance import ENDS, PATIENCE, PROMPTS, Adviser, Seen, measures, reaches
+from data_prep.live.recording_guidance import ENDS, PATIENCE, PROMPTS, RecordingAdvice, Seen, measures, reaches
 from data_prep.track.faces.detect import Face
 
 PICTURE = picture()
@@ -30,19 +30,19 @@ PICTURE = picture()
     ],
 )
 def test_what_is_wrong_is_said(image: np.ndarray, face: Face | None, advice: str) -> None:
-    adviser = Adviser()
+    adviser = RecordingAdvice()
     for _ in range(20):
         assert adviser.problem(PICTURE, posed()) == ""
     assert adviser.problem(image, face) == advice
 
 
 def test_a_camera_out_of_focus_is_told_from_a_movement() -> None:
-    adviser = Adviser()
+    adviser = RecordingAdvice()
     assert {adviser.problem(picture(blur=8.0), posed()) for _ in range(5)} == {"focus the camera, or wipe its lens"}
 
 
 def test_advice_waits_for_half_a_second_and_ends_at_once() -> None:
-    adviser, small = Adviser(), posed(height=150)
+    adviser, small = RecordingAdvice(), posed(height=150)
     said = [adviser.advise(PICTURE, small if 10 <= n < 30 else posed(), n / 20) for n in range(40)]
     wait = round(20 * PATIENCE)
     assert said == [""] * (10 + wait) + ["come closer"] * (20 - wait) + [""] * 10

@@ -28,4 +28,4 @@ def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tracking.TrackingStages, "masks", lambda *_: ([1.0], None))
     monkeypatch.setattr(tracking.TrackingStages, "torso", lambda _, fit: fit)
     monkeypatch.setattr(tracking.TrackingStages, "overlay", lambda *_: None)
-    monkeypatch.setattr(tracking, "judge", lambda *_: Quality((), (), ""))
+    monkeypatch.setattr(tracking, "grade_tracking", lambda *_: Quality((), (), ""))

@@ -20,7 +20,7 @@ from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import minimise
 from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.result import Fit
-from data_prep.track.quality import judge, landmark_figures
+from data_prep.track.quality import grade_tracking, landmark_figures
 
 FRAMES = 64
 AT_512 = 512 / SIZE
@@ -96,7 +96,7 @@ def test_the_table_tells_of_irises_that_do_not_follow(looked: Looked) -> None:
     def grades(landmarks: Landmarks, motion: Motion = fit.motion) -> list[str | None]:
         tracks = as_tracks(fit, motion, scene.camera, landmarks.size, scene.assets.num_expressions)
         figures = landmark_figures(scene.assets, Fit(tracks, {}), landmarks, scene.embedding)
-        quality = judge(landmarks, Fit(tracks, figures), [1.0], None, Focal(1.0, "given", False))
+        quality = grade_tracking(landmarks, Fit(tracks, figures), [1.0], None, Focal(1.0, "given", False))
         return [figure.grade for figure in quality.figures if "irises" in figure.name]
 
     assert grades(scene.landmarks) == ["good"]
