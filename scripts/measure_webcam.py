@@ -32,7 +32,7 @@ from data_prep.live.pictures import LONGEST, open_source
 from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
-from data_prep.track.fit.fitting import find_embedding
+from data_prep.track.fit.fit_clip import find_embedding
 from data_prep.track.fit.focal import choose_focal
 from data_prep.track.fit.landmark_fit import eye_distance, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import concatenated

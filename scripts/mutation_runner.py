@@ -76,7 +76,7 @@ class Changed(MetaPathFinder):
 
 def check_arrays_first() -> None:
     """Install the tests' import hook now: it would find the changed module's own file if it came later."""
-    sys.path.insert(0, str(ROOT / "tests"))
+    sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import array_shapes
 
     array_shapes.install_array_checks()

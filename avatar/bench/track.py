@@ -38,7 +38,7 @@ from data_prep.formats.avatar_track import LANDMARKS_FILE
 from data_prep.prepare.open_subject import find_head, open_subject
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.fit.camera import Pinhole
-from data_prep.track.fit.fitting import as_tracks, find_embedding
+from data_prep.track.fit.fit_clip import as_tracks, find_embedding
 from data_prep.track.fit.landmark_fit import fit_landmarks
 from data_prep.track.track import Choices, track
 

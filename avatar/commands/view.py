@@ -24,10 +24,10 @@ from avatar.errors import UserError, check_installed
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file, open_run
-from avatar.runs.curves import read_curves
 from avatar.runs.motion_clip import Clip, driven_clip, own_clip
 from avatar.runs.run import RUN_FILE, Run, open_trained
 from avatar.runs.trained_avatar import TrainedAvatar, avatar_path
+from avatar.runs.training_curves import read_curves
 from avatar.view.auth import LOCAL
 from avatar.view.newest_checkpoint import NewestAvatar, progress
 from avatar.view.player import Player

@@ -32,10 +32,9 @@ from avatar.data.colours import colour_name
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import MissingPackage, UserError
-from avatar.evaluation.conditions import conditions
-from avatar.evaluation.curves import curves
 from avatar.evaluation.draw import contact_sheet, draw, panel, speed
 from avatar.evaluation.find_lpips import find_networks
+from avatar.evaluation.frame_curves import curves
 from avatar.evaluation.held_out import views
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import FrameMeasurer
@@ -46,6 +45,7 @@ from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
 from avatar.evaluation.report import frames_csv, table
 from avatar.evaluation.results import FrameResult, summarise
 from avatar.evaluation.tracking_source import Drive, describe_tracking, drives, parts, renders_of, tracking_notes
+from avatar.evaluation.training_coverage import conditions
 from avatar.files.atomic import write_atomically
 from avatar.files.video import video_writer
 from avatar.losses.lpips_network import Lpips, Net

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from avatar.errors import UserError
-from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.pictures import clear_pictures
 from avatar.evaluation.protocol import NAME, Protocol, builtin_protocols
 from avatar.evaluation.results import FrameResult
 from avatar.evaluation.tracking_source import FRAMES_FILE, TRACKED_FILE, Drive, parts
+from avatar.evaluation.training_coverage import Conditions
 from avatar.files.read import read_bytes, read_json, read_text
 
 MAX_TABLE_BYTES = 2**28  # of a table of frames

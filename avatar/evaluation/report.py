@@ -8,11 +8,11 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.held_out import View
 from avatar.evaluation.protocol import MEASURES, REGIONS, column
 from avatar.evaluation.results import FrameResult
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
+from avatar.evaluation.training_coverage import Conditions
 
 MAIN_TITLE = "by the protocol"
 FORMATS = {"psnr": "7.2f", "ssim": "8.4f", "lpips": "8.4f"}

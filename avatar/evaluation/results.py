@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from avatar.evaluation.bootstrap import BlockBootstrap, block_length, describe
-from avatar.evaluation.conditions import Conditions
 from avatar.evaluation.find_lpips import ChosenLpips
 from avatar.evaluation.held_out import View
 from avatar.evaluation.measure import Figures
 from avatar.evaluation.protocol import Protocol
 from avatar.evaluation.tracking_source import Drive
+from avatar.evaluation.training_coverage import Conditions
 
 YAW_EDGES = (-30.0, -10.0, 10.0, 30.0)  # degrees
 DISTANCE_QUANTILES = (0.25, 0.5, 0.75)  # edges of the bins of expression distance: four bins with as many frames each

@@ -24,10 +24,10 @@ from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open_inputs import check_data, moved_source
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
-from avatar.runs.curves import CURVES_FILE
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
+from avatar.runs.training_curves import CURVES_FILE
 from avatar.train.frame_order import within_epochs
 from avatar.train.loss import PerceptualTerm, choose_perceptual
 from avatar.train.trainer import save_avatar, train

@@ -17,8 +17,8 @@ from avatar.files.read import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.parts import SERIES, data_uri
 from avatar.report.pictures import frame_panels
-from avatar.runs.curves import read_curves
 from avatar.runs.run import Run, versions
+from avatar.runs.training_curves import read_curves
 
 MAIN = {
     "psnr": ("PSNR, dB", "\N{UPWARDS ARROW} higher"),

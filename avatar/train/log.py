@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
-from avatar.runs.curves import LOSSES, read_curves, write_curves
+from avatar.runs.training_curves import LOSSES, read_curves, write_curves
 
 LOG_EVERY = 10  # steps between points of the training curves
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows

@@ -22,7 +22,7 @@ from data_prep.live.pictures import LivePicture, Newest, Source
 from data_prep.track.faces.detect import Face, FaceDetector, overlap
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
-from data_prep.track.fit.fitting import find_embedding
+from data_prep.track.fit.fit_clip import find_embedding
 from data_prep.track.fit.focal import choose_focal
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.motion import Motion, six_d

@@ -22,13 +22,13 @@ from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.expression_kind import is_statistical
+from data_prep.track.fit.initial_pose import start_poses
 from data_prep.track.fit.landmark_fit import LandmarkFit, faded, is_rigid, point_units, weighted_landmarks
 from data_prep.track.fit.levenberg_marquardt import Term, concatenated, minimise
 from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.priors import expected, score_targets
 from data_prep.track.fit.smoothness import NOMINAL_FPS, Smoothness, make_smoothness
-from data_prep.track.fit.start import start_poses
 
 STEPS = 2  # of Levenberg-Marquardt; more do not bring it nearer to the fit of the whole clip
 FIRST_STEPS = 8  # of a face that nothing is known of

@@ -16,7 +16,7 @@ from data_prep.progress import Progress
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.first_pass import FirstPass
-from data_prep.track.fit.fitting import fit_tracks
+from data_prep.track.fit.fit_clip import fit_tracks
 from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.footage.pictures import open_footage

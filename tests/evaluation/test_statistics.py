@@ -14,11 +14,11 @@ from heads import grid_head, random_params, rest_params
 
 from avatar.data.split import Split
 from avatar.evaluation.bootstrap import RESAMPLES, BlockBootstrap, block_length
-from avatar.evaluation.conditions import Conditions, conditions, expression_distances
-from avatar.evaluation.curves import line
+from avatar.evaluation.frame_curves import line
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import Pair
 from avatar.evaluation.results import FrameResult, binned, worst_frames
+from avatar.evaluation.training_coverage import Conditions, conditions, expression_distances
 from avatar.head.model import HeadModel
 from avatar.motion.orbit import seen_from
 from avatar.types import Camera

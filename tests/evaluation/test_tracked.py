@@ -17,8 +17,8 @@ from disc import TEST, BlobRenderer, make_run, make_subject, read_png, refined
 
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.evaluation import curves as curves_module
 from avatar.evaluation import evaluate as evaluate_module
+from avatar.evaluation import frame_curves as curves_module
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS
 from avatar.evaluation.evaluate import evaluate

@@ -16,7 +16,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from avatar.report.page import bins_tables, means_table
-from avatar.runs.curves import read_curves
+from avatar.runs.training_curves import read_curves
 
 LOADED = "[[...document.images].filter((one) => one.naturalWidth > 0).length, document.images.length]"
 

@@ -34,7 +34,7 @@ from data_prep.track.camera_rig.place_head import Points, View, place_head, refu
 from data_prep.track.camera_rig.recording import MAX_DIFFERENCE, Camera, Recording
 from data_prep.track.camera_rig.vhap_listing import IMAGES, MATTES, PARAMETERS, lens_in, write_listing, write_parameters
 from data_prep.track.faces.embedding import LandmarkEmbedding
-from data_prep.track.fit.fitting import find_embedding
+from data_prep.track.fit.fit_clip import find_embedding
 from data_prep.track.footage.source import MIN_SIDE, Span, check_span, whole
 from data_prep.track.frames import frame_file
 from data_prep.track.inputs import look_inputs, tracking_key

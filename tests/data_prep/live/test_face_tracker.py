@@ -25,7 +25,7 @@ from avatar.head.model import matrix_from_6d
 from data_prep.live import face_tracker
 from data_prep.live.face_tracker import LiveFaceTracker
 from data_prep.live.pictures import open_source
-from data_prep.track.fit.fitting import find_embedding
+from data_prep.track.fit.fit_clip import find_embedding
 
 pytestmark = [pytest.mark.usefixtures("tracking_models"), pytest.mark.slow]
 FRAMES, SIZE, SEED, FPS = 48, 192, 1, 10.0

@@ -10,7 +10,7 @@ from heads import grid_head
 
 from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
-from data_prep.track.fit import fitting
+from data_prep.track.fit import fit_clip
 
 
 def test_what_is_known_needs_no_landmarker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,7 +21,7 @@ def test_what_is_known_needs_no_landmarker(tmp_path: Path, monkeypatch: pytest.M
     with monkeypatch.context() as patch:
         patch.setattr("data_prep.track.faces.rendered_embedding.make_embedding", lambda *_: made)
         rendered_embedding(head, lambda image: None)
-    monkeypatch.setattr(fitting, "official_embedding", lambda *_: None)
-    monkeypatch.setattr(fitting, "FaceDetector", lambda: pytest.fail("the landmarker is loaded"))
-    found = fitting.find_embedding(tmp_path, head)
+    monkeypatch.setattr(fit_clip, "official_embedding", lambda *_: None)
+    monkeypatch.setattr(fit_clip, "FaceDetector", lambda: pytest.fail("the landmarker is loaded"))
+    found = fit_clip.find_embedding(tmp_path, head)
     assert found.landmarks.tolist() == [7] and found.barycentric.tolist() == [[0.5, 0.25, 0.25]]

@@ -14,7 +14,7 @@ from avatar.demo.motion import perform
 from data_prep.track.faces.landmark_groups import IRISES
 from data_prep.track.faces.landmarks import BLENDSHAPES, CLOSED_SCORE, Landmarks
 from data_prep.track.fit import photometric_fit
-from data_prep.track.fit.fitting import as_tracks
+from data_prep.track.fit.fit_clip import as_tracks
 from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import minimise

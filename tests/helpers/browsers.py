@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-WEB = Path(__file__).resolve().parents[1] / "avatar" / "web"
+WEB = Path(__file__).resolve().parents[2] / "avatar" / "web"
 # Chromium's own software renderer, so that machines with a GPU and without see the same.
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
