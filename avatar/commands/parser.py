@@ -52,10 +52,11 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     track = commands.add_parser("track")
     track.add_argument(
-        "video",
+        "videos",
         type=Path,
+        nargs="+",
         metavar="VIDEO",
-        help="a video, a folder of numbered PNG or JPEG pictures, or several calibrated cameras",
+        help="a video, a folder of numbered PNG or JPEG pictures, or sequences of several calibrated cameras",
     )
     add_head(track)
     track.add_argument("--out", type=Path, required=True, metavar="SUBJECT", help="the tracked folder to write")

@@ -18,10 +18,11 @@ from data_prep.track.track import Choices, track
 
 def run_track(arguments: Namespace) -> int:
     check_folder_output(arguments.out)
-    check_outputs([arguments.out], [arguments.video, arguments.matte, arguments.head])
-    head = head_for_video(arguments.video, arguments.head)
+    check_outputs([arguments.out], [*arguments.videos, arguments.matte, arguments.head])
+    video: Path = arguments.videos[0]
+    head = head_for_video(video, arguments.head)
     span = Span(arguments.start or 0.0, arguments.end)
-    if track_rig.recognise(arguments.video):
+    if track_rig.recognise(video) or len(arguments.videos) > 1:
         return _track_rig(arguments, head, span)
     choices = Choices(
         crop=parse_crop(arguments.crop),
@@ -32,7 +33,7 @@ def run_track(arguments: Namespace) -> int:
         matte=arguments.matte,
         rotate=arguments.rotate,
     )
-    track(arguments.video, arguments.out, head, load_head_assets(head), choices, progress=progress_bar)
+    track(video, arguments.out, head, load_head_assets(head), choices, progress=progress_bar)
     print(f"Look at  {arguments.out / 'overlay'}")
     print(f"Next     avatar train {arguments.out}")
     return OK
@@ -42,11 +43,11 @@ def _track_rig(arguments: Namespace, head: Path, span: Span) -> int:
     given = arguments.focal, arguments.fov, arguments.rotate, arguments.matte
     if any(value is not None for value in given) or arguments.crop != "auto":
         raise UserError(
-            f"{arguments.video} is a recording by several calibrated cameras, whose whole pictures are taken as they are: "
-            "leave out --focal, --fov, --rotate, --crop and --matte"
+            f"{arguments.videos[0]} is a recording by several calibrated cameras, whose whole pictures are taken as they "
+            "are: leave out --focal, --fov, --rotate, --crop and --matte"
         )
     track_rig.track_rig(
-        arguments.video, arguments.out, head, load_head_assets(head), arguments.size, span, progress=progress_bar
+        arguments.videos, arguments.out, head, load_head_assets(head), arguments.size, span, progress=progress_bar
     )
     print(f"Look at  {arguments.out / 'front' / 'overlay'}")
     print(f"Next     avatar train {arguments.out} --head {head}")

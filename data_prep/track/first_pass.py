@@ -15,7 +15,7 @@ from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.faces.person import follow_one
 from data_prep.track.footage.cuts import CutFinder, Shot
 from data_prep.track.footage.source import Footage, Span, stride, whole
-from data_prep.track.footage.timing import regular_timing
+from data_prep.track.footage.timing import Timing, regular_timing
 
 DETECTION_SIDE = 1920  # pixels of the longer side; the landmarks come from 256 pixels around the face
 MAX_PICTURES = 3600  # two minutes at 30 a second
@@ -72,7 +72,8 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
         raise UserError(
             f"no face was found in any of the {len(times)} pictures of {footage.path}{_because(notes)}: {why}"
         )
-    shot = _longest_shot(cuts.shots(), np.array(times), found, notes)
+    shots = [Shot(0, len(times))] if footage.is_joined else cuts.shots()
+    shot = _longest_shot(shots, np.array(times), found, notes)
     faces, about = follow_one(found[shot.start : shot.end])
     notes += about
     return _on_grid(footage, shot, np.array(times), faces, is_whole, notes)
@@ -104,7 +105,10 @@ def _on_grid(
 ) -> FirstPass:
     own = times[shot.start : shot.end]
     stated = None if footage.rate is None else footage.rate / stride(footage.rate)
-    timing = regular_timing(own, stated)
+    if footage.is_joined and stated is not None:
+        timing = Timing(stated, np.rint((own - own[0]) * stated).astype(np.int64), ())
+    else:
+        timing = regular_timing(own, stated)
     notes += timing.notes
     if timing.fps < _SLOW:
         notes.append(

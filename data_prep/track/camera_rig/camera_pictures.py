@@ -30,6 +30,9 @@ class Times(NamedTuple):
     begins: float
     fps: float
 
+    def seconds(self, number: int) -> float:
+        return self.begins + number / self.fps
+
     def pick(self, footage: Footage, view: View) -> Iterator[tuple[int, np.ndarray]]:
         """The nearest picture of each time, of all that the camera has: it need not have begun with the others."""
         span = Span(max(0.0, self.begins - 1 / self.fps), self.begins + (max(self.numbers) + 1) / self.fps)

@@ -10,7 +10,9 @@ What GaussianHeadAvatar's preprocessing makes (`gha_folder.py`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +21,11 @@ from avatar.errors import UserError
 from data_prep.ffmpeg import count_pictures
 from data_prep.formats.nersemble import TRAINED_CAMERA, camera_videos
 from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras, read_serials
-from data_prep.track.footage.source import Footage
+from data_prep.track.footage.joined import join
+from data_prep.track.footage.source import Footage, stride
 from data_prep.track.footage.video import open_video
 
+NOMINAL_RATE = 25.0
 MAX_DIFFERENCE = 2  # pictures, in length; of more, one is not whole
 
 
@@ -40,6 +44,7 @@ class Recording:
     cameras: dict[str, Camera]  # by serial
     front: str | None  # the camera before the face, where that is known
     unused: tuple[str, ...] = ()  # cameras that are calibrated and have no pictures
+    sequences: tuple[tuple[str, float], ...] = ()  # of several: name, and the second at which it begins
 
 
 def recognise(folder: Path) -> bool:
@@ -62,6 +67,38 @@ def open_recording(folder: Path) -> Recording:
     calibrated = read_cameras(person, {serial: (one.width, one.height) for serial, one in footage.items()})
     cameras = {serial: Camera(footage[serial], *calibrated[serial][:3]) for serial in videos}
     return Recording(folder, cameras, TRAINED_CAMERA if TRAINED_CAMERA in cameras else None, unused)
+
+
+def join_recordings(recordings: Sequence[Recording]) -> Recording:
+    """Sequences of one person, one after the other, by the cameras that filmed all of them.
+
+    Between two of them one time of the front camera has no picture, so that nothing is smoothed from one to the other.
+    Raises UserError where they are not of one person's calibration, or one is given twice.
+    """
+    first = recordings[0]
+    folders = [recording.folder.resolve() for recording in recordings]
+    if len({folder.parent for folder in folders}) > 1 or len(set(folders)) < len(folders):
+        raise UserError(
+            f"several recordings are tracked together where they are different sequences beside each other, as "
+            f"ID/sequences/EXP-1-head and ID/sequences/FREE; {recordings[-1].folder} and {first.folder} are not"
+        )
+    serials = [serial for serial in first.cameras if all(serial in one.cameras for one in recordings)]
+    starts = [0.0]
+    for recording in recordings[:-1]:
+        lengths = [recording.cameras[serial].footage for serial in serials]
+        seconds = max((footage.duration or 0.0 for footage in lengths), default=0.0)
+        rate = (lengths[0].rate or NOMINAL_RATE) / stride(lengths[0].rate) if lengths else NOMINAL_RATE
+        starts.append(starts[-1] + (math.ceil(seconds * rate - 0.01) + 1) / rate)
+    cameras = {
+        serial: replace(
+            first.cameras[serial], footage=join([one.cameras[serial].footage for one in recordings], starts)
+        )
+        for serial in serials
+    }
+    unused = {serial for one in recordings for serial in (*one.cameras, *one.unused)} - set(serials)
+    names = tuple(zip((folder.name for folder in folders), starts, strict=True))
+    front = first.front if first.front in cameras else None
+    return Recording(first.folder.parent, cameras, front, tuple(sorted(unused)), names)
 
 
 def without_pictures(filmed: set[str], calibrated: set[str], calibration: Path) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ fg_masks   head and neck in each of them
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ from data_prep.track.tracking_stages import Choices
 
 DEFAULT_SIZE = 802  # pixels of the longer side, as GaussianAvatars' data set has
 FRONT, WHOLE = "front", Span()
+HELD_OUT = "FREE"  # NeRSemble's sequence that is not trained on
 _LANDMARKS = 120  # of which the scale is found; the others say the same
 
 
@@ -54,7 +55,7 @@ def recognise(folder: Path) -> bool:
 
 
 def track_rig(
-    folder: Path,
+    folders: Sequence[Path],
     out: Path,
     head_path: Path,
     head: HeadAssets,
@@ -63,7 +64,10 @@ def track_rig(
     say: Callable[[str], object] = print,
     progress: Progress = silent,
 ) -> None:
-    """Track the recording in `folder` and write a folder in VHAP's layout, of pictures with `size` on the longer side.
+    """Track a recording and write a folder in VHAP's layout, of pictures with `size` on the longer side.
+
+    folders  the recording; or sequences of one person beside each other, which get one identity and one scale. Those
+             called FREE are listed for testing.
 
     Goes on from the stages of an interrupted call, as `track` does. Raises UserError, with what to do, where cameras and
     calibration do not belong together or show no face, and where `out` is not empty.
@@ -72,7 +76,10 @@ def track_rig(
         raise UserError(f"--size must be from {MIN_SIDE} to 4096 pixels, not {size}")
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out} is not empty: choose another --out, or remove it first")
-    opened = (recording if recording.recognise(folder) else gha_folder).open_recording(folder)
+    opened = _open(folders)
+    if opened.sequences and span != WHOLE:
+        raise UserError("--start and --end are of one sequence: leave them out, or track the sequences by themselves")
+    folder = opened.folder
     if len(opened.cameras) < 2:
         raise UserError(
             f"{folder} has pictures of one calibrated camera; two at least tell the head's size from its distance: copy "
@@ -106,7 +113,8 @@ def track_rig(
         times = times._replace(numbers=list(tracks))
         for serial in opened.cameras:
             rig.mattes(serial, tracks, placed.scale, times, colours, embedding, looks[serial][1], progress)
-        rig.write(tracks, placed.scale, times.fps)
+        tested = _held_out(opened, times, say)
+        rig.write(tracks, placed.scale, times.fps, tested)
         stages.finish(out, ())
     say(f"tracked {len(tracks)} times of {len(opened.cameras)} cameras in {out}")
 
@@ -192,12 +200,12 @@ class _RigTracking:
         inputs = {"images": key, "network": network.sha256, "given": given, "poses": poses, "camera": seen}
         self._stages.run(f"{MATTES}/{serial}", inputs, make)
 
-    def write(self, tracks: Mapping[int, FrameTrack], scale: float, fps: float) -> None:
+    def write(self, tracks: Mapping[int, FrameTrack], scale: float, fps: float, tested: Collection[int] = ()) -> None:
         out, to_world = self._stages.path, _pose(self._cameras[self._front], scale).inverse()
         with writing(out):
             self._remove_others()
             write_parameters(out, tracks, to_world, self._head)
-            write_listing(out, self._cameras, self._views, list(tracks), scale, fps)
+            write_listing(out, self._cameras, self._views, list(tracks), scale, fps, tested)
 
     def _remove_others(self) -> None:
         """What earlier calls made of cameras that are not there now, and the heads that they wrote."""
@@ -206,6 +214,31 @@ class _RigTracking:
                 if path.name not in self._cameras:
                     shutil.rmtree(path)
         shutil.rmtree(self._stages.path / PARAMETERS, ignore_errors=True)
+        for path in self._stages.path.glob("transforms*.json"):
+            path.unlink()
+
+
+def _open(folders: Sequence[Path]) -> Recording:
+    if len(folders) == 1:
+        return (recording if recording.recognise(folders[0]) else gha_folder).open_recording(folders[0])
+    for folder in folders:
+        if not recording.recognise(folder):
+            raise UserError(f"{folder} has no images/cam_SERIAL.mp4: only sequences of NeRSemble are tracked together")
+    return recording.join_recordings([recording.open_recording(folder) for folder in folders])
+
+
+def _held_out(opened: Recording, times: Times, say: Callable[[str], object]) -> set[int]:
+    """Times of the sequences that are called FREE; none where there is nothing else."""
+    begins = np.array([seconds for _, seconds in opened.sequences])
+    tested: set[int] = set()
+    for row, (name, _) in enumerate(opened.sequences):
+        own = [
+            n for n in times.numbers if np.searchsorted(begins, times.seconds(n) + 0.5 / times.fps, "right") == row + 1
+        ]
+        is_tested = name.upper().startswith(HELD_OUT)
+        say(f"{name}: {f'times {own[0]} to {own[-1]}' if own else 'no times'}{', held out' if is_tested else ''}")
+        tested |= set(own) if is_tested else set()
+    return tested if len(tested) < len(times.numbers) else set()
 
 
 def _pose(camera: Camera, scale: float = 1.0) -> Pose:

@@ -6,7 +6,7 @@ The cameras' world is the calibration's, scaled to metres.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from data_prep.track.footage.source import View
 from data_prep.track.frames import frame_file, mask_file
 
 IMAGES, MATTES, PARAMETERS, LISTING = "images", "fg_masks", "flame_param", "transforms.json"
+TRAIN_LISTING, TEST_LISTING = "transforms_train.json", "transforms_test.json"
 
 
 def lens_in(camera: Camera, view: View) -> np.ndarray:
@@ -40,11 +41,15 @@ def write_listing(
     times: Sequence[int],
     scale: float,
     fps: float,
+    tested: Collection[int] = (),
 ) -> None:
-    """`scale` is in metres for one unit of the calibration."""
-    entries = list(_entries(cameras, views, times, scale))
-    content = {"frames": entries, "fps": fps, "timestep_indices": list(times), "camera_indices": [*range(len(cameras))]}
-    (folder / LISTING).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    """`scale` is in metres for one unit of the calibration; times of `tested` are listed by themselves."""
+    trained = [time for time in times if time not in tested]
+    listings = {TRAIN_LISTING: trained, TEST_LISTING: sorted(tested)} if tested else {LISTING: trained}
+    for name, own in listings.items():
+        entries = list(_entries(cameras, views, own, scale))
+        content = {"frames": entries, "fps": fps, "timestep_indices": own, "camera_indices": [*range(len(cameras))]}
+        (folder / name).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _entries(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -59,6 +59,8 @@ class TimedPicture(NamedTuple):
 @dataclass(frozen=True)
 class Footage(ABC):
     """A source of pictures that can be read several times, each time the same ones."""
+
+    is_joined: ClassVar[bool] = False  # of several takes of a camera that stands still, with gaps of whole pictures
 
     path: Path
     width: int

@@ -49,7 +49,7 @@ def tracked(truth: Path, head: HeadAssets, tracking_models: None, tmp_path_facto
     root = tmp_path_factory.mktemp("raw")
     sequence = write_raw(truth, root, UNIT)
     said: list[str] = []
-    track_rig(sequence, root / "out", truth / "head_model", head, say=said.append)
+    track_rig([sequence], root / "out", truth / "head_model", head, say=said.append)
     (root / "said.txt").write_text("\n".join(said))
     return root / "out"
 
@@ -100,7 +100,7 @@ def test_a_folder_of_gaussian_head_avatar(truth: Path, head: HeadAssets, tmp_pat
     """Its front camera is told by the landmarks, its masks are used, and its pictures are made smaller."""
     said: list[str] = []
     folder = write_gha(truth, tmp_path / "gha", 1.0)
-    track_rig(folder, tmp_path / "out", truth / "head_model", head, size=128, say=said.append)
+    track_rig([folder], tmp_path / "out", truth / "head_model", head, size=128, say=said.append)
     assert "5 cameras; the front one is 222200002" in said[0]
     true, found = projected(truth, head), projected(tmp_path / "out", head)
     assert np.mean([np.linalg.norm(true[key] / 2 - found[key], axis=1).mean() for key in true]) < 0.012 * 128
@@ -111,7 +111,7 @@ def test_pictures_without_a_face_are_refused(truth: Path, head: HeadAssets, tmp_
     for path in folder.rglob("image_*.jpg"):
         cv2.imwrite(str(path), np.full((SIZE, SIZE, 3), 90, np.uint8))
     with pytest.raises(UserError, match="no face was found in the first 3 pictures of any camera"):
-        track_rig(folder, tmp_path / "out", truth / "head_model", head)
+        track_rig([folder], tmp_path / "out", truth / "head_model", head)
     assert not [path for path in tmp_path.iterdir() if path.name != "gha"]
 
 
@@ -123,5 +123,21 @@ def test_a_calibration_of_another_recording_is_refused(truth: Path, head: HeadAs
         for path, data in zip(places, (*kept[1:], kept[0]), strict=True):
             path.write_bytes(data)
     with pytest.raises(UserError, match="calibration .* does not fit the pictures"):
-        track_rig(folder, tmp_path / "out", truth / "head_model", head)
+        track_rig([folder], tmp_path / "out", truth / "head_model", head)
     shutil.rmtree(tmp_path / ".out.partial", ignore_errors=True)
+
+
+def test_two_sequences_get_one_identity_and_their_own_places(truth: Path, head: HeadAssets, tmp_path: Path) -> None:
+    """FREE, here the beginning of SPEECH once more, is listed for testing."""
+    sequence = write_raw(truth, tmp_path, UNIT)
+    free = write_raw(truth, tmp_path / "again", UNIT, times=8).rename(sequence.parent / "FREE")
+    track_rig([sequence, free], tmp_path / "out", truth / "head_model", head, size=SIZE, say=lambda _: None)
+    true, found = projected(truth, head), projected(tmp_path / "out", head)
+    errors = {
+        (camera, time): np.linalg.norm(true[camera, time % TIMES] - points, axis=1).mean()
+        for (camera, time), points in found.items()
+    }
+    assert len(errors) == CAMERAS * (TIMES + 8) and np.mean([*errors.values()]) < 0.012 * SIZE
+    opened = open_tracked_folder(tmp_path / "out")
+    tested = {opened.shots[n].time for n, part in opened.division.items() if part == "test"}
+    assert tested == {*range(TIMES, TIMES + 8)}
