@@ -30,7 +30,7 @@ class Times(NamedTuple):
     begins: float
     fps: float
 
-    def seconds(self, number: int) -> float:
+    def seconds(self, number: float) -> float:
         return self.begins + number / self.fps
 
     def pick(self, footage: Footage, view: View) -> Iterator[tuple[int, np.ndarray]]:

@@ -228,17 +228,17 @@ def _open(folders: Sequence[Path]) -> Recording:
 
 
 def _held_out(opened: Recording, times: Times, say: Callable[[str], object]) -> set[int]:
-    """Times of the sequences that are called FREE; none where there is nothing else."""
-    begins = np.array([seconds for _, seconds in opened.sequences])
+    """Times of the sequences that are called FREE, where there are others."""
+    free = {name for name, _ in opened.sequences if name.upper().startswith(HELD_OUT)}
+    begins = [seconds for _, seconds in opened.sequences]
+    rows = np.searchsorted(begins, [times.seconds(number + 0.5) for number in times.numbers], "right") - 1
     tested: set[int] = set()
     for row, (name, _) in enumerate(opened.sequences):
-        own = [
-            n for n in times.numbers if np.searchsorted(begins, times.seconds(n) + 0.5 / times.fps, "right") == row + 1
-        ]
-        is_tested = name.upper().startswith(HELD_OUT)
+        own = [number for number, place in zip(times.numbers, rows, strict=True) if place == row]
+        is_tested = name in free and len(free) < len(opened.sequences)
         say(f"{name}: {f'times {own[0]} to {own[-1]}' if own else 'no times'}{', held out' if is_tested else ''}")
-        tested |= set(own) if is_tested else set()
-    return tested if len(tested) < len(times.numbers) else set()
+        tested |= {*own} if is_tested else set()
+    return tested
 
 
 def _pose(camera: Camera, scale: float = 1.0) -> Pose:

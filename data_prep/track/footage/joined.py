@@ -46,6 +46,10 @@ def join(parts: Sequence[Footage], starts: Sequence[float]) -> JoinedFootage:
                 f"{first.width}x{first.height} at {first.rate}; track recordings of different cameras by themselves"
             )
     values: dict[str, Any] = {field.name: getattr(first, field.name) for field in fields(Footage)}
-    values |= {"path": first.path.parents[2], "duration": starts[-1] + (parts[-1].duration or 0.0)}
+    folder = first.path.parents[2]
+    values |= {
+        "path": folder / "*" / first.path.relative_to(folder / first.path.parents[1].name),
+        "duration": starts[-1] + (parts[-1].duration or 0.0),
+    }
     values |= {"notes": tuple(dict.fromkeys(note for part in parts for note in part.notes))}
     return JoinedFootage(**values, parts=tuple(parts), starts=tuple(starts))
