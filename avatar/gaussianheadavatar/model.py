@@ -57,6 +57,7 @@ class GaussianHeadAvatar(Avatar):
 
     is_replayable = False  # each path of the networks runs on the points that it counts for
     has_colours = False
+    zoom = 0.8, 1.25
     unknown_to_browsers = "its upsampling network"
     initial_frames = 48
     centre: Tensor  # of the head at rest, metres

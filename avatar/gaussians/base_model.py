@@ -42,6 +42,7 @@ class Avatar(nn.Module):
     is_replayable = True  # whether steps, and frames, do the same operations each time
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     has_colours = True  # whether each Gaussian has a colour; else `draw` makes colours of features
+    zoom: tuple[float, float] | None = None  # least and largest factor that training pictures are zoomed by
     initial_frames = 16  # that `initialize_from` gets, evenly spread over the training frames
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 
