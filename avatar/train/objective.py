@@ -124,7 +124,7 @@ class Objective:
         return loss
 
 
-def at_size(image: Float[Tensor, "H W 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def at_size(image: Float[Tensor, "H W C"], other: Float[Tensor, "h w _"]) -> Float[Tensor, "h w C"]:
     """`image` at the size of `other`: means over the area of each pixel."""
     return interpolate(image.permute(2, 0, 1)[None], size=tuple(other.shape[:2]), mode="area")[0].permute(1, 2, 0)
 
