@@ -42,7 +42,6 @@ class Avatar(nn.Module):
     is_replayable = True  # whether steps, and frames, do the same operations each time
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     has_colours = True  # whether each Gaussian has a colour; else `draw` makes colours of features
-    zoom: tuple[float, float] | None = None  # least and largest factor that training pictures are zoomed by
     initial_frames = 16  # that `initialize_from` gets, evenly spread over the training frames
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 
@@ -116,6 +115,10 @@ class Avatar(nn.Module):
     def parameter_groups(self, trainer: TrainerConfig) -> Groups:
         """Adam's groups of parameters with their learning rates."""
         raise NotImplementedError
+
+    def zoom_limits(self, trainer: TrainerConfig) -> tuple[float, float] | None:
+        """The least and largest factor that training pictures of several cameras are zoomed by; None: they are not."""
+        return None
 
     def after_step(self, optimizer: torch.optim.Adam, steps: int, config: TrainerConfig) -> None:
         """Called after `steps` steps. A function of parameters, step and seed, so that a resumed run repeats them."""

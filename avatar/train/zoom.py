@@ -37,7 +37,8 @@ class Zoom:
 
 def make_zoom(avatar: Avatar, recording: Recording, config: TrainerConfig) -> Zoom | None:
     """For a training of this model; None where its pictures stay as they are, as those of one camera do."""
-    return None if avatar.zoom is None or recording.rig is None else Zoom(avatar.zoom, config.seed)
+    limits = avatar.zoom_limits(config)
+    return None if limits is None or recording.rig is None else Zoom(limits, config.seed)
 
 
 def zoomed(frame: Frame, factor: float) -> Frame:

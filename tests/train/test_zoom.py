@@ -7,12 +7,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from heads import grid_head
 from small_runs import new_avatar, open_small, small_config
 from torch import Tensor
 
+from avatar.config import Config, load_config
 from avatar.data.frame import Frame
 from avatar.data.gpu_frame_cache import GpuFrameCache
 from avatar.data.loader import FrameLoader
+from avatar.data.recording import Recording
+from avatar.data.rig import Rig, RigCamera
+from avatar.runs.model_registry import make_avatar
 from avatar.splat import splat_features
 from avatar.train.objective import Objective, PerceptualTerm, Weighted
 from avatar.train.optimizer import make_optimizer
@@ -116,7 +121,20 @@ def test_a_step_zooms_frames_of_a_gpus_cache_as_those_of_files(tracked_folder: P
     assert seen_boxes == [(None, None)]
 
 
-def test_make_zoom_leaves_other_models_and_one_camera_as_they_are(tracked_folder: Path) -> None:
-    config = small_config("model=gaussianheadavatar")
-    _, subject, assets = open_small(tracked_folder, config)
-    assert make_zoom(new_avatar(assets, subject, config), subject.recording, config.trainer) is None
+def test_make_zoom_is_for_several_cameras_and_as_many_steps_as_published(tracked_folder: Path) -> None:
+    one = open_small(tracked_folder, small_config())[1].recording
+    camera = RigCamera("front", one.width, one.height, one.intrinsics)
+    several = replace(one, rig=Rig((camera,), tuple(range(len(one))), (0,) * len(one)))
+
+    def made_zoom(model: str, config: Config, recording: Recording = several) -> Zoom | None:
+        avatar = make_avatar(grid_head(), torch.zeros(3), small_config(f"model={model}").model)
+        return make_zoom(avatar, recording, config.trainer)
+
+    published, fewer = (
+        load_config(["experiment=gha_paper", "trainer.seed=5"]),
+        load_config(["trainer.iterations=599999"]),
+    )
+    assert made_zoom("gaussianheadavatar_hyper", published) == Zoom(LIMITS, 5)
+    assert made_zoom("gaussianheadavatar_hyper", published, one) is None
+    assert made_zoom("gaussianheadavatar_hyper", fewer) is None
+    assert made_zoom("hypergaussians", published) is None
