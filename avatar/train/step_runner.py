@@ -25,7 +25,7 @@ from avatar.train.condition_noise import ConditionNoise
 from avatar.train.objective import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import GradientCheck, StepInputs, StepOutputs, TrainState, train_step
-from avatar.train.zoom import Zoom
+from avatar.train.zoom import Zoom, zoomed
 from avatar.types import Camera
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
@@ -121,7 +121,7 @@ class StepRunner:
             crop = [None, None]
         frame = replace(frame, camera=camera)
         if self._zoom is not None:  # the crop moves with the head, and is found where it is used
-            frame, crop = self._zoom.of(step, frame), [None, None]
+            frame, crop = zoomed(frame, self._zoom.factor(step)), [None, None]
         avatar, objective = self._state.avatar, self._state.objective
         background = objective.background_of(step) if avatar.has_colours else objective.background
         return StepInputs(frame, self.vertices(frame), background, self._noise_of(step), row, jacobian, *crop)

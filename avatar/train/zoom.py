@@ -30,10 +30,6 @@ class Zoom:
         """Of step `step` (from 0): a function of seed and step."""
         return float(np.random.default_rng([self.seed, step, _STREAM]).uniform(*self.limits))
 
-    def of(self, step: int, frame: Frame) -> Frame:
-        """What step `step` sees of a frame."""
-        return zoomed(frame, self.factor(step))
-
 
 def make_zoom(avatar: Avatar, recording: Recording, config: TrainerConfig) -> Zoom | None:
     """For a training of this model; None where its pictures stay as they are, as those of one camera do."""
