@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.types import Camera, HeadParams
@@ -25,6 +25,7 @@ class Frame:
     mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth
     head_box: tuple[slice, slice] | None = None  # rows and columns that hold the head mask, if they are known already
     shared_time: int | None = None  # the row of the tracks, where pictures of several cameras share it; None: `index`
+    seen: Bool[Tensor, "H W"] | None = None  # pixels that the camera's picture holds; None: all
 
     @property
     def time(self) -> int:

@@ -116,6 +116,10 @@ class Avatar(nn.Module):
         """Adam's groups of parameters with their learning rates."""
         raise NotImplementedError
 
+    def zoom_limits(self, trainer: TrainerConfig) -> tuple[float, float] | None:
+        """The least and largest factor that training pictures of several cameras are zoomed by; None: they are not."""
+        return None
+
     def after_step(self, optimizer: torch.optim.Adam, steps: int, config: TrainerConfig) -> None:
         """Called after `steps` steps. A function of parameters, step and seed, so that a resumed run repeats them."""
 

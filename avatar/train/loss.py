@@ -104,13 +104,13 @@ class TrainingLoss:
         smaller: Sequence[Float[Tensor, "_ _ 3"]] = (),
     ) -> PhotometricLoss:
         """`crop`, rows and columns, takes the place of the frame's box of the head. Each of the `smaller` images adds
-        its L1 distance to the target at its size."""
+        its L1 distance to the target at its size. Pixels that the frame's picture does not hold cost nothing."""
         term = self.term(step)
         function = term and term.function
         if term and term.crops:
             function = partial(term.function, box=frame.head_box, crop=crop)
         loss = photometric_loss(
-            image,
+            where_seen(image, target, frame),
             target,
             frame.mouth_mask,
             frame.head_mask,
@@ -118,14 +118,22 @@ class TrainingLoss:
             perceptual_weight=term.weight if term else 0.0,
         )
         for other in smaller:
-            distance = l1_loss(other, at_size(target, other))
+            wanted = at_size(target, other)
+            distance = l1_loss(where_seen(other, wanted, frame), wanted)
             loss = loss._replace(total=loss.total + distance, frame=loss.frame + distance)
         return loss
 
 
-def at_size(image: Float[Tensor, "H W 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def at_size(image: Float[Tensor, "H W C"], other: Float[Tensor, "h w _"]) -> Float[Tensor, "h w C"]:
     """`image` at the size of `other`: means over the area of each pixel."""
     return interpolate(image.permute(2, 0, 1)[None], size=tuple(other.shape[:2]), mode="area")[0].permute(1, 2, 0)
+
+
+def where_seen(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], frame: Frame) -> Float[Tensor, "h w 3"]:
+    """`image`, and `target` where the frame's picture holds no whole pixel of that size."""
+    if frame.seen is None:
+        return image
+    return torch.where(at_size(frame.seen[..., None].float(), image) == 1, image, target)
 
 
 def choose_perceptual(

@@ -25,6 +25,7 @@ from avatar.train.condition_noise import ConditionNoise
 from avatar.train.loss import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
 from avatar.train.step import GradientCheck, StepInputs, StepOutputs, TrainState, train_step
+from avatar.train.zoom import Zoom, zoomed
 from avatar.types import Camera
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
@@ -65,16 +66,17 @@ class StepRunner:
         self,
         state: TrainState,
         noise: ConditionNoise | None = None,
+        zoom: Zoom | None = None,
         say: Callable[[str], object] = print,
     ) -> None:
-        self._state, self._noise, self._say = state, noise, say
+        self._state, self._noise, self._zoom, self._say = state, noise, zoom, say
         avatar = state.avatar
         self._device = avatar.device
         self._meshes: dict[int, Tensor] = {}  # by time: they do not change while the avatar does
         self._mesh_bytes = MESH_BYTES
         self._constants: dict[int, FrameConstants] = {}
         self._noises: tuple[int, Tensor] | None = None  # the first step of a block, and what is added in each
-        self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_replayable
+        self._replays = on_gpu(avatar.quats) and not avatar.quats.is_meta and avatar.is_replayable and zoom is None
         self._launched: Counter[Kind] = Counter()
         self._captured: OrderedDict[Kind, Replay[StepOutputs]] = OrderedDict()
         self._pool = new_pool(self._device)
@@ -118,6 +120,8 @@ class StepRunner:
         if term is None or not term.crops:
             crop = [None, None]
         frame = replace(frame, camera=camera)
+        if self._zoom is not None:  # the crop moves with the head, and is found where it is used
+            frame, crop = zoomed(frame, self._zoom.factor(step)), [None, None]
         avatar, objective = self._state.avatar, self._state.objective
         background = objective.background_of(step) if avatar.has_colours else objective.background
         return StepInputs(frame, self.vertices(frame), background, self._noise_of(step), row, jacobian, *crop)

@@ -29,6 +29,7 @@ from avatar.train.pose_corrections import PREFIX, make_pose_corrections
 from avatar.train.step import TrainState, non_finite_error
 from avatar.train.step_monitor import AsyncStepMonitor, NonFiniteStep, SyncStepMonitor
 from avatar.train.step_runner import StepRunner
+from avatar.train.zoom import make_zoom
 
 
 def train(
@@ -96,7 +97,7 @@ def train(
         interruption() as interrupted,
     ):
         progress = AsyncStepMonitor(log, optimizer, device) if is_gpu else SyncStepMonitor(log)
-        steps = StepRunner(state, make_noise(recording, trainer), log.say)
+        steps = StepRunner(state, make_noise(recording, trainer), make_zoom(avatar, recording, trainer), log.say)
         order = frame_order(subject.split.train, trainer.seed, step, trainer.iterations)
         try:
             for frame in loader.frames(order):

@@ -13,6 +13,7 @@ from small_runs import SMALL
 
 from avatar.cli import main
 from avatar.data.recording import Recording
+from avatar.gaussianheadavatar import model as gaussianheadavatar
 from avatar.pipeline.open_inputs import open_run
 from avatar.runs.avatar_file import read_avatar_file
 from avatar.runs.checkpoint import newest_checkpoint
@@ -98,3 +99,26 @@ def test_the_network_gets_the_same_turn_whichever_camera_looks(place: Path) -> N
     seen = [trained.gaussians(recording.params(index), recording.camera(index)) for index in same_time]
     for other in seen[1:]:
         torch.testing.assert_close(other.means, seen[0].means, atol=1e-6, rtol=0)
+
+
+def test_a_run_with_zoom_resumes_with_the_same_bits(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gaussianheadavatar, "STEPS", 12)  # fewer have no zoom
+
+    def trained(name: str) -> Path:
+        command = ["train", str(place / "EMO"), "--out", str(tmp_path / name), "model=gaussianheadavatar"]
+        assert main([*command, *options(place)]) == 0
+        return tmp_path / name
+
+    whole = newest_checkpoint(trained("whole"))
+    begun = trained("begun")
+    for later in sorted((begun / "checkpoints").iterdir())[1:]:
+        later.unlink()
+    assert main(["train", "--out", str(begun), "--resume"]) == 0
+    resumed = newest_checkpoint(begun)
+    assert resumed.step == whole.step == 12
+    assert all(torch.equal(value, resumed.tensors[name]) for name, value in whole.tensors.items())
+    monkeypatch.setattr(gaussianheadavatar, "ZOOM", None)
+    unzoomed = newest_checkpoint(trained("unzoomed"))
+    assert any(not torch.equal(value, unzoomed.tensors[name]) for name, value in whole.tensors.items())
