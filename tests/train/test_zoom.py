@@ -12,11 +12,11 @@ from small_runs import new_avatar, open_small, small_config
 from torch import Tensor
 
 from avatar.config import Config, load_config
+from avatar.data.camera_rig import CameraRig, RigCamera
 from avatar.data.frame import Frame
 from avatar.data.gpu_frame_cache import GpuFrameCache
 from avatar.data.loader import FrameLoader
 from avatar.data.recording import Recording
-from avatar.data.rig import Rig, RigCamera
 from avatar.runs.model_registry import make_avatar
 from avatar.splat import splat_features
 from avatar.train.loss import PerceptualTerm, TrainingLoss, Weighted
@@ -124,7 +124,7 @@ def test_a_step_zooms_frames_of_a_gpus_cache_as_those_of_files(tracked_folder: P
 def test_make_zoom_is_for_several_cameras_and_as_many_steps_as_published(tracked_folder: Path) -> None:
     one = open_small(tracked_folder, small_config())[1].recording
     camera = RigCamera("front", one.width, one.height, one.intrinsics)
-    several = replace(one, rig=Rig((camera,), tuple(range(len(one))), (0,) * len(one)))
+    several = replace(one, rig=CameraRig((camera,), tuple(range(len(one))), (0,) * len(one)))
 
     def made_zoom(model: str, config: Config, recording: Recording = several) -> Zoom | None:
         avatar = make_avatar(grid_head(), torch.zeros(3), small_config(f"model={model}").model)
