@@ -171,7 +171,7 @@ def test_the_minutes_count_every_part() -> None:
 
 SCRIPT = f"""
 import sys
-sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1] / "helpers")]!r}
 from pathlib import Path
 import pytest
 from test_create import GOOD, install_small

@@ -13,6 +13,7 @@ from avatar.errors import UserError
 from avatar.runs.memory_estimate import count_gaussians, drawing_needs, training_needs
 from avatar.runs.model_registry import make_avatar
 
+TESTS = Path(__file__).parents[1]
 MIB = 2**20
 PAPER = ("experiment=paper", "data.size=null", "trainer.perceptual=dssim")
 
@@ -96,7 +97,7 @@ print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
     ids=["activations", "heads", "network", "covariances", "n-dimensional", "features"],
 )
 def test_training_takes_what_is_foretold(overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path) -> None:
-    script = MEASURE.format(path=[str(p) for p in (Path(__file__).parents[1], Path(__file__).parents[1] / "data_prep")])
+    script = MEASURE.format(path=[str(p) for p in (TESTS / "helpers", TESTS / "data_prep")])
     process = subprocess.run(
         [sys.executable, "-c", script, str(tracked_folder), str(tmp_path), *overrides],
         capture_output=True,
