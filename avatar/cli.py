@@ -7,25 +7,24 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from avatar.commands.main import EXIT_INTERRUPTED, INTERRUPTED, drop_output, end_without_reader, failed, main
 
 
 def run() -> NoReturn:
-    """`main` as a process of its own, in which Ctrl-C at any moment ends without a stack trace.
+    """`main` as a process of its own, in which Ctrl-C and SIGTERM at any moment end without a stack trace.
 
     While libraries are imported, an exception would come out of the middle of them, and some print it themselves; nothing
     is lost by leaving at once. At the end Python's own clearing up is as little to be interrupted by an exception.
     """
     _prepare_streams()
     try:
-        interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # else it is to be ignored
-        if interruptible:
-            signal.signal(signal.SIGINT, _leave)
-        status = main(when_loaded=lambda: interruptible and signal.signal(signal.SIGINT, signal.default_int_handler))
-        if interruptible:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        # A signal that is to be ignored stays ignored.
+        ending = {number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN}
+        _handle(ending, _leave)
+        status = main(when_loaded=lambda: _handle(ending, signal.default_int_handler))
+        _handle(ending, signal.SIG_DFL)
     except KeyboardInterrupt:  # in the moments between
         _leave(signal.SIGINT, None)
     except SystemExit as stop:  # of argparse
@@ -38,6 +37,11 @@ def run() -> NoReturn:
         drop_output()
         status = status or failed(f"the output cannot be written ({error.strerror})")
     sys.exit(status)
+
+
+def _handle(numbers: set[signal.Signals], handler: Any) -> None:
+    for number in numbers:
+        signal.signal(number, handler)
 
 
 def _prepare_streams() -> None:

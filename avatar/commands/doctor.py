@@ -13,7 +13,7 @@ from avatar.compute.availability import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError, install
 from avatar.files.environment import named_path
-from avatar.files.read import check_file, is_there
+from avatar.files.read import check_file
 from avatar.files.third_party import (
     FETCHED_LPIPS,
     HEAD_VARIABLE,
@@ -28,6 +28,7 @@ from avatar.files.third_party import (
     models_folder,
     sha256_of,
 )
+from avatar.head.find import find_model_file
 from avatar.version import __version__
 
 DOWNLOAD = "avatar models --download"
@@ -131,10 +132,10 @@ def head_model() -> Finding:
         return Finding(
             "head model", "not set", f"give --head, set {HEAD_VARIABLE}, or put head_model/ into the subject"
         )
-    if not is_there(path):
-        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {path}, which does not exist")
-    if path.is_dir() and not any(file.suffix in (".pkl", ".npz") for file in path.iterdir()):
-        return Finding("head model", "missing", f"{HEAD_VARIABLE} names {path}, which holds no .pkl or .npz")
+    try:
+        find_model_file(path)
+    except (UserError, OSError) as error:
+        return Finding("head model", "missing", f"{HEAD_VARIABLE}: {error}")
     return Finding("head model", "found")
 
 

@@ -7,7 +7,7 @@ GROUPS = {
         "create": ("make an avatar's page from a video: track, train, evaluate, export", "me.mp4 --head flame/ --open"),
         "record": ("film yourself with the webcam, as the screen tells you", "me.mp4"),
         "track": ("track a face through a video, and write a folder to train on", "me.mp4 --head flame/ --out me"),
-        "check": ("say everything that is wrong with a tracked folder, before training", "me --out me/check"),
+        "check": ("say everything that is wrong with a tracked folder, before training", "me --out me-check"),
         "train": ("train an avatar on a tracked video folder, or on a video", "me --out runs/me"),
         "eval": ("measure a trained avatar on the held-out frames", "runs/me"),
         "refine": ("improve the tracking of a run's video through its avatar", "runs/me"),

@@ -7,6 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from avatar.commands.outputs import check_file, check_outputs
+from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.numbered import existing
 from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
@@ -19,6 +20,8 @@ from avatar.pipeline.track import cached_tracking, is_video
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained_avatar import TrainedAvatar
 from data_prep.formats.avatar_track import read_info
+
+READING_OPTIONS = ("driver_tracking", "frame_offset", "format", "cameras", "fps", "max_left_out")
 
 
 def run_reenact(arguments: Namespace) -> int:
@@ -38,6 +41,7 @@ def run_reenact(arguments: Namespace) -> int:
     inputs = [driver, behind, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
     check_outputs([first_file(out), *(existing(out) if first_file(out) != out else ()), *sidecars(out)], inputs)
     if driver.suffix.lower() in DRIVE_SUFFIXES:
+        refuse_reading_options(arguments)
         reenact(trained, open_drive_file(driver, trained), out, choices, backdrop=backdrop)
     else:
         sound = None
@@ -46,6 +50,14 @@ def run_reenact(arguments: Namespace) -> int:
             sound = (video, read_info(driver).source["begins"]) if video.is_file() else None
         reenact(trained, open_driver(driver, trained, arguments), out, choices, backdrop=backdrop, sound=sound)
     return OK
+
+
+def refuse_reading_options(arguments: Namespace) -> None:
+    """Raises UserError for options that say how a tracked folder is read."""
+    if given := [name for name in READING_OPTIONS if getattr(arguments, name) is not None]:
+        raise UserError(
+            f"--{given[0].replace('_', '-')} is for tracked folders, and {arguments.driver} is a drive file: leave it out"
+        )
 
 
 def head_of(arguments: Namespace, trained: TrainedAvatar) -> Path:

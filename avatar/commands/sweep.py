@@ -22,6 +22,7 @@ FAILED = 1
 
 
 def run_sweep(arguments: Namespace) -> int:
+    refuse_other_engines(arguments)
     folder = sweep_folder(arguments.spec, arguments.out)
     if arguments.spec is not None and not arguments.status:
         asked = read_spec(arguments.spec)
@@ -46,6 +47,13 @@ def run_sweep(arguments: Namespace) -> int:
     write_sweep_tables(folder, spec)
     failed = [state for state in states.values() if state.status == "failed"]
     return FAILED if failed else OK
+
+
+def refuse_other_engines(arguments: Namespace) -> None:
+    """Raises UserError for options that the engine does not have."""
+    for name, engines in (("address", ("ray",)), ("partition", ("slurm",))):
+        if getattr(arguments, name) is not None and arguments.engine not in engines:
+            raise UserError(f"--{name} is for --engine {engines[0]}, not for {arguments.engine}")
 
 
 def sweep_folder(spec: Path | None, out: Path | None) -> Path:

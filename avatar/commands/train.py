@@ -108,6 +108,8 @@ def assign_paths(arguments: Namespace) -> None:
     folders = [path for path in arguments.paths if path not in runs]
     if len(folders) > 1:
         raise UserError(f"neither {folders[0]} nor {folders[1]} is a run: say which to resume with --out RUN")
+    if arguments.folder is not None and any(folder.resolve() != arguments.folder.resolve() for folder in folders):
+        raise UserError(f"{folders[0]} and --folder {arguments.folder} are two folders: one at a time is trained on")
     arguments.folder = arguments.folder or next(iter(folders), None)
 
 

@@ -65,12 +65,18 @@ def whole_folder(
         raise UserError(f"nothing can be written in {target.parent} ({error.strerror}); {advice}") from None
     try:
         yield building
-        building.chmod(0o755)
+        building.chmod(0o777 & ~_umask())
         put(building, target)
     except OSError as error:
         raise UserError(f"{target} cannot be written ({error.strerror or error}); nothing was left behind") from error
     finally:
         shutil.rmtree(building, ignore_errors=True)
+
+
+def _umask() -> int:
+    """What a process may only read by setting it."""
+    os.umask(mask := os.umask(0o077))
+    return mask
 
 
 def temporary_name(path: Path) -> Path:

@@ -7,6 +7,7 @@ numpy, scipy, chumpy and torch come back as numpy arrays, sparse matrices as den
 from __future__ import annotations
 
 import io
+import lzma
 import math
 import pickle
 import struct
@@ -74,7 +75,7 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
             if sum(info.file_size for info in members) > MAX_FILE_BYTES:
                 raise UserError(f"{path} would unpack to more than {MAX_FILE_BYTES} bytes; such files are not read")
             return {info.filename.removesuffix(".npy"): _parse_npy(archive.read(info), path) for info in members}
-    except (*_MALFORMED, *_BAD_ZIP, zlib.error) as error:
+    except (*_MALFORMED, *_BAD_ZIP, zlib.error, lzma.LZMAError) as error:
         raise UserError(f"{path} is damaged or not a .npz file ({_short(error)})") from error
 
 

@@ -19,7 +19,7 @@ def read_yaml(path: Path, limit: int) -> Any:
     text = read_text(path, limit)
     try:
         return yaml.load(text, _PlainLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:  # of tagged scalars
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(f"{path} cannot be read as YAML ({reason})") from None
 

@@ -128,7 +128,9 @@ def _finish(encoder: subprocess.Popen[bytes]) -> None:
     if encoder.returncode != 0:
         first = said.decode(errors="replace").strip().partition("\n")[0]
         words = re.sub(r"^\[[^\]]*\] ", "", first)  # without the part of ffmpeg and its address
-        raise OSError(words or f"the encoder ended with status {encoder.returncode}")
+        number = 256 - encoder.returncode  # FFmpeg ends with -errno where it says nothing
+        status = os.strerror(number) if 0 < number < 128 else f"the encoder ended with status {encoder.returncode}"
+        raise OSError(words or status)
 
 
 @contextmanager

@@ -12,7 +12,6 @@ or the list of names alone. Without an entry of "arkit", a blendshape moves the 
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,7 +23,9 @@ from avatar.files.read import is_there, read_json
 
 NAMES_FILE = "expression_names.json"
 JAW_TARGETS = ("jaw_x", "jaw_y", "jaw_z")
+MAX_WEIGHT = 1e6
 _MAX_BYTES = 2**24
+_NUMBER = re.compile("0|[1-9][0-9]{0,5}")
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,8 @@ def _read_arkit(
     for blendshape, weights in raw.items():
         for name, weight in weights.items():
             exists = name in JAW_TARGETS or known.index(name) is not None
-            if not exists and not (name.isascii() and name.isdigit() and int(name[:9]) < num_expressions):
+            if not exists and not (_NUMBER.fullmatch(name) and int(name) < num_expressions):
                 raise UserError(f"{path}: {blendshape} moves {name!r}, which is no coefficient of the head model")
-            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
+            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not abs(weight) < MAX_WEIGHT:
                 raise UserError(f"{path}: the weight of {name!r} in {blendshape} is {weight!r}, not a number")
     return {plain(blendshape): dict(weights) for blendshape, weights in raw.items()}

@@ -165,7 +165,7 @@ def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:
     found = {"head": head, **entry}
     for key in ("folder", "head", "tracking"):
         if (value := found.get(key)) is not None:
-            if not isinstance(value, str):
+            if not isinstance(value, str) or "\0" in value:
                 raise UserError(f"{path}: {key} is {value!r}, not a path")
             found[key] = str((path.resolve().parent / expanded(value, f"{path}: {key} {value}")).resolve())
     for key in ("frame_offset", "format", "fps"):

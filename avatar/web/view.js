@@ -196,6 +196,8 @@ export class AvatarView extends EventTarget {
   }
 
   close() {
+    this.ready.catch(() => {}); // nobody need listen
+    this.#reject("The avatar was closed.");
     this.#worker.terminate();
     cancelAnimationFrame(this.#loop);
   }
@@ -289,8 +291,12 @@ export class AvatarView extends EventTarget {
     this.statistics = { milliseconds, framesPerSecond: span > 0.2 ? (this.#times.length - 1) / span : 0 };
   }
 
-  #fail(sentence) {
+  #reject(sentence) {
     for (const { reject } of [this.#settle, ...this.#saving.splice(0)]) reject(new AvatarError(sentence));
+  }
+
+  #fail(sentence) {
+    this.#reject(sentence);
     this.dispatchEvent(new CustomEvent("failed", { detail: sentence }));
   }
 

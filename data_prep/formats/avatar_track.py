@@ -119,14 +119,22 @@ def read_info(folder: Path) -> TrackingInfo:
             source=dict(raw["source"]),
             left_out={int(number): str(why) for number, why in dict(raw["left_out"]).items()},
             notes=tuple(str(note) for note in raw["notes"]),
-            quality=dict(raw["quality"]),
+            quality=_quality(raw["quality"]),
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(f"{path} is damaged ({error!r}); track the video again") from None
     is_camera = len(intrinsics) == 4 and all(math.isfinite(v) for v in intrinsics) and min(intrinsics[:2]) > 0
     if not is_camera or not (0 < info.fps < 1e4) or not (1 <= info.width < 2**16 and 1 <= info.height < 2**16):
         raise UserError(f"{path} is damaged: its camera or its rate cannot be; track the video again")
     return info
+
+
+def _quality(raw: Any) -> dict[str, Any]:
+    """Raises TypeError, ValueError or OverflowError where its figures are no objects of finite numbers."""
+    for figure in raw.get("figures", []):
+        if not math.isfinite(float(figure.get("value", 0.0))):
+            raise ValueError(figure)
+    return dict(raw)
 
 
 def write_tracking(folder: Path, info: TrackingInfo, tracks: Mapping[int, FrameTrack]) -> None:

@@ -91,10 +91,9 @@ def chosen_cameras(
     Raises UserError for a name that no camera has.
     """
     try:
-        found = set(cameras) if chosen == ALL else {front()} if chosen == FRONT else named_cameras(chosen, cameras)
+        found = set(cameras) if chosen == ALL else {front()} if chosen == FRONT else _named(chosen.split(","), cameras)
     except UserError as error:
         raise UserError(f"--cameras: {error} in {folder} (or say {ALL} or {FRONT})") from None
-    found = found or set(cameras)
     if len(found) == len(cameras):
         return found, ()
     are = "is" if len(found) == 1 else "are"
@@ -108,9 +107,15 @@ def named_cameras(names: str | None, cameras: Collection[str]) -> set[str] | Non
     """
     if names is None:
         return None
+    return set() if names == NO_CAMERA else _named(names.split(","), cameras)
+
+
+def _named(names: Sequence[str], cameras: Collection[str]) -> set[str]:
     found = set()
-    for name in [] if names == NO_CAMERA else [word.strip() for word in names.split(",")]:
-        same = [one for one in cameras if one == name or (one.isdigit() and name.isdigit() and int(one) == int(name))]
+    for name in (word.strip() for word in names):
+        same = [
+            one for one in cameras if one == name or (one.isdecimal() and name.isdecimal() and int(one) == int(name))
+        ]
         if not same:
             raise UserError(f"there is no camera {name!r} among {', '.join(sorted(cameras))}")
         found.add(same[0])

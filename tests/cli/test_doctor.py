@@ -76,6 +76,9 @@ def test_what_is_damaged_is_not_called_missing(tmp_path: Path, monkeypatch: pyte
     for name in (FACE_LANDMARKER.name, "LPIPS squeeze", "LPIPS alex"):
         assert found[name][0] == "damaged" and FACE_LANDMARKER.url not in output
     assert found["head model"][0] == "missing" and str(tmp_path / "none") in found["head model"][1]
+    (tmp_path / "none" / "FLAME2023").mkdir(parents=True)
+    (tmp_path / "none" / "FLAME2023" / "generic_model.pkl").touch()
+    assert rows(avatar("doctor"))["head model"][0] == "found"
 
 
 def test_a_package_that_is_missing_has_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

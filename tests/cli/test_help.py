@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from command_line import avatar
 
+from avatar.commands.arguments import parse
 from avatar.commands.groups import GROUPS
+from avatar.commands.outputs import check_outputs
 from avatar.commands.parser import build_parser
 from avatar.config import load_config
 
@@ -24,6 +26,13 @@ def test_every_command_is_in_one_group_with_an_example() -> None:
             assert meaning in overview and f"avatar {name} {example}".rstrip() in overview
             said = " ".join(avatar(name, "--help").split())
             assert f"example: avatar {name} {example}".rstrip() in said
+
+
+def test_the_examples_write_beside_their_inputs() -> None:
+    for name, example in ((name, told) for group in GROUPS.values() for name, (_, told) in group.items()):
+        words = example.partition(">>")[0].split()
+        if (out := getattr(parse([name, *words]), "out", None)) is not None and "--out" in words:
+            check_outputs([Path(out)], [Path(words[0])])
 
 
 COMPLETE = """source {script}

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from command_line import avatar
+from waiting import until
 
 from avatar.commands import doctor
 
@@ -75,6 +76,22 @@ def test_ctrl_c_while_libraries_are_imported_is_the_conventional_status() -> Non
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output, errors) == (130, "", "avatar: interrupted\n")
+
+
+def test_sigterm_leaves_nothing_half_written(tmp_path: Path) -> None:
+    """What `docker stop` and a cluster send."""
+    made = tmp_path / "film.mp4"
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, "demo-data", str(made), "--video", "--frames", "600", "--size", "128"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    until(lambda: [path for path in tmp_path.iterdir() if "partial" in path.name], 60)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and errors.endswith("avatar: interrupted\n")
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["head_model"])
 
 
 def test_ctrl_c_does_not_come_out_of_the_middle_of_an_import() -> None:

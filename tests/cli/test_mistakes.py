@@ -60,6 +60,15 @@ MISTAKES = {
         ["reenact", "{run}", "--driver", "{other}", "--frame-offset", "1"],
         "was tracked with another head model",
     ),
+    "a folder and another --folder": (["train", "{data}", "--folder", "{twin}"], "twin are two folders"),
+    "a drive file read as a folder": (
+        ["reenact", "{run}", "{tmp}/motion.csv", "--fps", "50"],
+        "--fps is for tracked folders, and {tmp}/motion.csv is a drive file",
+    ),
+    "a cluster's address for this machine": (
+        ["sweep", "--out", "{tmp}/sweep", "--address", "head:1"],
+        "--address is for --engine ray, not for local",
+    ),
     "LPIPS without weights": (
         ["train", "{data}", "--frame-offset", "1", "--out", "{tmp}/l", "trainer.perceptual=lpips-squeeze", *QUICK],
         "fetch it by other means to",

@@ -9,7 +9,7 @@ import pytest
 from command_line import avatar
 from small_runs import QUICK
 
-from avatar.commands.arguments import parse
+from avatar.commands.arguments import is_override, parse
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 
 
@@ -60,6 +60,10 @@ def test_a_path_with_an_equals_sign_is_no_override(
     arguments = parse(["train", *words.split()])
     assert arguments.paths == [Path(folder)] and arguments.overrides == overrides
     assert parse(["bench", "train", *words.split()]).inputs == [Path(folder)]
+
+
+def test_an_override_may_be_longer_than_a_file_name() -> None:
+    assert is_override(f"data.test_cameras={','.join(f'2222000{n:02}' for n in range(36, 67))}")
 
 
 def test_a_folder_with_an_equals_sign_is_trained_on(tracked_folder: Path, tmp_path: Path) -> None:

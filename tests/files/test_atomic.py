@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from avatar.files.atomic import temporary_name, write_atomically
+from avatar.files.atomic import temporary_name, whole_folder, write_atomically
 
 
 def test_two_writers_at_once_never_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,3 +33,15 @@ def test_another_process_has_other_temporary_names(tmp_path: Path, monkeypatch: 
         monkeypatch.setattr(atomic, "_COUNTER", iter((7,)))
         names.add(temporary_name(tmp_path / "clip.mp4").name)
     assert len(names) == 2 and all(name.startswith(".clip.") and name.endswith(".mp4") for name in names)
+
+
+def test_a_folder_is_as_open_as_the_users_other_folders(tmp_path: Path) -> None:
+    for mask, mode in ((0o077, 0o700), (0o027, 0o750)):
+        before = os.umask(mask)
+        try:
+            with whole_folder(tmp_path / f"{mask:o}"):
+                pass
+            assert (tmp_path / f"{mask:o}").stat().st_mode & 0o777 == mode
+            assert os.umask(mask) == mask
+        finally:
+            os.umask(before)

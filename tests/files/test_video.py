@@ -73,6 +73,18 @@ def test_an_encoder_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytest
     assert not path.exists()
 
 
+def test_an_encoder_that_ends_with_an_error_number_says_what_it_means(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "ffmpeg"
+    tells = 'if [ "$1" = -version ]; then echo ffmpeg version 7; exit 0; fi'
+    broken.write_text(f"#!/bin/sh\n{tells}\ncat > /dev/null\nexit 228\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(broken))
+    with pytest.raises(UserError, match="cannot be written .No space left on device"):
+        write_video(tmp_path / "clip.mp4", gradients(3, 64, 64), fps=25)
+
+
 def test_a_folder_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \(.*(Not a directory|File exists)"):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from avatar.errors import UserError
-from avatar.head.expression_names import NAMES_FILE, load_expression_names
+from avatar.head.expression_names import NAMES_FILE, load_expression_names, parse_expression_names
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
@@ -25,3 +25,18 @@ def test_other_bytes_are_refused_by_name(content: bytes, tmp_path: Path) -> None
     (tmp_path / NAMES_FILE).write_bytes(content)
     with pytest.raises(UserError, match=rf"{NAMES_FILE} cannot be read as JSON \("):
         load_expression_names(tmp_path, 2)
+
+
+@pytest.mark.parametrize("name", ["000000000999", "00", "01", "7", "²"])
+def test_numbers_of_no_coefficient_are_refused(name: str) -> None:
+    with pytest.raises(UserError, match=f"moves '{name}', which is no coefficient"):
+        parse_expression_names({"names": [], "arkit": {"jawOpen": {name: 1}}}, 2, "file")
+
+
+@pytest.mark.parametrize("weight", [10**400, 1e300, float("nan"), "1", True])
+def test_weights_that_are_no_usual_numbers_are_refused(weight: object) -> None:
+    assert parse_expression_names({"names": [], "arkit": {"jawOpen": {"1": -2}}}, 2, "file").targets("jawOpen") == {
+        1: -2
+    }
+    with pytest.raises(UserError, match="the weight of '1' in jawOpen is"):
+        parse_expression_names({"names": [], "arkit": {"jawOpen": {"1": weight}}}, 2, "file")

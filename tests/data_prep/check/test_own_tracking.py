@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 
+from avatar.errors import UserError
 from data_prep.check import own_tracking
 from data_prep.check.own_tracking import tracking_sections
 from data_prep.formats.avatar_track import TrackingInfo, write_tracking
@@ -53,3 +55,15 @@ def test_the_video_is_inside_the_page_unless_it_is_large(folder: Path, monkeypat
 
 def test_folders_of_others_have_none_of_it(tracked_folder: Path) -> None:
     assert tracking_sections(tracked_folder) == []
+
+
+LARGE = f'[{{"value": 1{"0" * 400}}}]'
+
+
+@pytest.mark.parametrize("figures", ["5", '["x"]', '[{"value": 1e999}]', LARGE, '[{"value": "x"}]'])
+def test_figures_of_no_tracking_are_refused(folder: Path, figures: str) -> None:
+    told = json.loads((folder / "tracking.json").read_text())
+    told["quality"] = {"figures": "HERE"}
+    (folder / "tracking.json").write_text(json.dumps(told).replace('"HERE"', figures))
+    with pytest.raises(UserError, match=r"tracking\.json (is damaged|cannot be read)"):
+        tracking_sections(folder)
