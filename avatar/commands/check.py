@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from argparse import Namespace
+from dataclasses import replace
 
 from tqdm import tqdm
 
@@ -14,6 +15,7 @@ from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
 from avatar.pipeline.open_inputs import source_options
 from avatar.train.cost_estimate import measure_cost
+from avatar.train.frame_order import within_epochs
 from data_prep.check.folder import Check, as_text, check_tracked_folder
 from data_prep.check.frame import first_training_frame
 from data_prep.prepare.open_subject import find_head
@@ -48,7 +50,8 @@ def training_facts(outcome: Check) -> dict[str, str] | None:
         return None
     frame, identity = first_training_frame(outcome.clip, outcome.coverage)
     try:
-        frames = len(outcome.coverage.images)
-        return measure_cost(frame, outcome.clip.head.assets, identity, frames, load_config()).facts()
+        frames, config = len(outcome.coverage.images), load_config()
+        config = replace(config, trainer=within_epochs(config.trainer, len(outcome.coverage.split.train)))
+        return measure_cost(frame, outcome.clip.head.assets, identity, frames, config).facts()
     except UserError as error:  # frames that are too small
         return {"training": f"not possible: {error}"}

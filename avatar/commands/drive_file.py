@@ -17,6 +17,7 @@ def run_drive_file(arguments: Namespace) -> int:
     source = source_of(arguments)
     check_outputs([arguments.out], [source.folder, source.head, source.tracking])
     subject, assets = open_subject(source)
-    write_drive(arguments.out, subject_drive(subject, None), assets.fingerprint)
-    print(f"{len(subject)} frames written to {arguments.out}")
+    drive = subject_drive(subject, None)
+    write_drive(arguments.out, drive, assets.fingerprint)
+    print(f"{len(drive)} frames written to {arguments.out}")
     return OK

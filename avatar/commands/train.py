@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from avatar.commands.outputs import check_run_folder
 from avatar.config import chosen_options, flatten, load_config
@@ -50,6 +52,9 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
         drop_video(arguments)
         plan = Plan.load(run)
         refuse_changed_plan(run, plan, arguments, overrides)
+        if (device := asked_device(overrides)) is not None:
+            kept = (override for override in plan.overrides if override.partition("=")[0] != "device")
+            plan = replace(plan, overrides=(*kept, f"device={device}"))
         source = moved_plan_source(run, plan.source, arguments)
         with locked(run / ROUNDS_FOLDER):
             return train_refined(run, plan, source, time.monotonic() - plan.spent)
@@ -139,9 +144,9 @@ def refuse_changed_plan(run: Path, plan: Plan, arguments: Namespace, overrides: 
         if now not in (None, was):
             began = f"without {option}" if was is None else f"with {option} {was:g}"
             raise UserError(f"{run} began {began}, not {now:g}: leave it out to resume")
-    if overrides and load_config(overrides) != load_config(plan.overrides):
-        began = " ".join(plan.overrides) or "no override"
-        raise UserError(f"{run} began with {began}: leave the overrides out to resume, or start a new run")
+    began = list(plan.overrides)
+    recorded = {**flatten(load_config(began).to_dict()), **chosen_options(began)}
+    refuse_changed_keys(run, recorded, overrides, {"device"})
     refuse_other_source(run, plan.source, arguments)
 
 
@@ -192,22 +197,27 @@ def config_overrides(arguments: Namespace) -> list[str]:
 
 def refuse_changed_run(run: Path, info: RunInfo, arguments: Namespace, overrides: list[str]) -> None:
     """A resumed run keeps its decisions; naming another value for one is an error, not a silent choice."""
-    if overrides:
-        recorded = {**flatten(info.config.to_dict()), **info.options}
-        asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
-        limited = (
-            recorded["trainer.max_epochs"] is not None
-            and asked["trainer.max_epochs"] == recorded["trainer.max_epochs"]
-            and asked["trainer.iterations"] > recorded["trainer.iterations"]
-        )
-        free = {"device", *(["trainer.iterations"] if limited else [])}  # what was asked for is not recorded
-        for key in (override.partition("=")[0] for override in overrides):
-            if key not in free and recorded[key] != asked[key]:
-                raise UserError(
-                    f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
-                    "start a new run"
-                )
+    recorded = {**flatten(info.config.to_dict()), **info.options}
+    asked = load_config(overrides).trainer
+    limited = (
+        recorded["trainer.max_epochs"] is not None
+        and asked.max_epochs == recorded["trainer.max_epochs"]
+        and asked.iterations > recorded["trainer.iterations"]
+    )
+    free = {"device", *(["trainer.iterations"] if limited else [])}  # what was asked for is not recorded
+    refuse_changed_keys(run, recorded, overrides, free)
     refuse_other_source(run, info.source, arguments)
+
+
+def refuse_changed_keys(run: Path, recorded: Mapping[str, Any], overrides: list[str], free: Collection[str]) -> None:
+    """Raises UserError for an override of another value than the recorded one, of keys that are not `free`."""
+    asked = {**flatten(load_config(overrides).to_dict()), **chosen_options(overrides)}
+    for key in (override.partition("=")[0] for override in overrides):
+        if key not in free and recorded[key] != asked[key]:
+            raise UserError(
+                f"{run} began with {key}={recorded[key]}, not {asked[key]}: leave the override out to resume, or "
+                "start a new run"
+            )
 
 
 def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None:

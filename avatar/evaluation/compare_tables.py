@@ -61,7 +61,7 @@ def markdown(comparison: Comparison) -> str:
 
 def latex(comparison: Comparison) -> str:
     """One tabular a protocol, for the package booktabs."""
-    heads = ["".join(LATEX_SPECIAL.get(character, character) for character in label) for label in _heads(comparison)]
+    heads = [_escaped(label) for label in _heads(comparison)]
     blocks = []
     for each in comparison.protocols:
         lines = [
@@ -74,9 +74,13 @@ def latex(comparison: Comparison) -> str:
         for figure, row in each.rows.items():
             arrow = "\\uparrow" if figure.startswith(HIGHER_IS_BETTER) else "\\downarrow"
             cells = (_math(figure, cell) for cell in row)
-            lines.append(f"{_title(figure)} ${arrow}$ & {' & '.join(cells)} \\\\")
+            lines.append(f"{_escaped(_title(figure))} ${arrow}$ & {' & '.join(cells)} \\\\")
         blocks.append("\n".join([*lines, "\\bottomrule", "\\end{tabular}"]))
     return "\n\n".join([*blocks, "\n".join(f"% {remark}" for remark in _remarks(comparison))]) + "\n"
+
+
+def _escaped(words: str) -> str:
+    return "".join(LATEX_SPECIAL.get(character, character) for character in words)
 
 
 def as_csv(comparison: Comparison) -> str:

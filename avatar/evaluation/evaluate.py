@@ -261,14 +261,17 @@ def worst_sheet(run: Run, renderer: Renderer, protocol: Protocol, worst: Sequenc
 
 
 def notes_of(protocols: Sequence[Protocol], run: Run) -> list[str]:
-    return [*background_notes(protocols, run.config.data.background), *region_notes(protocols, run)]
+    return [*background_notes(protocols, run), *region_notes(protocols, run)]
 
 
-def background_notes(protocols: Sequence[Protocol], trained: Sequence[float]) -> list[str]:
+def background_notes(protocols: Sequence[Protocol], run: Run) -> list[str]:
     """A warning for each background that the avatar was not trained over."""
-    notes = []
+    trained, notes = run.config.data.background, []
+    over = {tuple(trained)}
+    if run.config.trainer.opposite_background_every and run.avatar.has_colours:
+        over.add(tuple(1.0 - value for value in trained))
     for background in dict.fromkeys(protocol.background for protocol in protocols):
-        if tuple(trained) != background:
+        if background not in over:
             names = [protocol.name for protocol in protocols if protocol.background == background]
             notes.append(
                 f"{' and '.join(names)}: drawn over {colour_name(background)}, trained over {colour_name(trained)}; where "

@@ -16,6 +16,7 @@ from avatar.pipeline.train import config_for_subject, new_avatar
 from avatar.pose_refinement.refine import estimated_seconds
 from avatar.runs.checkpoint import KEPT
 from avatar.runs.memory_estimate import training_needs
+from avatar.runs.model_registry import refuse_features
 from avatar.train.cost_estimate import measure_cost
 from avatar.train.loss import choose_perceptual
 from data_prep.prepare.open_subject import open_subject
@@ -31,6 +32,9 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     config = load_config(overrides)
     chosen = choose_device(device or config.device, print)
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
+    if rounds:
+        refuse_features(config.model, "--refine")
+        subject.refuse_several_cameras("--refine")
     check_divided(subject.split)
     config, size = config_for_subject(config, subject), subject.image_size(config.data.size)
     frames = len(subject.split.train)
@@ -42,7 +46,6 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     cost = measure_cost(frame, assets, subject.identity, frames, config)
     seconds = cost.step_seconds * (cost.iterations + rounds * round_steps(cost.iterations, frames))
     if rounds:
-        subject.refuse_several_cameras("--refine")
         avatar = new_avatar(assets, subject, config, perceptual.name, CPU)
         background = torch.tensor(config.data.background)
         seconds += rounds * estimated_seconds(avatar, subject, config.data.size, background)

@@ -75,7 +75,9 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
 
 
 def continue_or_begin(source: Source, overrides: list[str], run: Path) -> int:
-    return resume_run(run, source.head, source.folder) if is_begun(run) else train_new(source, overrides, run)
+    if is_begun(run):
+        return resume_run(run, source.head, source.folder, load_config(overrides).device)
+    return train_new(source, overrides, run)
 
 
 def is_begun(run: Path) -> bool:

@@ -18,6 +18,7 @@ from avatar.runs.model_registry import MODELS
 Shapes = dict[str, tuple[int, ...]]  # by the names in a state dict
 
 FLOAT = 4  # bytes
+MESH_BYTES = 2**28  # of posed meshes, 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again
 STEP_COPIES = 4  # of a parameter during a step: itself, its gradient, Adam's two moments
 # While a checkpoint is written: all but the gradient once more as a file, which is copied once.
 SAVING_COPIES = 4 + 2 * 3
@@ -54,9 +55,10 @@ def training_needs(
     gaussians = count_gaussians(model, assets)
     shapes = MODELS[model.name].shapes(model, assets.num_expressions, gaussians)
     cached = min(CACHE_BYTES, frames * pixels * BYTES_PER_PIXEL)
+    posed = min(MESH_BYTES, frames * 3 * FLOAT * assets.num_vertices)
     ahead = FRAMES_AHEAD * pixels * BYTES_PER_PIXEL
     lasting = [
-        Need("the cache of decoded frames", cached, "--size"),
+        Need("the cache of decoded frames", cached + posed, "--size"),
         Need("a frame and its losses", ahead + pixels * PIXEL_BYTES.get(perceptual, PIXEL_BYTES["dssim"]), "--size"),
     ]
     layers = encoded_size() + (model.mlp_layers + 2) * model.mlp_width

@@ -21,6 +21,7 @@ from avatar.compute.device import on_gpu, to_device
 from avatar.compute.gpu_functions import gpu_function
 from avatar.data.frame import Frame
 from avatar.losses.photometric import crop_of_few_sizes
+from avatar.runs.memory_estimate import MESH_BYTES
 from avatar.train.condition_noise import ConditionNoise
 from avatar.train.loss import Weighted, sh_degree
 from avatar.train.optimizer import schedule, set_rates
@@ -29,7 +30,6 @@ from avatar.train.zoom import Zoom, zoomed
 from avatar.types import Camera
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
-MESH_BYTES = 2**28  # of posed meshes, 4,400 frames of FLAME's 5,023 vertices; what does not fit is computed again
 KEPT = 8  # kinds that are ready at a time
 BLOCK = 64  # steps whose noise comes to a GPU at once
 

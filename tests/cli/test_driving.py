@@ -75,7 +75,9 @@ def test_one_time_of_several_cameras_drives_and_is_not_trained_on(
     video = tmp_path / "one.mp4"
     assert main(["reenact", str(run), "--driver", str(folder), "--out", str(video), *head]) == 0
     assert len(iio.imread(video)) == 1
-    assert "the pictures are of a single time" in capsys.readouterr().out
+    assert main(["drive-file", str(folder), "--out", str(tmp_path / "one.npz"), *head]) == 0
+    assert "\n1 frames written" in (said := capsys.readouterr().out)
+    assert "the pictures are of a single time" in said
     for held_out in ([], ["data.test_cameras=08"], ["data.test_frames=1"]):
         assert main(["train", str(folder), "--out", str(tmp_path / "run"), *head, *held_out]) == 1
         assert "3 pictures are all of one time; at least 2 times are needed" in capsys.readouterr().err

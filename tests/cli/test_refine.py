@@ -158,8 +158,13 @@ def test_training_in_rounds(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     raw = json.loads((run / "rounds" / "2" / "someone" / "refinement.json").read_text())["refinement"]
     assert [Path(one["run"]).parts[-2:] for one in raw["rounds"]] == [("1", "run"), ("2", "run")]
     assert "refined, fitted" in avatar("eval", run, "--protocol", "strict")
-    assert "is complete" in avatar("train", "--resume", "--out", run)
+    assert "is complete" in avatar("train", "--resume", "--out", run, "--device", "cpu", "trainer.seed=0")
     assert "holds a run already" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
+
+
+def test_a_dry_run_refuses_what_training_in_rounds_refuses(folder: Path) -> None:
+    words = ("train", folder, "--frame-offset", 1, "--dry-run", "--refine", 1, "model=gaussianheadavatar", *QUICK)
+    assert "--refine" in avatar(*words, status=1)
 
 
 def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,7 +278,7 @@ def test_rounds_go_on_where_they_stopped(folder: Path, tmp_path: Path, monkeypat
     assert "add --resume" in avatar(*words, status=1)
     assert "began with --refine 1, not 2" in avatar("train", "--resume", "--out", run, "--refine", 2, status=1)
     changed = avatar("train", "--resume", "--out", run, "trainer.iterations=11", status=1)
-    assert "leave the overrides out" in changed
+    assert "leave the override out" in changed
     assert "began with --frame-offset 1" in avatar("train", "--resume", "--out", run, "--frame-offset", 2, status=1)
     other = write_tracked_folder(tmp_path / "other", frames=4, size=24)
     assert "began on" in avatar("train", other, "--resume", "--out", run, status=1)

@@ -192,6 +192,8 @@ def test_tables(tmp_path: Path) -> None:
     assert "\\begin{tabular}{lrr}" in lines and "tracked & a\\_1 & b|2 \\\\" in lines
     assert "PSNR, dB $\\uparrow$ & $30.00$ & $31.50$ ($+1.50$ $[+1.50, +1.50]$)* \\\\" in lines
     assert "jitter, levels $\\downarrow$ & $2.00$ & $1.50$ ($-0.50$ $[-0.50, -0.50]$)* \\\\" in lines
+    rims = [write_run(tmp_path / name, {"psnr_head_rim": np.full(40, 30.0)}) for name in ("c", "d")]
+    assert "PSNR head\\_rim, dB $\\uparrow$" in latex(compare_runs(rims))
     rows = list(csv.DictReader(io.StringIO(as_csv(comparison))))
     line = ["strict", "tracked", "psnr", "b|2", "40", "31.500000", "1.500000", "1.500000", "1.500000", "dssim", ""]
     assert list(rows[1].values()) == line

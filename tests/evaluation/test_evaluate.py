@@ -17,7 +17,7 @@ from avatar.data.split import Split
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation import measure as measure_module
-from avatar.evaluation.evaluate import evaluate
+from avatar.evaluation.evaluate import evaluate, notes_of
 from avatar.evaluation.protocol import builtin_protocols, choose_protocols
 
 
@@ -108,6 +108,9 @@ def test_results_name_every_choice(tmp_path: Path, subject: Subject) -> None:
         assert entry["means"]["lpips"] is None and entry["lpips"]["network"] is None
         assert entry["lpips"]["note"].startswith("not measured") and len(entry["lpips"]["note"]) < 100
         assert not (run.path / "eval" / protocol.name / "renders").exists()
+    run.config.trainer.opposite_background_every = 3
+    (alone,) = [note for note in notes_of(choose_protocols(None), run) if "drawn over" in note]
+    assert alone.startswith("flashavatar")
     green, black = results["notes"]
     assert green.startswith("flashavatar: drawn over green, trained over white; ")
     assert black.startswith("rgbavatar: drawn over black, trained over white; ")

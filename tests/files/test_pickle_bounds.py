@@ -8,12 +8,14 @@ import struct
 import time
 import tracemalloc
 import zipfile
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from avatar.errors import UserError
-from avatar.files.pickles import MIN_BUDGET_BYTES, load_pickle, load_torch_pickle
+from avatar.files.pickles import MIN_BUDGET_BYTES, load_npz, load_pickle, load_torch_pickle
 
 HUGE = 2**28
 
@@ -125,3 +127,15 @@ def test_a_deep_nest_is_made_and_thrown_away() -> None:
 def test_a_device_without_end_is_not_read() -> None:
     with pytest.raises(UserError, match=r"^/dev/zero is a device"):
         load_pickle("/dev/zero")
+
+
+def test_a_damaged_lzma_member_of_an_npz(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.save(tmp_path / "a.npy", np.arange(1000))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.write(tmp_path / "a.npy", "a.npy")
+    data = bytearray(path.read_bytes())
+    for place in range(60, 260):
+        path.write_bytes(bytes([*data[:place], data[place] ^ 0xFF, *data[place + 1 :]]))
+        with suppress(UserError):
+            load_npz(path)

@@ -94,6 +94,8 @@ NECK = torch.tensor([[0.0, 0.5, 0.0]])  # a vertex below
 class Blob:
     """Stands in for a trained avatar: Gaussians on a disc whose colour follows the first expression coefficient."""
 
+    has_colours = True
+
     def __init__(self, eyeballs: bool = True) -> None:
         regions = {"left_eyeball": torch.tensor([0, 1]), "right_eyeball": torch.tensor([2, 3])} if eyeballs else {}
         assets = SimpleNamespace(fingerprint="ab" * 32, regions=regions)
@@ -136,7 +138,8 @@ class BlobRenderer:
 
 def make_run(path: Path, subject: Subject) -> Any:
     data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0))
-    config = SimpleNamespace(data=data, to_dict=lambda: {"data": {"size": None}})
+    trainer = SimpleNamespace(opposite_background_every=None)
+    config = SimpleNamespace(data=data, trainer=trainer, to_dict=lambda: {"data": {"size": None}})
     return SimpleNamespace(
         path=path, config=config, avatar=Blob(), subject=subject, step=1500, trained=SimpleNamespace(perceptual="dssim")
     )
