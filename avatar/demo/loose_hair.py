@@ -102,14 +102,15 @@ def draw(screen: np.ndarray, widths: np.ndarray, colours: np.ndarray, depth: np.
         column, row = corner[:, 0] + x, corner[:, 1] + y
         on = np.flatnonzero((column >= 0) & (column < width) & (row >= 0) & (row < height))
         behind = depth[row[on], column[on]]
-        on = on[(behind == 0) | (sample[on, 2] < behind)]
-        share = np.abs(1 - x - part[on, 0]) * np.abs(1 - y - part[on, 1])
+        cover = np.minimum(area[on] * np.abs(1 - x - part[on, 0]) * np.abs(1 - y - part[on, 1]), 0.95)
+        some = (cover > 0) & ((behind == 0) | (sample[on, 2] < behind))
+        on = on[some]
         pixels.append(row[on] * width + column[on])
-        covers.append(np.minimum(area[on] * share, 0.95))
+        covers.append(cover[some])
         seen.append(on)
     pixel, cover, of = map(np.concatenate, (pixels, covers, seen))
     at, place = np.unique(pixel, return_inverse=True)
-    weight = np.maximum(np.bincount(place, cover), 1e-12)
+    weight = np.bincount(place, cover)
     colour = np.stack([np.bincount(place, cover * sample[of, 4 + c]) for c in range(3)], -1) / weight[:, None]
     clear = np.exp(np.bincount(pixel, np.log1p(-cover), height * width)).reshape(height, width)
     return Drawn(clear.astype(np.float32), at // width, at % width, colour.astype(np.float32))
