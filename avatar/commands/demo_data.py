@@ -17,6 +17,8 @@ NAMES_OF_VIDEOS = (*VIDEO_SUFFIXES, ".avi", ".m4v", ".webm")  # what a person ca
 def run_demo_data(arguments: Namespace) -> int:
     check_outputs([arguments.out], [])
     is_video = arguments.video or arguments.out.suffix.lower() in NAMES_OF_VIDEOS
+    if arguments.outdoors and not is_video:
+        raise UserError("--outdoors is of a video: add --video")
     if arguments.cameras is not None:
         if is_video:
             raise UserError("--cameras writes a folder, no video: leave out --video and name a folder")
@@ -28,7 +30,7 @@ def run_demo_data(arguments: Namespace) -> int:
         return OK
     frames, motion = _or(arguments.frames, 600), arguments.motion or "speech"
     if is_video:
-        make_video(arguments.out, frames, _or(arguments.size, 512), arguments.seed, motion)
+        make_video(arguments.out, frames, _or(arguments.size, 512), arguments.seed, motion, arguments.outdoors)
         if not (head := find_subject_head(arguments.out)).exists():
             make_head_model(head)
             print(f"Head   {head}")

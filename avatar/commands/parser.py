@@ -215,6 +215,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     demo_data.add_argument("--frames", type=int, help="default: 600; with --cameras 100 in a sequence")
     demo_data.add_argument("--cameras", type=int, metavar="N", help="2 to 64: three sequences in VHAP's layout")
     demo_data.add_argument("--video", action="store_true", help="film it: OUT is an .mp4, head_model/ beside it")
+    demo_data.add_argument("--outdoors", action="store_true", help="of a video: loose hair, a background that moves")
     demo_data.add_argument("--size", type=int, help="width and height in pixels (default: 256, of a video 512)")
     demo_data.add_argument("--seed", type=int, default=0, help="another seed is another person")
     demo_data.add_argument("--motion", choices=("speech", "turn", "gaze"), help="default: speech")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from avatar.errors import UserError
 from avatar.files.video import video_writer
 
 SHOT_NOISE, READ_NOISE = 0.55, 1.2  # standard deviations in levels of 255: per root of the level, and everywhere
+_STREET = 1.3  # sides of a picture over which a hand-held camera drifts
+_PASSING, _SKIN = 3, (150, 115, 95)  # people, and their faces' colour
 _GRAIN = 1.1  # pixels, over which a sensor's noise is smeared by demosaicing
 
 
@@ -26,9 +29,11 @@ def make_video(
     size: int = 512,
     seed: int = 0,
     motion: Motion = "speech",
+    outdoors: bool = False,
 ) -> Path:
     """Film `frames` pictures of `size` x `size` pixels of the person of `seed` and write them as H.264 to `out` (.mp4).
 
+    `outdoors` is hard to matte: loose hair, before a background that moves.
     The same arguments give the same pictures before the encoder, and the same motion as `make_subject`, whose tracking is
     the truth for this video. The file appears when it is complete. Raises UserError for values out of range, and where
     `out` exists or has another suffix.
@@ -40,32 +45,38 @@ def make_video(
         raise UserError(f"{out} exists; choose another name or remove it first")
     check_arguments(frames, size, seed, motion)
     with video_writer(out, FPS) as add:
-        for picture in tqdm(filmed(frames, size, seed, motion), total=frames, desc="filming", unit="frame"):
+        for picture in tqdm(filmed(frames, size, seed, motion, outdoors), total=frames, desc="filming", unit="frame"):
             add(picture)
     return out
 
 
-def filmed(frames: int, size: int, seed: int, motion: Motion = "speech") -> Iterator[np.ndarray]:
+def filmed(
+    frames: int, size: int, seed: int, motion: Motion = "speech", outdoors: bool = False
+) -> Iterator[np.ndarray]:
     """The pictures, uint8 [size, size, 3], before they are encoded."""
-    renderer = Renderer(sample_identity(seed))
+    renderer = Renderer(sample_identity(seed), has_loose_hair=outdoors)
     performance = perform(seed, frames, motion)
     with single_threads():
         drawn = rendered(renderer, performance, size)
-        yield from in_room(((picture.image, picture.alpha) for _, _, picture in drawn), size, seed)
+        yield from in_room(((picture.image, picture.alpha) for _, _, picture in drawn), size, seed, outdoors)
 
 
-def in_room(pictures: Iterable[tuple[np.ndarray, np.ndarray]], size: int, seed: int) -> Iterator[np.ndarray]:
-    """Pictures of the person of `seed` and their alpha, as a camera in the person's room would have taken them.
+def in_room(
+    pictures: Iterable[tuple[np.ndarray, np.ndarray]], size: int, seed: int, outdoors: bool = False
+) -> Iterator[np.ndarray]:
+    """Pictures of the person of `seed` and their alpha, as a camera in the person's room would have taken them, or
+    `outdoors`, where what is behind moves.
 
     All are uint8, `size` pixels wide and high; the pictures are over the person's own background, as the renderer and
     `make_subject` leave them.
     """
-    change = make_room(size, seed) - background_of(sample_identity(seed), size, size)
+    own = background_of(sample_identity(seed), size, size)
+    scenery = make_street(size, seed) if outdoors else itertools.repeat(make_room(size, seed))
     rng = np.random.default_rng((seed, 11))
-    for image, alpha in pictures:
+    for (image, alpha), seen in zip(pictures, scenery, strict=False):
         # Where the person covers a part of a pixel, the renderer's own background is the rest of it.
         behind = 1.0 - alpha[..., None].astype(np.float32) / 255.0
-        yield expose(image + behind * change, rng)
+        yield expose(image + behind * (seen - own), rng)
 
 
 def expose(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -101,3 +112,31 @@ def make_room(size: int, seed: int) -> np.ndarray:
             place(at, height + rng.uniform(0.0, 0.07), at + width, height + 0.16, colour)
             at += width
     return cv2.GaussianBlur(room, (0, 0), 0.012 * size)
+
+
+def make_street(size: int, seed: int) -> Iterator[np.ndarray]:
+    """What a hand-held camera sees outdoors behind the person, frame by frame without end: trees before the sky, which
+    drift, and people who pass. Like `make_room`."""
+    rng = np.random.default_rng((seed, 14))
+    wide = round(_STREET * size)
+    x = np.arange(wide) / wide
+    leaves = cv2.GaussianBlur(rng.standard_normal((wide, wide)), (0, 0), 0.015 * size)
+    tops = cv2.GaussianBlur(rng.standard_normal((1, wide)), (0, 0), 0.05 * size)
+    street = np.empty((wide, wide, 3), np.float32)
+    street[:] = np.array([226, 233, 240]) * (1.0 - 0.1 * x[:, None, None])
+    is_tree = x[:, None] > rng.uniform(0.2, 0.5) + 0.1 * tops / tops.std()
+    trees = rng.uniform((40, 55, 25), (95, 100, 60)) * np.exp(0.45 * leaves / leaves.std())[..., None]
+    street[is_tree] = np.minimum(trees, 235.0)[is_tree]
+    at, pace = rng.uniform(0.0, 1.0, _PASSING), rng.choice((-1, 1), _PASSING) * rng.uniform(0.003, 0.01, _PASSING)
+    clothes = rng.uniform(30, 190, (_PASSING, 1)) * rng.uniform(0.7, 1.0, (_PASSING, 3))
+    phase, speed = rng.uniform(0, 2 * np.pi, (2, 2)), rng.uniform(0.02, 0.07, (2, 2))
+    for frame in itertools.count():
+        picture = street.copy()
+        for k in range(_PASSING):
+            centre = round(wide * (1.3 * ((at[k] + frame * pace[k]) % 1.0) - 0.15))
+            for y, across, high, colour in ((0.98, 0.09, 0.42, clothes[k]), (0.52, 0.035, 0.05, _SKIN)):
+                axes = round(across * wide), round(high * wide)
+                cv2.ellipse(picture, (centre, round(y * wide)), axes, 0, 0, 360, [float(c) for c in colour], -1)
+        picture = cv2.GaussianBlur(picture, (0, 0), 0.012 * size)
+        left, top = 0.5 * (wide - size) * (1.0 - 0.45 * np.sin(phase + frame * speed).sum(0))
+        yield cv2.warpAffine(picture, np.array([[1, 0, -left], [0, 1, -top]]), (size, size))

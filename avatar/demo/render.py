@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 
-from avatar.demo import lighting, scene, shading
+from avatar.demo import lighting, loose_hair, scene, shading
 from avatar.demo.identity import Identity, sample_identity
 from avatar.demo.mesh import EYE_RADIUS
 from avatar.demo.occlusion import ambient_occlusion
@@ -58,9 +58,10 @@ class PosedScene(NamedTuple):
 
 
 class Renderer:
-    """Renders one person. Baking the textures takes some seconds, a frame then about a tenth of one."""
+    """Renders one person, with loose hair where asked to. Baking the textures takes some seconds, a frame then about a
+    tenth of one."""
 
-    def __init__(self, identity: Identity) -> None:
+    def __init__(self, identity: Identity, has_loose_hair: bool = False) -> None:
         self.identity = identity
         self.performer = performer = scene.Performer(identity)
         self.lights = lighting.make_lights(identity.key_side)
@@ -68,6 +69,7 @@ class Renderer:
         self._relief = (self.skin.relief[..., :4].copy(), self.skin.relief[..., 4:].copy())
         self.iris = paint_iris(identity)
         self._strands = strand_tile(identity.seed)
+        self._loose = loose_hair.LooseHair(performer) if has_loose_hair else None
         mesh = performer.head.mesh
         self._texels = np.stack((mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]), -1).astype(np.float32) * TEXTURE_SIZE - 0.5
         on_lips = np.zeros(performer.num_points, bool)
@@ -140,7 +142,17 @@ class Renderer:
             lenses = to_screen(geometry.lens_points, R_view, t_view, big)
             front = rasterize_mesh(lenses, self.performer.lenses.faces, big.height, big.width)
             self._add_lenses(colour, front, pixels, depth, whole.view, posed)
-        return self._to_picture(colour, material, pixels, camera)
+        if self._loose is None:
+            return self._to_picture(colour, material, pixels, camera, None)
+        at = self._loose.points(geometry.points)
+        flat, R = at.reshape(-1, 3), posed.R_studio_head
+        ahead = lighting.turn(lighting.turn(flat, R_view) + t_view, R_view_studio.T)  # from the camera
+        lit = self._key_share(posed, ahead - R_view_studio.T @ t_view_studio)
+        placed = lighting.turn(flat, R).reshape(at.shape)
+        shades = loose_hair.shade(self._loose, placed, posed.surface, -lighting.unit(ahead), lit, self.lights)
+        screen = to_screen(flat, R_view, t_view, big).reshape(at.shape)
+        strands = loose_hair.draw(screen, self._loose.widths * big.fx / screen[..., 2], shades, raster.depth)
+        return self._to_picture(colour, material, pixels, camera, strands)
 
     def _shade(self, kind: int, surface: shading.Surface, pixels: Pixels, posed: PosedScene) -> np.ndarray:
         if kind == scene.SKIN:
@@ -202,7 +214,14 @@ class Renderer:
         normals = lighting.turn(normals, posed.R_studio_head)
         colour[at] = shading.lens(colour[at], lighting.unit(normals), view[at], self.lights)
 
-    def _to_picture(self, colour: np.ndarray, material: np.ndarray, pixels: Pixels, camera: Camera) -> RenderedFrame:
+    def _to_picture(
+        self,
+        colour: np.ndarray,
+        material: np.ndarray,
+        pixels: Pixels,
+        camera: Camera,
+        strands: loose_hair.Drawn | None,
+    ) -> RenderedFrame:
         height, width = SUPERSAMPLE * camera.height, SUPERSAMPLE * camera.width
         canvas = _background(tuple(self.identity.background.tolist()), height, width).copy()
         canvas[pixels.row, pixels.column] = lighting.tone_map(colour)
@@ -210,6 +229,10 @@ class Renderer:
         in_mouth = np.isin(material, (scene.MOUTH_UPPER, scene.MOUTH_LOWER, scene.LINING)) | self._is_lip[pixels.face]
         everything = np.ones(len(material), bool)
         masks[pixels.row, pixels.column] = np.column_stack((everything, material != scene.SHIRT, in_mouth)) * 255.0
+        if strands is not None:
+            clear, at = strands.clear[..., None], (strands.row, strands.column)
+            canvas[at] = canvas[at] * clear[at] + lighting.tone_map(strands.colour) * (1.0 - clear[at])
+            masks = masks * clear + np.array([255.0, 255.0, 0.0], np.float32) * (1.0 - clear)
         small = (camera.width, camera.height)
         image = cv2.resize(canvas, small, interpolation=cv2.INTER_AREA)
         masks = cv2.resize(masks, small, interpolation=cv2.INTER_AREA)

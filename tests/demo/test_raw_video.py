@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from avatar.cli import main
 from avatar.demo.motion import frame_camera, frame_params, perform
-from avatar.demo.raw_video import expose, filmed, make_room, make_video
+from avatar.demo.raw_video import expose, filmed, make_room, make_street, make_video
 from avatar.demo.render import render_frame
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
@@ -51,6 +53,24 @@ def test_it_repeats_and_every_seed_has_its_room(pictures: list[np.ndarray]) -> N
     assert np.abs(make_room(SIZE, 1) - make_room(SIZE, 2)).mean() > 10
 
 
+def test_outdoors_the_background_moves_behind_the_same_person(pictures: list[np.ndarray]) -> None:
+    first, second = (list(filmed(FRAMES, SIZE, SEED, outdoors=True)) for _ in range(2))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+    performance = perform(SEED, FRAMES, "speech")
+    truth = [
+        render_frame(SEED, frame_params(performance, n), frame_camera(performance, n, SIZE)) for n in range(FRAMES)
+    ]
+    mouth = truth[0].mouth == 255
+    assert np.abs(first[0].astype(float) - pictures[0])[mouth].mean() < 3.0
+    street = list(islice(make_street(SIZE, SEED), 40))
+    assert street[0].shape == (SIZE, SIZE, 3) and street[0].dtype == np.float32
+    assert 2.0 < np.abs(street[1] - street[0]).mean() < np.abs(street[39] - street[0]).mean()
+    for n in (0, FRAMES - 1):
+        far = cv2.erode((truth[n].alpha == 0).astype(np.uint8), np.ones((25, 25), np.uint8)) > 0  # from loose hair too
+        assert far.sum() > 500 and np.abs(first[n] - street[n])[far].mean() < 4.0
+
+
 def test_the_command_writes_a_video_and_a_head_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, head = tmp_path / "me.mp4", tmp_path / "head_model"
     options = ["--video", "--frames", "3", "--size", "96"]
@@ -62,8 +82,10 @@ def test_the_command_writes_a_video_and_a_head_model(tmp_path: Path, capsys: pyt
     assert sorted(path.name for path in tmp_path.iterdir()) == ["head_model", "me.mp4"]
     assert load_head_assets(head).num_vertices > 1000
     # The name alone says that it is a video; one head model is enough for all of them.
-    assert main(["demo-data", str(tmp_path / "you.mp4"), *options[1:], "--seed", "2"]) == 0
+    assert main(["demo-data", str(tmp_path / "you.mp4"), *options[1:], "--seed", "2", "--outdoors"]) == 0
     assert f"--head {head}" in capsys.readouterr().out and open_video(tmp_path / "you.mp4").width == 96
+    assert main(["demo-data", str(tmp_path / "folder"), "--outdoors"]) == 1
+    assert "--outdoors is of a video: add --video" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["me.webm", "me.MOV", "me.avi"])
