@@ -51,9 +51,9 @@ def run_sweep(arguments: Namespace) -> int:
 
 def refuse_other_engines(arguments: Namespace) -> None:
     """Raises UserError for options that the engine does not have."""
-    for name, engines in (("address", ("ray",)), ("partition", ("slurm",))):
+    for name, engines in (("address", ("ray", "slurm")), ("partition", ("slurm",))):
         if getattr(arguments, name) is not None and arguments.engine not in engines:
-            raise UserError(f"--{name} is for --engine {engines[0]}, not for {arguments.engine}")
+            raise UserError(f"--{name} is for --engine {' or '.join(engines)}, not for {arguments.engine}")
 
 
 def sweep_folder(spec: Path | None, out: Path | None) -> Path:

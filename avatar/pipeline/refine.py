@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,8 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
         "refinement.png": sheet(run.avatar, subject, refined, after, config.data.size, background),
     }
     write_folder(target, subject, refined.tracks, next_refinement(run), extras)
+    with suppress(OSError):
+        progress.unlink()
     print(f"Refined in {seconds:.0f} s ({seconds / len(subject):.3f} s per frame).")
     print("\n".join(summary(subject, refined, centre)))
     print(f"Subject      {target}")

@@ -13,6 +13,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 
 _MAX_PROGRESS = 2**28  # bytes
+_MISSING = -1e30  # a figure of a frame without a head, which is NaN: files hold finite values
 
 
 def read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list[tuple[float, ...]]]:
@@ -26,9 +27,9 @@ def read_progress(path: Path, key: str, values: int) -> tuple[list[Tensor], list
         return [], []
     if moves.shape[1:] != (values,) or figures.shape != (len(moves), 3):
         return [], []
-    return list(moves), [tuple(row) for row in figures.tolist()]
+    return list(moves), [tuple(row) for row in figures.masked_fill(figures == _MISSING, torch.nan).tolist()]
 
 
 def write_progress(path: Path, key: str, moves: list[Tensor], figures: list[tuple[float, ...]]) -> None:
-    tensors = {"moves": torch.stack(moves), "figures": torch.tensor(figures, dtype=torch.float64)}
+    tensors = {"moves": torch.stack(moves), "figures": torch.tensor(figures, dtype=torch.float64).nan_to_num(_MISSING)}
     write_atomically(path, serialize(tensors, metadata={"key": key}))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -71,7 +71,8 @@ def refine_subject(
 ) -> Refined | None:
     """Refine all frames at `size` pixels of width; None after an interruption (Ctrl-C or SIGTERM).
 
-    progress   file for what is done so far: the next call with the same avatar and subject goes on from it
+    progress   file for what is done so far: the next call with the same avatar and subject goes on from it. The caller
+               removes it when the result is written
     Raises UserError for a frame that cannot be read, when no training frame shows a head and when the disk refuses.
     """
     with frozen(avatar), interruption() as interrupted:
@@ -93,11 +94,10 @@ def refine_subject(
                     write_progress(progress, key, moves, figures)
                 if interrupted():
                     return None
+        write_progress(progress, key, moves, figures)
         first = torch.linalg.cholesky(matrices[0])
         result = work.finish(torch.stack(moves), first @ first.T, np.array(figures)[:, :2])
-    with suppress(OSError):
-        progress.unlink()
-    return result
+        return None if interrupted() else result
 
 
 def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, background: Float[Tensor, 3]) -> float:

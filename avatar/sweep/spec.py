@@ -26,6 +26,7 @@ from typing import Any
 
 from avatar.config import load_config
 from avatar.errors import UserError
+from avatar.evaluation.protocol import choose_protocols
 from avatar.files.environment import expanded
 from avatar.files.plain_yaml import read_yaml
 
@@ -124,7 +125,7 @@ def read_spec(path: Path) -> Spec:
         raise UserError(f"{path}: seeds holds {wrong[0]!r}, which is no number from 0 up")
     if len(set(seeds)) < len(seeds):
         raise UserError(f"{path}: seeds names one twice")
-    protocols = tuple(_words(path, "protocols", raw.get("protocols", [])))
+    protocols = _protocols(path, _words(path, "protocols", raw.get("protocols", [])))
     if len(subjects) * len(variants) * len(seeds) > MAX_JOBS:
         raise UserError(f"{path} asks for more than {MAX_JOBS:,} jobs; split it into several sweeps")
     jobs = [
@@ -154,6 +155,18 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
     return raw
+
+
+def _protocols(path: Path, words: list[str]) -> tuple[str, ...]:
+    """Names, and paths of files. Raises UserError as `avatar eval` does, before anything is trained."""
+    is_file = [word.endswith((".yaml", ".yml")) for word in words]
+    placed = [str(path.resolve().parent / word) if file else word for word, file in zip(words, is_file, strict=True)]
+    if placed:
+        try:
+            choose_protocols(placed)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
+    return tuple(placed)
 
 
 def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from avatar.files.atomic import write_atomically
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
 from avatar.runs.training_curves import LOSSES, read_curves, write_curves
@@ -75,7 +76,7 @@ class TrainingLog:
         pair = torch.cat((truth, render), dim=1).detach().clamp(0, 1)
         image = np.round(pair.cpu().numpy() * 255).astype(np.uint8)
         self._previews.mkdir(parents=True, exist_ok=True)
-        iio.imwrite(self._previews / f"step_{step:08d}.png", image)
+        write_atomically(self._previews / f"step_{step:08d}.png", iio.imwrite("<bytes>", image, extension=".png"))
 
 
 def smoothed(mean: float, value: float, steps: int) -> float:

@@ -108,9 +108,12 @@ def train(
                 if saves or interrupted():
                     progress.flush()
                 if saves:
-                    log.preview(step, *render_held_out(avatar, loader, subject, background, step))
+                    pair = render_held_out(
+                        avatar, loader, subject, background, step
+                    )  # what cannot be drawn is not saved
                     save(step)
                     saved = step
+                    log.preview(step, *pair)
                 if interrupted():
                     break
         except NonFiniteStep as nonfinite:

@@ -67,7 +67,7 @@ MISTAKES = {
     ),
     "a cluster's address for this machine": (
         ["sweep", "--out", "{tmp}/sweep", "--address", "head:1"],
-        "--address is for --engine ray, not for local",
+        "--address is for --engine ray or slurm, not for local",
     ),
     "LPIPS without weights": (
         ["train", "{data}", "--frame-offset", "1", "--out", "{tmp}/l", "trainer.perceptual=lpips-squeeze", *QUICK],

@@ -46,7 +46,7 @@ def refined(avatar: Avatar, clip: Clip, progress: Path, said: list[str] | None =
 def result(avatar: Avatar, wrong: Clip, tmp_path_factory: pytest.TempPathFactory) -> Refined:
     progress = tmp_path_factory.mktemp("work") / "progress"
     found = refined(avatar, wrong, progress)
-    assert found is not None and not progress.exists()
+    assert found is not None and progress.exists()
     return found
 
 

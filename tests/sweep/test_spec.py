@@ -70,6 +70,8 @@ MISTAKES = {
     "a tag without a value": ("subjects: [!!int '']", "cannot be read as YAML"),
     "a tag of another kind": ("subjects: [!!timestamp x]", "cannot be read as YAML"),
     "a folder that no system has": ('subjects: ["a\\0b"]', "not a path"),
+    "a protocol that is none": ("subjects: [a]\nprotocols: [hypergausians]", "there is no protocol 'hypergausians'"),
+    "a protocol's file that is not there": ("subjects: [a]\nprotocols: [mine.yaml]", "mine.yaml does not exist"),
     "no subjects": ("seeds: [1]", "subjects must be a list with at least one entry"),
     "a subject without folder": ("subjects: [{head: x}]", "names no folder"),
     "an unknown key of a subject": ("subjects: [{folder: a, size: 3}]", "a subject has no key 'size'"),
