@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from avatar.files.lock import is_held
 from avatar.sweep.engines import Engine
 from avatar.sweep.spec import Spec
 from avatar.sweep.state import State, progress_mark, read_state, stored_state, write_state
@@ -55,7 +56,10 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                 if said is not None:
                     del handles[name]
                     states[name] = final_state(places[name], ended.pop(name, said), spec.retries)
-                    again += [name] if is_open(states[name], spec.retries) else []
+                    if states[name].status == "running":
+                        elsewhere.add(name)
+                    else:
+                        again += [name] if is_open(states[name], spec.retries) else []
                     continue
                 states[name] = read_state(places[name])
                 is_running = name not in ended and stored_state(places[name]).status == "running"
@@ -92,8 +96,13 @@ def is_open(state: State, retries: int) -> bool:
 
 
 def final_state(place: Path, said: str, retries: int) -> State:
-    """The state of a job whose worker has ended. One that died without a word leaves `running` behind."""
+    """The state of a job whose worker has ended. One that died without a word leaves `running` behind.
+
+    A job that another sweep's worker has taken is running, and nothing is written.
+    """
     state = stored_state(place)
+    if "is being written by" in said and is_held(place):
+        return replace(state, status="running")
     if state.status == "running":
         state = replace(state, status="failed", sentence=said or "the worker ended without a word")
     elif said and state.status == "waiting":

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from avatar.errors import UserError
+from avatar.files.lock import locked
 from avatar.sweep import run_sweep
 from avatar.sweep import worker as workers
 from avatar.sweep.engines import EngineOptions, LocalProcesses, make_engine
@@ -156,6 +157,40 @@ def test_a_worker_of_another_sweep_that_hangs_is_named_and_not_waited_for(place:
     state = run_jobs(place.parents[1], SPEC, Hanging(place), Progress())["j"]
     assert state.status == "failed" and "elsewhere:17 hangs" in state.sentence
     assert json.loads((place / "state.json").read_text())["status"] == "running", "it is not ours"
+
+
+class TakenByAnother(Hanging):
+    """An engine whose worker finds that another sweep's has the job."""
+
+    submissions = 0
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        self.submissions += 1
+        write_state(self.place, State("running", 1, "elsewhere:17"))
+        write_heartbeat(self.place, 3)
+        return list(folders)
+
+    def poll(self, handle: Any) -> str | None:
+        with pytest.raises(UserError) as error, locked(self.place):
+            pass
+        return str(error.value)
+
+
+@pytest.mark.timeout(30)
+def test_a_job_that_another_sweep_has_taken_is_waited_for(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, looks = TakenByAnother(place), list[str]()
+    monkeypatch.setattr(run_sweep, "STALLED_SECONDS", 10.0)
+
+    def look(progress: Progress, states: dict[str, State], last: bool = False) -> None:
+        looks.append(json.loads((place / "state.json").read_text())["status"])
+        if len(looks) == 3:
+            write_state(place, State("done", 1, "elsewhere:17"))
+
+    monkeypatch.setattr(Progress, "show", look)
+    with locked(place):
+        state = run_jobs(place.parents[1], SPEC, engine, Progress())["j"]
+    assert state == State("done", 1, "elsewhere:17") and engine.submissions == 1
+    assert looks[:3] == ["running"] * 3, "nothing is written over"
 
 
 def test_progress_is_processor_time_or_something_said(tmp_path: Path) -> None:
