@@ -24,7 +24,7 @@ from data_prep.formats.frame_files import FrameFiles, KindNames, transparent
 from data_prep.formats.frame_track import BadFrame, FrameTrack, Tracking, nearest_rotation, read_frames
 from data_prep.formats.root_pose import Joint, camera_of_head, rotation_matrix, six_d, turned_with_neck
 from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of, matte_notes
-from data_prep.formats.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate
+from data_prep.formats.transforms import OPENCV_FROM_OPENGL, ListedFrame, frame_rate, numbered
 
 NAME = "IMavatar"
 NAMES = KindNames("mask/", "semantic/", "semantic/", images="image/", tracking="flame_params.json")
@@ -38,7 +38,7 @@ def recognise(frames: list[ListedFrame]) -> bool:
 
 def open_folder(folder: Path, frames: list[ListedFrame]) -> TrackedFolder:
     """Raises UserError for paths outside the folder."""
-    listed = dict(enumerate(frames))
+    listed = numbered(frames)
     images = {number: frame.image for number, frame in listed.items()}
     files = FrameFiles(
         folder=folder,

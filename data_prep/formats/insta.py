@@ -23,7 +23,7 @@ from data_prep.formats.frame_track import Tracking
 from data_prep.formats.insta_meshes import CANONICAL, mesh_paths, read_meshes
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, existing, listings_of
-from data_prep.formats.transforms import ListedFrame, frame_rate
+from data_prep.formats.transforms import ListedFrame, frame_rate, numbered
 
 NAME = "INSTA"
 NAMES = KindNames("matted/", "seg_mask/", "seg_mask/", images="images/")
@@ -35,7 +35,7 @@ def recognise(frames: list[ListedFrame]) -> bool:
 
 def open_folder(folder: Path, frames: list[ListedFrame], tracking: Path | None = None) -> TrackedFolder:
     """Raises UserError for paths outside the folder, and where there is neither the tracker's result nor a mesh."""
-    listed = dict(enumerate(frames))
+    listed = numbered(frames)
     images = {number: frame.image for number, frame in listed.items()}
     result = _result_folder(folder, tracking)
     if result is None and tracking is not None:

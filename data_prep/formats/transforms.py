@@ -131,6 +131,17 @@ def read_listings(folder: Path) -> list[ListedFrame]:
     return _in_order(frames)
 
 
+def numbered(frames: Sequence[ListedFrame]) -> dict[int, ListedFrame]:
+    """The frames by number, from 0; between two folders of images a number is missing, as they are two sequences."""
+    found: dict[int, ListedFrame] = {}
+    number, folder = -1, None
+    for frame in frames:
+        place = frame.image.parent
+        number += 1 if folder in (None, place) else 2
+        found[number], folder = frame, place
+    return found
+
+
 def _in_order(frames: dict[Path, ListedFrame]) -> list[ListedFrame]:
     first_use = {folder: len(SPLITS) for folder in {path.parent for path in frames}}
     for path, frame in frames.items():

@@ -41,6 +41,7 @@ from data_prep.formats.transforms import (
     camera_pose,
     frame_rate,
     is_union,
+    numbered,
     pinhole,
 )
 
@@ -59,7 +60,7 @@ def open_folder(folder: Path, frames: list[ListedFrame], cameras: str = ALL) -> 
     Raises UserError for paths outside the folder, frames without parameters, and cameras that there are not.
     """
     frames, notes = _chosen(frames, cameras, folder)
-    listed = dict(enumerate(frames))
+    listed = numbered(frames)
     parameters = {number: _parameter_file(frame) for number, frame in listed.items()}
     images = {number: frame.image for number, frame in listed.items()}
     shots = _shots(listed, parameters)

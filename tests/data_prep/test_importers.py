@@ -16,6 +16,8 @@ from importing import FRAMES, SIZE, assert_same_pictures, import_folder
 
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from data_prep.formats import imavatar, insta, vhap
+from data_prep.formats.transforms import read_listings
 
 
 def test_vhap(tracked: Path, original: Subject, tmp_path: Path) -> None:
@@ -187,3 +189,13 @@ def test_more_coefficients_than_directions_are_an_error_unless_zero(tracked: Pat
 def test_an_offset_contradicts_a_listing(tracked: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--frame-offset 2: transforms_train.json itself says which image"):
         import_folder(write_vhap(tracked, tmp_path / "vhap"), tracked, tmp_path / "out", frame_offset=2)
+
+
+def test_vhap_imavatar_and_insta_lack_a_number_between_two_folders_of_images(tmp_path: Path) -> None:
+    entry = {"flame_param_path": "1.npz", "mesh_path": "1.obj"}
+    frames = [{"file_path": f"{folder}/{n}.png", **entry} for folder in "ab" for n in (1, 2)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    (tmp_path / "1.obj").touch()
+    listed = read_listings(tmp_path)
+    for layout in (vhap, imavatar, insta):
+        assert list(layout.open_folder(tmp_path, listed).files.images) == [0, 1, 3, 4]

@@ -11,7 +11,7 @@ import pytest
 
 from avatar.errors import UserError
 from data_prep.formats.root_pose import rotation_matrix
-from data_prep.formats.transforms import ListedFrame, camera_pose, pinhole, read_listings
+from data_prep.formats.transforms import ListedFrame, camera_pose, numbered, pinhole, read_listings
 
 
 def test_validation_is_held_out_where_no_test_is(tmp_path: Path) -> None:
@@ -29,6 +29,14 @@ def test_validation_is_held_out_where_no_test_is(tmp_path: Path) -> None:
 
 def listed(**values: Any) -> ListedFrame:
     return ListedFrame(Path("transforms.json"), 0, values, {}, None, Path())
+
+
+def test_numbered_frames_lack_a_number_between_two_folders() -> None:
+    paths = ["a/1.png", "a/2.png", "b/1.png", "b/2.png"]
+    frames = [listed(file_path=path) for path in paths]
+    assert {number: frame.values["file_path"] for number, frame in numbered(frames).items()} == dict(
+        zip((0, 1, 3, 4), paths, strict=True)
+    )
 
 
 @pytest.mark.parametrize("folder", ["person", "UNION_person"])
