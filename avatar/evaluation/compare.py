@@ -26,6 +26,32 @@ from avatar.evaluation.tracking_source import Drive, Part, is_marked, legend, pa
 from avatar.files.read import MissingFile, read_bytes, read_json
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "perceptual", "protocols", "tracking"}  # of results.json
+# What is read of results.json, where it is there: "*" is every other key, a list has its one form throughout.
+_NUMBER = int | float
+_MEANS = {"*": _NUMBER | None}
+_BINS = [{"name": str, "from": _NUMBER | None, "to": _NUMBER | None, "frames": int, "means": _MEANS}]
+_FIGURES = {
+    "means": _MEANS,
+    "frames_sha256": str,
+    **dict.fromkeys(("by_held_out", "by_camera", "by_yaw", "by_expression_distance"), _BINS),
+}
+_ENTRY = {
+    **_FIGURES,
+    "tracked": _FIGURES,
+    "driven_by": ("tracked", "refined"),
+    "frames": [str],
+    "lpips": {"note": str},
+    "choices": {"summary": str},
+    "bootstrap": {"block_frames": int},
+}
+_ROUND = {"frames_trained_on": int, "measured_frames_trained_on": int}
+FORM = {
+    **dict.fromkeys(("data_hash", "head_fingerprint", "perceptual"), str),
+    "image_size": [int],
+    "notes": [str],
+    "tracking": {"tracker": str, "tracked": str, "refined": str, "rounds": [_ROUND]},
+    "protocols": {"*": _ENTRY},
+}
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
 
 
@@ -140,7 +166,21 @@ def read_evaluation(label: str, run: Path) -> Evaluation:
     names = results["protocols"]
     if not isinstance(names, dict) or not all(NAME.fullmatch(name) for name in names):  # they name folders
         raise UserError(f"{path} is damaged (the names of its protocols); evaluate the run again")
+    if wrong := _misfit(results, FORM):
+        raise UserError(f"{path} is damaged ({wrong.lstrip('.')}): run avatar eval {run} again")
     return Evaluation(label, path.parent, results)
+
+
+def _misfit(value: Any, form: Any, where: str = "") -> str:
+    """The first place where a value has another form; empty where it has this one."""
+    if isinstance(form, dict) and isinstance(value, dict):
+        found = (_misfit(one, form.get(key, form.get("*", object)), f"{where}.{key}") for key, one in value.items())
+        return next(filter(None, found), "")
+    if isinstance(form, list) and isinstance(value, list):
+        return next(filter(None, (_misfit(one, form[0], f"{where}[{n}]") for n, one in enumerate(value))), "")
+    if isinstance(form, tuple):
+        return "" if value in form else where
+    return where if isinstance(form, (dict, list)) or not isinstance(value, form) else ""
 
 
 def check_same(first: Evaluation, other: Evaluation) -> None:

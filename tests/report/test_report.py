@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +19,12 @@ from small_runs import train_small
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
-from avatar.report.page import bins_tables, means_table
+from avatar.errors import UserError
+from avatar.pipeline.open_inputs import open_run
+from avatar.report.page import bins_tables, means_table, render_report
 from avatar.runs.training_curves import read_curves
+from avatar.sweep.results import fold_results
+from avatar.sweep.spec import Job, Resources, Spec
 
 LOADED = "[[...document.images].filter((one) => one.naturalWidth > 0).length, document.images.length]"
 
@@ -98,6 +106,38 @@ def test_a_run_that_was_not_evaluated_says_so(run: Path, tmp_path: Path, capsys:
     (copy / "eval" / "results.json").write_text("[]")
     assert main(["report", str(copy)]) == 1
     assert "was written by another version of this program" in capsys.readouterr().err
+
+
+def places(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, one in inner:
+        yield (*path, key)
+        yield from places(one, (*path, key))
+
+
+def test_damaged_results_get_a_sentence(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avatar.report.page.frame_panels", lambda run: [])
+    monkeypatch.setattr("avatar.report.page._curves", lambda run: [])
+    results = tmp_path / "jobs" / "j" / "run" / "eval" / "results.json"
+    results.parent.mkdir(parents=True)
+    text = (run / "eval" / "results.json").read_text()
+    spec = Spec((Job("j", "s", "v", 0, {"folder": "/f"}, (), ()),), Resources(), 0)
+    opened = replace(open_run(run), path=results.parents[1])
+    refused = 0
+    for path in places(json.loads(text)):
+        for wrong in (None, "x", []):
+            damaged = json.loads(text)
+            reduce(lambda part, key: part[key], path[:-1], damaged)[path[-1]] = wrong
+            results.write_text(json.dumps(damaged))
+            for read in (lambda: render_report(opened), lambda: fold_results(tmp_path, spec)):
+                try:
+                    read()
+                except UserError as error:
+                    assert str(results) in str(error) or str(tmp_path) in str(error)
+                    refused += 1
+                except Exception as error:
+                    pytest.fail(f"{path} = {wrong!r}: {type(error).__name__}: {error}")
+    assert refused > 100
 
 
 @pytest.mark.chromium
