@@ -64,8 +64,10 @@ def summary(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> lis
     turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
     turn, shift = math.degrees(float(np.median(turns))), 1e3 * float(np.median(shifts))
     lines.append(f"{'moved:':17} {turn:.2f} degrees and {shift:.2f} mm, medians")
-    if refined.kept.any():
-        lines.append(f"{'as they were:':17} {int(refined.kept.sum())} frames, which would have fitted no better")
+    unseen = np.isnan(refined.before)
+    for kept, why in ((refined.kept & ~unseen, "which would have fitted no better"), (unseen, "which show no head")):
+        if kept.any():
+            lines.append(f"{'as they were:':17} {int(kept.sum())} frames, {why}")
     return lines
 
 

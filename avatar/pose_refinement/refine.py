@@ -53,7 +53,7 @@ class Refined:
     tracks: dict[str, Tensor]  # as `Recording.tracks`
     before: Float[np.ndarray, " T"]
     after: Float[np.ndarray, " T"]
-    kept: Bool[np.ndarray, " T"]  # frames whose pictures fitted no better, and so kept the tracking that they had
+    kept: Bool[np.ndarray, " T"]  # frames that kept their tracking: they fitted no better, or show no head
 
 
 class _Found(NamedTuple):

@@ -228,7 +228,10 @@ def test_the_record_tells_what_happened(avatar: Avatar, wrong: Clip, result: Ref
     assert f"{result.before[:7].mean():.2f} -> {result.after[:7].mean():.2f} dB" in lines
     assert "as they were" not in lines
     kept = replace(result, kept=np.arange(10) < 2)
-    assert "2 frames" in summary(cast(Subject, wrong), kept, centre)[-1]
+    assert "2 frames, which would have fitted no better" in summary(cast(Subject, wrong), kept, centre)[-1]
+    unseen = replace(kept, before=np.where(np.arange(10) == 1, np.nan, result.before))
+    told = [line[18:] for line in summary(cast(Subject, wrong), unseen, centre)[-2:]]
+    assert told == ["1 frames, which would have fitted no better", "1 frames, which show no head"]
 
 
 def test_movements_are_the_turn_and_the_way_of_the_centre(clip: Clip) -> None:
