@@ -19,7 +19,9 @@ def test_noise_in_held_out_frames_changes_no_bit_of_refined_training_frames(tmp_
     clip = wrongly_tracked(drawn_clip(avatar, frames=10, train=7))
 
     def refined(one: Clip) -> Refined:
-        found = refine_subject(avatar, cast(Subject, one), SIZE, BACKGROUND, tmp_path / f"progress{id(one)}", lambda _: None)
+        found = refine_subject(
+            avatar, cast(Subject, one), SIZE, BACKGROUND, tmp_path / f"progress{id(one)}", lambda _: None
+        )
         assert found is not None
         return found
 
