@@ -19,17 +19,9 @@ from avatar.runs.trained_avatar import TrainedAvatar
 WEB = Path(__file__).resolve().parents[1] / "web"
 SLOW_NODES = 2000  # places at which the network is evaluated; above, a picture takes longer than it should
 PAGE_MODULES = (
-    *(
-        "core.js",
-        "motion.js",
-        "canvas.js",
-        "webgl_renderer.js",
-        "drive.js",
-        "settings.js",
-        "view.js",
-        "orbit_controls.js",
-    ),
-    *("landmarker.js", "camera.js", "controls.js", "gaze.js", "page_display.js", "camera_panel.js", "page.js"),
+    *("core.js", "motion.js", "canvas.js", "webgl_renderer.js", "drive.js", "settings.js", "view.js"),
+    *("orbit_controls.js", "landmarker.js", "camera.js", "controls.js", "gaze.js", "page_display.js"),
+    *("camera_panel.js", "page.js"),
 )
 WORKER_MODULES = ("core.js", "worker.js")
 LANDMARKER_WORKER_MODULES = ("landmarker_worker.js",)

@@ -108,9 +108,8 @@ def train(
                 if saves or interrupted():
                     progress.flush()
                 if saves:
-                    pair = render_held_out(
-                        avatar, loader, subject, background, step
-                    )  # what cannot be drawn is not saved
+                    # What cannot be drawn is not saved.
+                    pair = render_held_out(avatar, loader, subject, background, step)
                     save(step)
                     saved = step
                     log.preview(step, *pair)
