@@ -1,8 +1,9 @@
-"""Checks of shape, dtype and finiteness that bind named dimensions across tensors and answer in one sentence."""
+"""Checks of shape and finiteness that answer in one sentence, and tensors as 8-bit levels."""
 
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 
@@ -53,3 +54,9 @@ def check_finite(**tensors: Tensor) -> None:
         message = describe_non_finite(name, tensor)
         if message is not None:
             raise ValueError(message)
+
+
+def to_8_bit(values: Float[Tensor, "..."], truncate: bool = False) -> UInt8[Tensor, "..."]:
+    """256 levels of the values clamped to [0, 1]: the nearest one, or with `truncate` the one below."""
+    scaled = values.detach().clamp(0.0, 1.0) * 255.0
+    return (scaled.floor() if truncate else scaled.round()).to(torch.uint8)

@@ -24,6 +24,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.compute.device import to_device
+from avatar.tensors import to_8_bit
 
 IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
@@ -121,7 +122,7 @@ class Rendering(NamedTuple):
 
     def numpy(self) -> UInt8[np.ndarray, "H W C"]:
         """The image in 8 bits, 255 for 1 and above."""
-        return (self.image.detach().cpu().clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+        return to_8_bit(self.image).cpu().numpy()
 
     def png(self) -> bytes:
         """The image as a PNG file. Raises ValueError for features."""

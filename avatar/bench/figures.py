@@ -11,11 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.frame import Frame
-from avatar.evaluation.measure import lpips_in_mask, to_8_bit
+from avatar.evaluation.measure import lpips_in_mask
 from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips_network import Lpips
 from avatar.losses.metrics import psnr, ssim
 from avatar.render import Renderer
+from avatar.tensors import to_8_bit
 from avatar.types import Camera, HeadParams
 
 

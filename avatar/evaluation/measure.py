@@ -10,9 +10,10 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from avatar.compute.device import CPU, to_device
-from avatar.evaluation.protocol import ImageFormat, Levels, Protocol, Region, column, columns_of
+from avatar.evaluation.protocol import ImageFormat, Protocol, Region, column, columns_of
 from avatar.losses.lpips_network import MIN_SIZE, Lpips, Net
 from avatar.losses.metrics import SSIM_RADIUS, bounding_box, grown_box, squared_error, ssim_map, weighted_mean
+from avatar.tensors import to_8_bit
 
 LPIPS_CROP = 64  # pixels; a region is given at least so much context
 INSIDE = slice(SSIM_RADIUS, -SSIM_RADIUS)  # where SSIM's windows have their centres
@@ -31,13 +32,7 @@ def as_seen(image: Float[Tensor, "..."], image_format: ImageFormat) -> Tensor:
     """An image as a protocol compares it: uint8 after rounding or truncation, or float32."""
     if image_format.clamp:
         image = image.clamp(0.0, 1.0)
-    return image if image_format.levels == "float" else to_8_bit(image, image_format.levels)
-
-
-def to_8_bit(image: Float[Tensor, "..."], levels: Levels = "round") -> UInt8[Tensor, "..."]:
-    """256 levels of the values clamped to [0, 1]: the nearest one, or the one below with "truncate"."""
-    scaled = image.clamp(0.0, 1.0) * 255.0
-    return (scaled.floor() if levels == "truncate" else scaled.round()).to(torch.uint8)
+    return image if image_format.levels == "float" else to_8_bit(image, image_format.levels == "truncate")
 
 
 class FrameMeasurer:

@@ -12,8 +12,9 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.evaluation.measure import Pair, to_8_bit
+from avatar.evaluation.measure import Pair
 from avatar.evaluation.protocol import REGIONS, Region
+from avatar.tensors import to_8_bit
 
 RENDERS, TRACKED_RENDERS = "renders", "tracked_renders"
 MASK_FOLDERS: dict[Region, str] = {region: "masks" if region == "head" else f"{region}_masks" for region in REGIONS}

@@ -14,6 +14,7 @@ from torch import Tensor
 from avatar.data.frame import Frame
 from avatar.evaluation.protocol import RIMS, Region
 from avatar.head.model import HeadModel
+from avatar.tensors import to_8_bit
 from avatar.types import Camera
 
 EYEBALLS = ("left_eyeball", "right_eyeball")  # region names of FLAME_masks.pkl
@@ -36,7 +37,7 @@ def region_masks(frame: Frame, head: HeadModel, wanted: Iterable[Region]) -> dic
             is_neck = head.neck()[1] < 0.5  # more on the root than on the neck joint
             rims = outline_rims(frame.alpha * frame.head_mask, frame.camera.project(vertices)[:, :2], is_neck)
             masks |= {region: rim.float() for region, rim in zip(RIMS, rims, strict=True)}
-    return {region: (mask * 255.0).round().to(torch.uint8) for region, mask in masks.items() if region in wanted}
+    return {region: to_8_bit(mask) for region, mask in masks.items() if region in wanted}
 
 
 def has_eyeballs(regions: Mapping[str, Int[Tensor, " R"]]) -> bool:

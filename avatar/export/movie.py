@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import torch
 from tqdm import tqdm
 
 from avatar.files.video import write_video
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.runs.motion_clip import Clip
 from avatar.runs.trained_avatar import TrainedAvatar
+from avatar.tensors import to_8_bit
 from avatar.types import Camera, HeadParams
 
 CameraPath = Literal["recorded", "still", "turntable", "orbit"]
@@ -56,5 +56,5 @@ def along_path(
 def write_movie(trained: TrainedAvatar, clip: Clip, out: Path, path: CameraPath, size: int | None = None) -> None:
     """H.264 in MP4, drawn over the colour that the avatar was trained over."""
     images = (rendering.image for rendering in trained.stream(along_path(trained, clip, path, size)))
-    pixels = ((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy() for image in images)
+    pixels = (to_8_bit(image).numpy() for image in images)
     write_video(out, tqdm(pixels, total=len(clip), desc="video", unit="frame", dynamic_ncols=True), clip.fps)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.files.atomic import temporary_name
+from avatar.tensors import to_8_bit
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
 ALPHA_SUFFIXES = (".mov", ".webm")
@@ -159,7 +160,7 @@ def side_by_side(
     strip = max(round(height * CAPTION_SHARE), MIN_CAPTION)
     columns = []
     for image, caption in zip(images, captions, strict=True):
-        picture = (image.detach().cpu().clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+        picture = to_8_bit(image).cpu().numpy()
         if picture.shape[0] != height:
             width = round(picture.shape[1] * height / picture.shape[0])
             picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -172,7 +173,7 @@ def error_map(
 ) -> Float[Tensor, "H W 3"]:
     """Mean absolute error of the channels as a heat map: black at 0, light yellow from `full_scale` up."""
     error = (image - target).abs().mean(dim=-1) / full_scale
-    levels = (error.detach().cpu().clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+    levels = to_8_bit(error).cpu().numpy()
     colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     return image.new_tensor(colours) / 255.0
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from avatar.data.colours import COLOURS, parse_colour
 from avatar.data.images import read_image
 from avatar.errors import UserError
+from avatar.tensors import to_8_bit
 from avatar.types import Rendering
 
 TRANSPARENT = "transparent"
@@ -30,9 +31,9 @@ class Backdrop:
         image, alpha = rendering.image.detach().cpu(), rendering.alpha.detach().cpu()[..., None]
         if self.behind is None:
             head = (image - (1 - alpha) * trained) / alpha.clamp(min=1e-3)
-            return _bytes(torch.cat((head, alpha), dim=-1))
+            return to_8_bit(torch.cat((head, alpha), dim=-1)).numpy()
         behind = self.behind if self.behind.ndim == 1 else _covering(self.behind, image.shape[0], image.shape[1])
-        return _bytes(image + (1 - alpha) * (behind - trained))
+        return to_8_bit(image + (1 - alpha) * (behind - trained)).numpy()
 
 
 def parse_backdrop(word: str) -> Backdrop:
@@ -57,7 +58,3 @@ def _covering(picture: Float[Tensor, "H W 3"], height: int, width: int) -> Float
     )
     top, left = (size[1] - height) // 2, (size[0] - width) // 2
     return scaled[top : top + height, left : left + width]
-
-
-def _bytes(values: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
-    return (values.clamp(0.0, 1.0) * 255.0).round().byte().numpy()

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import imageio.v3 as iio
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -17,6 +16,7 @@ from avatar.files.atomic import write_atomically
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
 from avatar.runs.training_curves import LOSSES, read_curves, write_curves
+from avatar.tensors import to_8_bit
 
 LOG_EVERY = 10  # steps between points of the training curves
 SMOOTHING = 0.98  # of the loss and PSNR that the progress bar shows
@@ -73,8 +73,7 @@ class TrainingLog:
 
     def preview(self, step: int, truth: Tensor, render: Tensor) -> None:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""
-        pair = torch.cat((truth, render), dim=1).detach().clamp(0, 1)
-        image = np.round(pair.cpu().numpy() * 255).astype(np.uint8)
+        image = to_8_bit(torch.cat((truth, render), dim=1)).cpu().numpy()
         self._previews.mkdir(parents=True, exist_ok=True)
         write_atomically(self._previews / f"step_{step:08d}.png", iio.imwrite("<bytes>", image, extension=".png"))
 

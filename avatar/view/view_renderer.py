@@ -19,6 +19,7 @@ from avatar.motion.controls import JOINT_FIELD, ExpressionControl, expression_co
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import checked_drawings
+from avatar.tensors import to_8_bit
 from avatar.types import Camera, HeadParams, Rendering
 
 Overlay = Literal["none", "mesh", "error"]
@@ -120,28 +121,24 @@ class ViewRenderer:
         look, _ = self.within(setting.look)
         camera = orbited(own, look.yaw, look.pitch, look.zoom)
         with checked_drawings():
-            picture = to_bytes(self.rendered(params, camera).image)
+            picture = to_8_bit(self.rendered(params, camera).image).cpu().numpy()
         if setting.overlay == "mesh":
             _draw_mesh(picture, self.trained.avatar.vertices(params).cpu(), self.trained.assets.faces, camera)
         beside = [picture]
         if self.truth is not None and recorded is not None and (setting.with_truth or setting.overlay == "error"):
             truth = self.truth(recorded, width)
             if setting.with_truth:
-                beside.append(to_bytes(truth))
+                beside.append(to_8_bit(truth).numpy())
             if setting.overlay == "error":  # of the recorded view, whatever the camera
                 with checked_drawings():
                     drawn = self.rendered(frame[0], own).image.cpu()
-                beside.append(to_bytes(error_map(drawn, truth, ERROR_SCALE)))
+                beside.append(to_8_bit(error_map(drawn, truth, ERROR_SCALE)).numpy())
         return np.concatenate(beside, axis=1)
 
     @torch.no_grad()
     def rendered(self, params: HeadParams, camera: Camera) -> Rendering:
         """The avatar alone, where it computes."""
         return self.trained.render(params, camera)
-
-
-def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def _draw_mesh(picture: np.ndarray, vertices: Float[Tensor, "V 3"], faces: Tensor, camera: Camera) -> None:

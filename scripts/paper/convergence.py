@@ -34,7 +34,6 @@ from avatar.data.source import Source
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
-from avatar.evaluation.measure import to_8_bit
 from avatar.files.atomic import write_atomically
 from avatar.head.assets import HeadAssets
 from avatar.losses.metrics import psnr, ssim
@@ -48,6 +47,7 @@ from avatar.runs.checkpoint import (
     save_checkpoint,
 )
 from avatar.runs.model_registry import make_avatar
+from avatar.tensors import to_8_bit
 from avatar.train.frame_order import frame_order
 from avatar.train.loss import TrainingLoss, choose_perceptual
 from avatar.train.optimizer import load_optimizer, make_optimizer, optimizer_tensors

@@ -11,9 +11,10 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from avatar.evaluation.measure import LPIPS_CROP, Figures, FrameMeasurer, Pair, as_seen, lpips_crop, to_8_bit
+from avatar.evaluation.measure import LPIPS_CROP, Figures, FrameMeasurer, Pair, as_seen, lpips_crop
 from avatar.evaluation.protocol import ImageFormat, Protocol, choose_protocols
 from avatar.losses.lpips_network import Lpips
+from avatar.tensors import to_8_bit
 
 PROTOCOLS = {protocol.name: protocol for protocol in choose_protocols(None)}
 SKIMAGE = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255, "channel_axis": 2}
@@ -121,7 +122,7 @@ def test_a_hidden_mouth_has_no_figure() -> None:
 def test_levels_are_rounded_or_cut_and_floats_stay() -> None:
     values = torch.tensor([-0.2, 0.0, 0.49 / 255, 0.51 / 255, 99.4 / 255, 99.6 / 255, 1.0, 1.7])
     assert to_8_bit(values).tolist() == [0, 0, 0, 1, 99, 100, 255, 255]
-    assert to_8_bit(values, "truncate").tolist() == [0, 0, 0, 0, 99, 99, 255, 255]
+    assert to_8_bit(values, truncate=True).tolist() == [0, 0, 0, 0, 99, 99, 255, 255]
     white = (1.0, 1.0, 1.0)
     assert torch.equal(as_seen(values, ImageFormat(white, True, "round")), to_8_bit(values))
     assert torch.equal(as_seen(values, ImageFormat(white, True, "float")), values.clamp(0, 1))
@@ -130,7 +131,7 @@ def test_levels_are_rounded_or_cut_and_floats_stay() -> None:
 
 def test_truncation_keeps_the_levels_of_8_bit_files() -> None:
     levels = torch.arange(256)
-    assert torch.equal(to_8_bit(levels.float() / 255.0, "truncate").long(), levels)
+    assert torch.equal(to_8_bit(levels.float() / 255.0, truncate=True).long(), levels)
 
 
 def test_unclamped_floats_are_measured_as_they_are() -> None:

@@ -14,9 +14,10 @@ from avatar.motion.controls import posed
 from avatar.motion.orbit import orbited
 from avatar.runs.motion_clip import own_clip
 from avatar.runs.trained_avatar import TrainedAvatar
+from avatar.tensors import to_8_bit
 from avatar.view.live import LiveFrame
 from avatar.view.player import NEUTRAL, STREAM, Player
-from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer, to_bytes
+from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer
 
 WIDTH = 64
 
@@ -36,7 +37,7 @@ def test_a_frame_is_drawn_as_the_program_draws_it(renderer: ViewRenderer, traine
     look = ViewOffset(renderer.limits.yaw[1], renderer.limits.pitch[0], 1.5)
     drawn = renderer.draw((params, camera), Setting(look), WIDTH, 5)
     expected = trained.render(params, orbited(camera.resized(WIDTH, WIDTH), look.yaw, look.pitch, look.zoom)).image
-    np.testing.assert_array_equal(drawn, to_bytes(expected))
+    np.testing.assert_array_equal(drawn, to_8_bit(expected).numpy())
     assert not np.array_equal(drawn, renderer.draw((params, camera), Setting(), WIDTH))
 
 
