@@ -30,6 +30,7 @@ class FlashAvatar(UVAvatar):
     heads: ClassVar[type[Any] | None] = None  # made of the numbers of Gaussians and latent values; None: no latents
     is_fused = True
     unknown_to_browsers = None
+    without_effect = "upsampling", "latent_dim", "latent_grid"
     code: Tensor  # positional code of the places where the network is evaluated
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
@@ -106,3 +107,4 @@ class HyperGaussianAvatar(FlashAvatar):
     latent, its offsets. With `model.latent_grid` the network is evaluated on that grid over the UV map."""
 
     heads = HyperHeads
+    without_effect = ("upsampling",)

@@ -102,6 +102,7 @@ class CovarianceHeads(nn.Module):
 class CovarianceAvatar(FlashAvatar):
     heads = CovarianceHeads
     is_fused = False
+    without_effect = ("upsampling",)
 
     @classmethod
     def step_needs(cls, config: ModelConfig, gaussians: int, size: tuple[int, int]) -> list[Need]:

@@ -52,6 +52,7 @@ class MonoGaussianAvatar(FlashAvatar):
     is_fused = False
     is_replayable = False  # the set of points grows
     unknown_to_browsers = "points that have left their texel"
+    without_effect = *FlashAvatar.without_effect, "skull_binding"
     count: Tensor  # of the points that are alive, which are the first ones
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:

@@ -78,6 +78,7 @@ def substitute(triangle: Float[Tensor, "T N"], right: Float[Tensor, "n N"]) -> F
 class NdgsAvatar(FlashAvatar):
     heads = NdGaussians
     is_fused = False
+    without_effect = ("upsampling",)
     unknown_to_browsers = "its opacities"
 
     def offsets(self, latents: Float[Tensor, "N n"]) -> Slice:

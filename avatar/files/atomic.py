@@ -16,7 +16,9 @@ from avatar.errors import UserError
 from avatar.files.names import shortened
 
 _COUNTER = itertools.count()
+_CLEANED: set[Path] = set()  # folders whose left-overs this process has removed
 _HOST = re.sub(r"[^0-9A-Za-z_]", "_", platform.node())[:40]
+_LEFT_OVER = re.compile(rf"\..+\.{_HOST}-([0-9]+)-[0-9]+\.partial.{{0,20}}")
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -28,7 +30,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     temporary = temporary_name(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_left_overs(path)
+        _remove_left_overs(path.parent)
         with temporary.open("xb") as file:
             file.write(data)
             file.flush()
@@ -95,12 +97,12 @@ def is_running(pid: int) -> bool:
     return True
 
 
-def _remove_left_overs(path: Path) -> None:
-    """Delete what writers of `path` that this machine's kernel no longer knows have left."""
-    pattern = re.compile(
-        rf"\.{re.escape(shortened(path.stem))}\.{re.escape(_HOST)}-([0-9]+)-[0-9]+\.partial{re.escape(path.suffix[-20:])}"
-    )
-    for other in path.parent.iterdir():
-        if (match := pattern.fullmatch(other.name)) and not is_running(int(match[1])):
+def _remove_left_overs(folder: Path) -> None:
+    """Delete what writers that this machine's kernel no longer knows have left; listed once, not for every picture."""
+    if (folder := folder.absolute()) in _CLEANED:
+        return
+    _CLEANED.add(folder)
+    for other in folder.iterdir():
+        if (match := _LEFT_OVER.fullmatch(other.name)) and other.is_file() and not is_running(int(match[1])):
             with suppress(OSError):
                 other.unlink()

@@ -50,6 +50,7 @@ ZOOM = 0.8, 1.25
 POINT_RATE, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, NETWORK_RATE = 1e-5, 1e-5, 3e-5, 1e-4, 1e-4
 LAYERS = 46  # widths of floats that a Gaussian's networks keep in a step, measured
 FIT_STEPS, FIT_POINTS, FIT_RATE = 300, 4096, 1e-3  # of the colour networks to the first colours
+WITHOUT_EFFECT = "latent_grid", "mlp_layers", "skull_binding", "head_rotation", "teeth"
 
 
 class GaussianHeadAvatar(Avatar):
@@ -59,6 +60,7 @@ class GaussianHeadAvatar(Avatar):
     is_replayable = False  # each path of the networks runs on the points that it counts for
     has_colours = False
     unknown_to_browsers = "its upsampling network"
+    without_effect = *WITHOUT_EFFECT, "latent_dim"
     initial_frames = 48
     centre: Tensor  # of the head at rest, metres
     places: Tensor  # landmarks, half head lengths from the centre
@@ -227,6 +229,8 @@ class GaussianHeadAvatar(Avatar):
 class HyperGaussianHeadAvatar(GaussianHeadAvatar):
     """With HyperGaussians: the networks give five latents, which condition what the networks gave before."""
 
+    without_effect = WITHOUT_EFFECT
+
     @staticmethod
     def make_hyper(config: ModelConfig, N: int) -> nn.Module:
         return HyperSets(N, channels_of(config), config.latent_dim)
@@ -247,6 +251,8 @@ class HyperGaussianHeadAvatar(GaussianHeadAvatar):
 
 class NdgsHeadAvatar(GaussianHeadAvatar):
     """With N-dimensional Gaussians, which the latent moves and fades; colours and shapes are the networks' own."""
+
+    without_effect = WITHOUT_EFFECT
 
     @staticmethod
     def make_hyper(config: ModelConfig, N: int) -> nn.Module:

@@ -25,7 +25,7 @@ from avatar.pipeline.open_inputs import check_data, moved_source
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.memory_estimate import training_needs
-from avatar.runs.model_registry import make_avatar
+from avatar.runs.model_registry import keys_without_effect, make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
 from avatar.runs.training_curves import CURVES_FILE
 from avatar.train.frame_order import within_epochs
@@ -40,6 +40,8 @@ OTHER_ROUNDING = "pictures come out alike, not to the bit, and parameters that t
 def train_new(source: Source, overrides: list[str], run: Path, device: str | None = None) -> int:
     """`device` stands in for the configuration's."""
     config = load_config(overrides)
+    for key in keys_without_effect(overrides, config.model.name):
+        print(f"Note: {key} has no effect on model={config.model.name}")
     with locked(run):
         refuse_trained(run)
         chosen = choose_device(device or config.device, print)

@@ -51,8 +51,10 @@ def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
         # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
         source = replace(source, folder=stage / name, tracking=None, frame_offset=None, format=None, fps=None)
     status = continue_or_begin(source, plan.final_overrides(), run)
+    plan = replace(plan, spent=time.monotonic() - begin)
+    plan.save(run)
     if status == OK and plan.minutes is not None:
-        print(f"Time         {(time.monotonic() - begin) / 60:.1f} of {plan.minutes:g} minutes")
+        print(f"Time         {plan.spent / 60:.1f} of {plan.minutes:g} minutes")
     return status
 
 

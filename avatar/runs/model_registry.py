@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -36,6 +38,12 @@ def refuse_features(config: ModelConfig, what: str) -> None:
             f"{what} needs Gaussians that have colours, those of model={config.name} have features for a network; train "
             "with model=hypergaussians"
         )
+
+
+def keys_without_effect(overrides: Sequence[str], name: str) -> list[str]:
+    """Those keys among the overrides that the model `name` does not read."""
+    unread = {f"model.{key}" for key in MODELS[name].without_effect}
+    return [key for override in overrides if (key := override.partition("=")[0]) in unread]
 
 
 def make_avatar(assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> Avatar:

@@ -187,7 +187,7 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     assert "allow 10 steps; 10 are taken" in output and "of 1 minutes" in output
     assert "31 s of 1 minutes are gone, and a step takes 1.000 s: 27 steps are taken" in output
     steps = [json.loads((one / "run.json").read_text())["config"]["trainer"]["iterations"] for one in (first(run), run)]
-    assert steps == [10, 27]
+    assert steps == [10, 27] and json.loads((run / "rounds" / "plan.json").read_text())["spent"] == 57.0
     monkeypatch.undo()
     assert "with --minutes 1, not 3" in avatar("train", "--resume", "--out", run, "--minutes", 3, status=1)
     assert "is complete" in avatar(*words, "--refine", 1, "--minutes", 1, "--resume")

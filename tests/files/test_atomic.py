@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -45,3 +46,16 @@ def test_a_folder_is_as_open_as_the_users_other_folders(tmp_path: Path) -> None:
             assert os.umask(mask) == mask
         finally:
             os.umask(before)
+
+
+def test_left_overs_are_looked_for_once_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dead = tmp_path / re.sub(r"-[0-9]+-[0-9]+\.partial", f"-{2**30}-0.partial", temporary_name(tmp_path / "a.png").name)
+    own = temporary_name(tmp_path / "b.png")
+    for file in (dead, own):
+        file.touch()
+    listed, iterdir = [], Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda folder: (listed.append(folder), iterdir(folder))[1])
+    for number in range(3):
+        write_atomically(tmp_path / f"{number}.png", b"picture")
+    assert listed == [tmp_path]
+    assert not dead.exists() and own.exists()

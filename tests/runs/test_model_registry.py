@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
 import torch
 from heads import grid_head, random_params
 from small_runs import small_config
+from tracked_folder import write_head_model
 
 from avatar.config import ModelConfig
-from avatar.runs.model_registry import MODELS, make_avatar
+from avatar.runs.model_registry import MODELS, keys_without_effect, make_avatar
 
 
 def test_the_models_are_those_of_the_configuration() -> None:
@@ -35,3 +38,20 @@ def test_a_frozen_copy_leaves_the_avatar_as_it_is(model: str) -> None:
     assert all(parameter.requires_grad for parameter in avatar.parameters())
     assert before.keys() == avatar.state_dict().keys()
     assert all(torch.equal(value, before[name]) for name, value in avatar.state_dict().items())
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_keys_without_effect_are_all_that_change_nothing(model: str, tmp_path: Path) -> None:
+    assets = write_head_model(tmp_path, mouth_opening=True)
+    config = small_config(f"model={model}").model
+    other = {"latent_dim": 5, "latent_grid": 2, "mlp_width": 40, "mlp_layers": 5, "upsampling": 4}
+    other |= {key: not getattr(config, key) for key in ("skull_binding", "head_rotation", "teeth")}
+
+    def parts(config: ModelConfig) -> object:
+        count = MODELS[model].count_gaussians(config, assets)
+        return MODELS[model].shapes(config, assets.num_expressions, count), MODELS[model].most_places(config, count)
+
+    same = {key for key, value in other.items() if parts(replace(config, **{key: value})) == parts(config)}
+    assert same == set(MODELS[model].without_effect)
+    overrides = [f"model={model}", *(f"model.{key}={value}" for key, value in other.items())]
+    assert keys_without_effect(overrides, model) == [f"model.{key}" for key in other if key in same]
