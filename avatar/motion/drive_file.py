@@ -61,7 +61,7 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     read_arkit = {".csv": read_drive_csv, ".json": read_drive_json}.get(path.suffix.lower())
     arrays = read_arkit(path, assets.num_expressions, assets.names, say) if read_arkit else load_npz(path)
     if "expression" not in arrays:
-        arrays = {FLAME_KEYS.get(key, key): a.ravel() if key == "shape" else a for key, a in arrays.items()}
+        arrays = _renamed(path, arrays)
     unknown = sorted(set(arrays) - set(KEYS))
     if "expression" not in arrays:
         raise UserError(f"{path} holds no expression (it holds {', '.join(unknown) or 'nothing'}); see docs/reenact.md")
@@ -123,6 +123,18 @@ def write_drive(path: Path, drive: Drive, fingerprint: str) -> None:
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
     write_atomically(path, content.getvalue())
+
+
+def _renamed(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """With this module's names in place of VHAP's and SMIRK's."""
+    renamed: dict[str, np.ndarray] = {}
+    for key, array in arrays.items():
+        name = FLAME_KEYS.get(key, key)
+        if name in renamed:
+            both = " and ".join(other for other in arrays if FLAME_KEYS.get(other, other) == name)
+            raise UserError(f"{path} holds {name} twice, as {both}; remove one of them")
+        renamed[name] = array.ravel() if key == "shape" else array
+    return renamed
 
 
 def _numbers(path: Path, arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:

@@ -118,3 +118,9 @@ def test_smirks_parameters(tmp_path: Path) -> None:
     assert drive.params[1].expression.tolist() == [0.5] * 5 and drive.params[1].eyelids.tolist() == [0.25, 0.75]
     assert float(matrix_from_6d(drive.params[1].jaw)[2, 1]) == pytest.approx(math.sin(0.2), abs=1e-6)
     assert "also holds cam, pose_params, shape_params" in said
+
+
+def test_a_drive_file_with_two_expressions_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "two.npz", expr=np.zeros((2, 5), np.float32), expression_params=np.ones((2, 5), np.float32))
+    with pytest.raises(UserError, match="two.npz holds expression twice, as expr and expression_params"):
+        read(tmp_path / "two.npz")
