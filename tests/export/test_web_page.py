@@ -258,6 +258,13 @@ def test_the_element_in_a_page_of_ones_own(
         early = "document.createElement('avatar-view')"
         refused = f"(() => {{ try {{ {early}.play(); }} catch (e) {{ return e.message; }} }})()"
         assert "not loaded yet" in page.evaluate(refused)
+        closed = """async () => {
+            const parts = { worker: new Worker("data:text/javascript,"), wasm: null, file: null };
+            const view = new avatar.constructor(document.createElement("canvas"), parts);
+            view.close();
+            return view.ready.then(() => "ready", (error) => error.message);
+        }"""
+        assert page.evaluate(closed) == "The avatar was closed."
         page.close()
 
 

@@ -9,8 +9,9 @@ import torch
 from heads import grid_head
 from small_runs import small_config
 
+from avatar.data.loader import BYTES_PER_PIXEL
 from avatar.errors import UserError
-from avatar.runs.memory_estimate import count_gaussians, drawing_needs, training_needs
+from avatar.runs.memory_estimate import MESH_BYTES, count_gaussians, drawing_needs, training_needs
 from avatar.runs.model_registry import make_avatar
 
 TESTS = Path(__file__).parents[1]
@@ -123,6 +124,15 @@ def test_the_largest_part_is_what_is_to_be_lowered() -> None:
         == "the network's layers at every place"
     )
     assert largest() == "the cache of decoded frames"
+
+
+def test_posed_meshes_are_counted_up_to_what_is_kept_of_them() -> None:
+    def cached(frames: int, rows: int) -> int:
+        needs = training_needs(small_config(), grid_head(rows), frames=frames, size=(1, 1), perceptual="none")
+        return needs[0].size - frames * BYTES_PER_PIXEL
+
+    assert cached(100, 7) == 100 * 3 * 4 * grid_head(7).num_vertices
+    assert cached(10**6, 70) == MESH_BYTES
 
 
 def test_drawing_takes_less_than_training_and_grows_with_what_it_holds() -> None:

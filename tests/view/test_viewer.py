@@ -12,15 +12,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("viser")
 from browsers import chromium
 from command_line import avatar
-from lively import lively_run
+from lively import lively_avatar, lively_run
 from view_client import TOKEN, WIDTH, Page, started
 from waiting import until
 
-from avatar.commands.view import address, checked_url
+from avatar.commands.view import address, checked_url, clips
 from avatar.motion.orbit import orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.player import Player
@@ -280,3 +281,17 @@ def test_what_cannot_be_shown_is_said(tracked_folder: Path, tmp_path: Path, monk
     assert "cannot listen" in avatar("view", run, "--host", "no such host", status=1)
     monkeypatch.setenv("AVATAR_TOKEN", "not one!")
     assert "must be at least 8" in avatar("view", run, status=1)
+
+
+def test_drive_files_of_one_name_are_both_there(tracked_folder: Path, tmp_path: Path) -> None:
+    trained = lively_avatar(tracked_folder, tmp_path / "run")
+    paths = [tmp_path / folder / "x.npz" for folder in ("still", "moving")]
+    for moves, path in enumerate(paths):
+        path.parent.mkdir()
+        expression = np.zeros((2, trained.assets.num_expressions), np.float32)
+        expression[1] = moves
+        np.savez(path, expression=expression)
+    found = clips(trained, paths)
+    assert list(found)[-2:] == ["x.npz", str(paths[1])]
+    still, moving = ([params.expression for params, _ in found[name].frames] for name in ("x.npz", str(paths[1])))
+    assert torch.equal(still[0], still[1]) and not torch.equal(moving[0], moving[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -50,6 +51,8 @@ def test_the_page_holds_pictures_findings_and_cost_and_loads_nothing(page: Path)
     assert "Check of so <me> & one" in parsed.text
     assert "The tracking cannot be used in frame 00005 of checkpoint: all zero" in parsed.text
     assert "one training step on this machine" in parsed.text
+    steps = re.search(r"the recipe's ([0-9,]+) steps", parsed.text)
+    assert steps is not None and steps[1] == "180", "ten passes over 18 frames"
     assert page.stat().st_size < 3e6
 
 
