@@ -28,7 +28,7 @@ from avatar.view.viewer import Viewer
 from avatar.view.webcam import Webcam
 from data_prep.live.face_tracker import LiveFaceTracker
 from data_prep.live.frame_fit import FrameFit
-from data_prep.live.pictures import LONGEST, open_source
+from data_prep.live.picture_sources import LONGEST, open_source
 from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
@@ -36,7 +36,7 @@ from data_prep.track.fit.fit_clip import find_embedding
 from data_prep.track.fit.focal import choose_focal
 from data_prep.track.fit.landmark_fit import eye_distance, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import concatenated
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Span, whole
 
 COMPARED = 200  # frames

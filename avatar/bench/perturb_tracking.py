@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avatar.data.recording import Recording
 from avatar.head.model import HeadModel
-from avatar.pose_refinement.motion import PARTS, SHIFT, TURN, moved_tracks, values_of
+from avatar.pose_refinement.tracking_values import PARTS, SHIFT, TURN, moved_tracks, values_of
 
 TURN_DEGREES, SHIFT_MM, COEFFICIENT_SHARE = 0.4, 1.1, 0.1  # root mean squares: of vectors, and of each coefficient
 JITTER_SHARE = 0.2  # of the error, white from frame to frame

@@ -28,7 +28,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.pipeline.refine_plan import round_steps
-from avatar.pose_refinement.refine import refine_subject
+from avatar.pose_refinement.refine_subject import refine_subject
 from avatar.runs.model_registry import make_avatar
 from avatar.train.frame_order import planned_steps, within_epochs
 from avatar.train.loss import choose_perceptual

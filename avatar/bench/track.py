@@ -32,7 +32,7 @@ from avatar.demo.subject import make_subject
 from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
-from avatar.pipeline.track import progress_bar
+from avatar.pipeline.cached_tracking import progress_bar
 from avatar.train.frame_order import planned_steps
 from data_prep.formats.avatar_track import LANDMARKS_FILE
 from data_prep.prepare.open_subject import find_head, open_subject

@@ -30,7 +30,7 @@ from avatar.data.recording import Recording
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer as Truth
 from avatar.demo.subject import make_subject, tracking_bias
 from avatar.gaussians.base_model import Avatar

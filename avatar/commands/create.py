@@ -32,9 +32,9 @@ from avatar.export.web_page import write_page
 from avatar.files.names import safe_name
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
+from avatar.pipeline.cached_tracking import head_for_video, progress_bar, tracking_lacks
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import plan_file, round_steps
-from avatar.pipeline.track import head_for_video, progress_bar, tracking_lacks
 from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
@@ -42,7 +42,7 @@ from avatar.train.frame_order import within_epochs
 from avatar.train.loss import choose_perceptual
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.track.first_pass import MAX_PICTURES
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Footage, stride
 from data_prep.track.track import track
 

@@ -14,9 +14,9 @@ from avatar.errors import UserError
 from avatar.export.web_page import write_page
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
+from avatar.pipeline.cached_tracking import can_track, progress_bar
 from avatar.pipeline.open_inputs import open_driver
 from avatar.pipeline.reenact import reenact
-from avatar.pipeline.track import can_track, progress_bar
 from avatar.pipeline.train_refined import continue_or_begin, is_begun
 from avatar.runs.run import open_trained, read_run_info
 from data_prep.track.track import track

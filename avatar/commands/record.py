@@ -15,7 +15,7 @@ from avatar.compute.interruption import interruption
 from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.pipeline import OK
-from data_prep.live.pictures import FILMED, Newest, open_source
+from data_prep.live.picture_sources import FILMED, Newest, open_source
 from data_prep.live.recording_guidance import ENDS, PROMPTS, RecordingAdvice, Seen, measures, reaches
 from data_prep.live.video_recorder import WARM_UP, VideoRecorder
 from data_prep.track.faces.detect import FaceDetector

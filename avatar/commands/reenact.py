@@ -13,10 +13,10 @@ from avatar.files.numbered import existing
 from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
 from avatar.pipeline.backdrop import parse_backdrop
+from avatar.pipeline.cached_tracking import cached_tracking, is_video
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file, open_driver
 from avatar.pipeline.reenact import PICTURES, Choices, first_file, reenact, sidecars
-from avatar.pipeline.track import cached_tracking, is_video
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained_avatar import TrainedAvatar
 from data_prep.formats.avatar_track import read_info

@@ -8,7 +8,7 @@ from pathlib import Path
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.pipeline import OK
 from avatar.pipeline.open_inputs import open_run
-from avatar.pipeline.refine import REFINED_FOLDER, refine_run
+from avatar.pipeline.refine_run import REFINED_FOLDER, refine_run
 
 
 def run_refine(arguments: Namespace) -> int:

@@ -9,7 +9,7 @@ from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
-from avatar.pipeline.track import head_for_video, progress_bar
+from avatar.pipeline.cached_tracking import head_for_video, progress_bar
 from data_prep.track.camera_rig import track_rig
 from data_prep.track.crop import parse_crop
 from data_prep.track.footage.source import Span

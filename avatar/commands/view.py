@@ -35,7 +35,7 @@ from avatar.view.receiver import Receiver
 from avatar.view.view_renderer import ViewRenderer
 from avatar.view.webcam import Webcam
 from data_prep.live.face_tracker import LiveFaceTracker
-from data_prep.live.pictures import open_source
+from data_prep.live.picture_sources import open_source
 
 if TYPE_CHECKING:
     from avatar.view.viewer import Viewer

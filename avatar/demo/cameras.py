@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from avatar.demo.head import DemoHead
-from avatar.demo.motion import CAMERA_DISTANCE, FIELD_OF_VIEW_HEIGHT
+from avatar.demo.performance import CAMERA_DISTANCE, FIELD_OF_VIEW_HEIGHT
 from avatar.types import Camera, HeadParams
 
 AZIMUTH, ELEVATION = 60.0, 10.0  # degrees to either side of the front camera, and the most above or below it

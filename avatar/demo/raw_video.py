@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import FPS, Motion, perform
+from avatar.demo.performance import FPS, Motion, perform
 from avatar.demo.render import Renderer, background_of
 from avatar.demo.subject import check_arguments, rendered, single_threads
 from avatar.errors import UserError

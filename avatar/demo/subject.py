@@ -18,7 +18,7 @@ from avatar.compute.workers import in_order
 from avatar.demo.head import NUM_EXPRESSION, NUM_IDENTITY, demo_head
 from avatar.demo.head_files import write_head_model
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import MOTIONS, Motion, Performance, frame_camera, frame_params, perform
+from avatar.demo.performance import MOTIONS, Motion, Performance, frame_camera, frame_params, perform
 from avatar.demo.render import RenderedFrame, Renderer
 from avatar.errors import UserError
 from avatar.files.atomic import check_target, whole_folder

@@ -30,7 +30,7 @@ from avatar.compute.native import thread_count
 from avatar.compute.workers import in_order
 from avatar.demo.cameras import World, front_camera, root_joint, studio_cameras, world_of
 from avatar.demo.head_files import write_head_model
-from avatar.demo.motion import FPS, Motion, Performance, frame_camera, frame_params, perform
+from avatar.demo.performance import FPS, Motion, Performance, frame_camera, frame_params, perform
 from avatar.demo.render import VIEW_AXES, PosedScene, Renderer, renderer_of
 from avatar.demo.subject import check_arguments, check_number, single_threads, write_image
 from avatar.files.atomic import check_target, whole_folder

@@ -13,7 +13,7 @@ from avatar.pipeline import OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import round_steps
 from avatar.pipeline.train import config_for_subject, new_avatar
-from avatar.pose_refinement.refine import estimated_seconds
+from avatar.pose_refinement.refine_subject import estimated_seconds
 from avatar.runs.checkpoint import KEPT
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import refuse_features

@@ -18,7 +18,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.read import read_json
 from avatar.pipeline.train import new_avatar
-from avatar.pose_refinement.refine import estimated_seconds
+from avatar.pose_refinement.refine_subject import estimated_seconds
 from avatar.train.cost_estimate import measure_cost
 from avatar.train.frame_order import within_epochs
 from avatar.train.loss import choose_perceptual

@@ -17,8 +17,8 @@ from avatar.files.lock import locked
 from avatar.files.names import safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.open_inputs import open_run
-from avatar.pipeline.refine import refine_run
 from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, RoundTimes, steps_in_time
+from avatar.pipeline.refine_run import refine_run
 from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.runs.model_registry import refuse_features

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from avatar.compute.device import on_gpu
 from avatar.pose_refinement.frame_fitter import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, FrameFitter, Target
-from avatar.pose_refinement.motion import HeadPose
 from avatar.pose_refinement.parameterization import PoseParameterization
+from avatar.pose_refinement.tracking_values import HeadPose
 
 PROBE = 0.1  # units that a value is moved by to see what it does
 MEMORY = 5  # steps that the frame's own curvature is learned from

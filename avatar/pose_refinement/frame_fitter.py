@@ -17,7 +17,7 @@ from avatar.data.frame import Frame
 from avatar.gaussians.base_model import Avatar
 from avatar.head.model import HeadModel
 from avatar.losses.metrics import bounding_box, psnr
-from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose
+from avatar.pose_refinement.tracking_values import HeadPose, head_params, moved_pose
 from avatar.types import Camera
 
 # The squared error of a frame counts as this many independent observations with this standard deviation. Errors of

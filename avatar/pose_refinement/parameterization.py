@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import trim_mean
 from torch import Tensor
 
-from avatar.pose_refinement.motion import NECK, POSE, SHIFT, TURN, Tracks, accelerations, values_of
+from avatar.pose_refinement.tracking_values import NECK, POSE, SHIFT, TURN, Tracks, accelerations, values_of
 
 DEGREE = math.pi / 180
 # Standard deviations of a tracker's error that are assumed at least. Depth hardly shows in the picture, so that a blurred

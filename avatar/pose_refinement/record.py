@@ -18,7 +18,7 @@ from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.files.video import error_map, side_by_side
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement.refine import Refined
+from avatar.pose_refinement.refine_subject import Refined
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, Severity
-from data_prep.check.motion import head_angles
+from data_prep.check.head_angles import head_angles
 from data_prep.prepare.check_alignment import CUT_OFF, MAX_OUTSIDE
 from data_prep.prepare.constant_parameters import ConstantParameter, constant_parameters
 

@@ -12,7 +12,7 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
 from data_prep.check.clip import NOT_SOUGHT, Clip
 from data_prep.check.findings import Finding, from_sentence, grouped
-from data_prep.check.motion import measure_jumps
+from data_prep.check.head_angles import measure_jumps
 from data_prep.formats.frame_files import TRACKING
 from data_prep.prepare.pairing import BEHIND_CAMERA, REPEATS
 

@@ -11,7 +11,7 @@ from avatar.data.split import Split, check_divided
 from avatar.errors import UserError
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
-from data_prep.check.motion import HeadAngles, head_angles
+from data_prep.check.head_angles import HeadAngles, head_angles
 from data_prep.formats.train_test_split import split_frames_of
 
 SHORT_CLIP = 10.0  # seconds; published clips have 40 to 120

@@ -18,14 +18,14 @@ from avatar.errors import UserError
 from avatar.head.assets import IDENTITY_COEFFICIENTS, HeadAssets
 from avatar.types import HeadParams
 from data_prep.live.frame_fit import FrameFit
-from data_prep.live.pictures import LivePicture, Newest, Source
+from data_prep.live.picture_sources import LivePicture, Newest, Source
 from data_prep.track.faces.detect import Face, FaceDetector, overlap
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.fit_clip import find_embedding
 from data_prep.track.fit.focal import choose_focal
+from data_prep.track.fit.frame_poses import Motion, six_d
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
-from data_prep.track.fit.motion import Motion, six_d
 
 CALIBRATION_SECONDS = 4.0
 FEWEST, MOST = 20, 60  # pictures with the face that calibration is made from

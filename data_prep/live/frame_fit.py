@@ -22,10 +22,10 @@ from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.expression_kind import is_statistical
+from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.initial_pose import start_poses
 from data_prep.track.fit.landmark_fit import LandmarkFit, faded, is_rigid, point_units, weighted_landmarks
 from data_prep.track.fit.levenberg_marquardt import Term, concatenated, minimise
-from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.priors import expected, score_targets
 from data_prep.track.fit.smoothness import NOMINAL_FPS, Smoothness, make_smoothness

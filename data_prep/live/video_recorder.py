@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import UInt8
 
-from data_prep.live.pictures import LivePicture, Source
+from data_prep.live.picture_sources import LivePicture, Source
 
 WARM_UP = 2.0  # seconds of pictures that the rate is measured on
 FEWEST = 8  # pictures for it

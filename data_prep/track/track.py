@@ -36,7 +36,7 @@ from data_prep.progress import Progress, silent
 from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.first_pass import FirstPass, from_json, look_at, to_json
 from data_prep.track.fit.focal import Focal
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, View, check_span
 from data_prep.track.frames import in_view

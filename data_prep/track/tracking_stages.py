@@ -19,7 +19,7 @@ from data_prep.track.first_pass import FirstPass
 from data_prep.track.fit.fit_clip import fit_tracks
 from data_prep.track.fit.focal import Focal, choose_focal
 from data_prep.track.fit.result import Clip, Fit
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Box, Footage, Span, View
 from data_prep.track.frames import (
     ahead,

@@ -24,7 +24,7 @@ from avatar.files.third_party import FOLDER_VARIABLE
 from avatar.files.video import video_writer
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.prepare.open_subject import HEAD_VARIABLE
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.quality import Figure
 
 FRAMES = 30

@@ -14,7 +14,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.commands import demo
 from avatar.files.third_party import FOLDER_VARIABLE
-from avatar.pipeline.track import can_track
+from avatar.pipeline.cached_tracking import can_track
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.runs.run import read_run_info
 

@@ -20,7 +20,7 @@ from avatar.commands import train
 from avatar.data.source import Source
 from avatar.pipeline import refine_plan, train_refined
 from avatar.pipeline.open_inputs import source_of
-from avatar.pose_refinement import refine as refine_module
+from avatar.pose_refinement import refine_subject as refine_module
 from avatar.runs.checkpoint import list_checkpoints
 
 pytestmark = pytest.mark.slow

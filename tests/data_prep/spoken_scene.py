@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import Motion as Performed
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import Motion as Performed
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import RenderedFrame, render_frame
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.expression_names import ExpressionNames, load_expression_names
@@ -19,8 +19,8 @@ from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding
 from data_prep.track.faces.landmark_groups import FEATURES
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.fit.camera import Pinhole, to_camera
+from data_prep.track.fit.frame_poses import Motion
 from data_prep.track.fit.landmark_fit import LandmarkFit
-from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.surface import SurfacePoints
 
 SIZE, SEED, FPS = 160, 1, 25.0

@@ -19,7 +19,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
-from avatar.pipeline import track
+from avatar.pipeline import cached_tracking as caching
 from data_prep.prepare.prepare import prepare
 
 
@@ -208,12 +208,12 @@ def test_a_damaged_tracking_in_the_cache_is_made_again_and_it_is_said(
         seal(out)
         made.append(out)
 
-    monkeypatch.setattr(track, "track", fake_track)
-    monkeypatch.setattr(track, "open_footage", lambda path: SimpleNamespace(content_hash="ab"))
-    folder = track.cached_tracking(video, head)
-    assert track.cached_tracking(video, head) == folder and made == [folder]
+    monkeypatch.setattr(caching, "track", fake_track)
+    monkeypatch.setattr(caching, "open_footage", lambda path: SimpleNamespace(content_hash="ab"))
+    folder = caching.cached_tracking(video, head)
+    assert caching.cached_tracking(video, head) == folder and made == [folder]
     flip(folder / "frames" / "00000.jpg", 2)
     capsys.readouterr()
-    assert track.cached_tracking(video, head) == folder and made == [folder, folder]
+    assert caching.cached_tracking(video, head) == folder and made == [folder, folder]
     assert "frames/00000.jpg is not what was written; it is made again" in capsys.readouterr().out
-    assert track.cached_tracking(video, head) == folder and made == [folder, folder]
+    assert caching.cached_tracking(video, head) == folder and made == [folder, folder]

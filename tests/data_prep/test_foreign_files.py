@@ -18,7 +18,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import Check, check_tracked_folder
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 
 
 def checked(folder: Path, head: Path) -> Check:

@@ -12,7 +12,7 @@ import torch
 from listed_views import CAMERAS, FRAMES, FRONT, NAMES, SEED, SIZE, View, drawn, posed, views
 
 from avatar.demo.cameras import front_camera, studio_cameras
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import VIEW_AXES, renderer_of
 from avatar.head.assets import HeadAssets
 from avatar.types import Camera

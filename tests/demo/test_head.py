@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from avatar.demo.head import JOINTS, DemoHead, demo_head
-from avatar.demo.motion import perform
 from avatar.demo.occlusion import neutral_params
+from avatar.demo.performance import perform
 from avatar.demo.scene import head_assets
 from avatar.head.model import HeadModel
 from avatar.head.rasterize import rasterize_mesh

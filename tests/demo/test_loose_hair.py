@@ -9,7 +9,7 @@ import pytest
 
 from avatar.demo.identity import sample_identity
 from avatar.demo.loose_hair import draw
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import RenderedFrame, Renderer, background_of, render_frame
 
 SEED, SIZE, FRAME = 2, 256, 20

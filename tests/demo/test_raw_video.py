@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from avatar.cli import main
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, filmed, make_room, make_street, make_video
 from avatar.demo.render import render_frame
 from avatar.errors import UserError

@@ -13,8 +13,8 @@ import torch
 
 from avatar.demo import make_subject, render_frame, subject
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import frame_camera, frame_params, perform
 from avatar.demo.occlusion import neutral_params
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import RenderedFrame
 from avatar.demo.scene import EYE_LEFT, EYE_RIGHT, FRAME, MOUTH_UPPER, Performer
 from avatar.errors import UserError

@@ -26,8 +26,8 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation.draw import draw
 from avatar.evaluation.protocol import ImageFormat
-from avatar.pose_refinement import refine as refine_module
-from avatar.pose_refinement.refine import _Work, frozen
+from avatar.pose_refinement import refine_subject as refine_module
+from avatar.pose_refinement.refine_subject import _Work, frozen
 from avatar.runs.checkpoint import list_checkpoints, load_checkpoint
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import CannotDraw, gpu_buffers

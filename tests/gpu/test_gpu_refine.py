@@ -18,10 +18,10 @@ from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement import refine as refine_module
-from avatar.pose_refinement.motion import head_params, rotation
+from avatar.pose_refinement import refine_subject as refine_module
 from avatar.pose_refinement.parallel import read_later
-from avatar.pose_refinement.refine import _Work, frozen
+from avatar.pose_refinement.refine_subject import _Work, frozen
+from avatar.pose_refinement.tracking_values import head_params, rotation
 from avatar.splat import CannotDraw, gpu_buffers
 
 FRAME = 1

@@ -18,7 +18,17 @@ from avatar.data.frame import Frame
 from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, EYES, JAW, POSE, SHIFT, TURN, moved_tracks, values_of
+from avatar.pose_refinement.tracking_values import (
+    EXPRESSION,
+    EYELIDS,
+    EYES,
+    JAW,
+    POSE,
+    SHIFT,
+    TURN,
+    moved_tracks,
+    values_of,
+)
 from avatar.runs.model_registry import make_avatar
 from avatar.splat.sh import C0
 from avatar.types import IDENTITY_6D

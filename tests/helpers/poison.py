@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avatar.data.recording import Recording
 from avatar.data.subject import FramePixels, Subject
-from avatar.pose_refinement.motion import rotation
+from avatar.pose_refinement.tracking_values import rotation
 
 
 class _Poisoned(Subject):

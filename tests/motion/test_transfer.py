@@ -12,7 +12,7 @@ from avatar.motion.expression_space import fit_expressions
 from avatar.motion.neutral_pose import RestPose, find_mean, find_neutral
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.motion.transfer import TRANSFERS, retargeted, transfer_motion
-from avatar.pose_refinement.motion import rotation
+from avatar.pose_refinement.tracking_values import rotation
 from avatar.types import HeadParams
 
 

@@ -13,9 +13,9 @@ from avatar.data.recording import Recording
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.descent import Problem, curvature, descend
 from avatar.pose_refinement.frame_fitter import HUBER_DELTA, FrameFitter, targets
-from avatar.pose_refinement.motion import HeadPose, moved_tracks
 from avatar.pose_refinement.parameterization import find_parameterization
-from avatar.pose_refinement.refine import frozen
+from avatar.pose_refinement.refine_subject import frozen
+from avatar.pose_refinement.tracking_values import HeadPose, moved_tracks
 
 
 @pytest.fixture(scope="module")

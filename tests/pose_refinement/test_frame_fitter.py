@@ -23,8 +23,8 @@ from avatar.pose_refinement.frame_fitter import (
     targets,
 )
 from avatar.pose_refinement.frame_fitter import misfit as misfit_of
-from avatar.pose_refinement.motion import HeadPose, head_params, moved_pose, values_of
-from avatar.pose_refinement.refine import frozen
+from avatar.pose_refinement.refine_subject import frozen
+from avatar.pose_refinement.tracking_values import HeadPose, head_params, moved_pose, values_of
 from avatar.splat import splat
 
 VALUES = 20 + EXPRESSIONS

@@ -11,7 +11,7 @@ from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, wro
 from poison import poisoned_clip
 
 from avatar.data.subject import Subject
-from avatar.pose_refinement.refine import Refined, refine_subject
+from avatar.pose_refinement.refine_subject import Refined, refine_subject
 
 
 def test_noise_in_held_out_frames_changes_no_bit_of_refined_training_frames(tmp_path: Path) -> None:

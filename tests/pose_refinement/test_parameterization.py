@@ -9,7 +9,6 @@ import torch
 from drawn_clip import EXPRESSIONS, true_tracks
 from poison import poisoned_tracks
 
-from avatar.pose_refinement.motion import EXPRESSION, EYELIDS, EYES, JAW, NECK, POSE, SHIFT, accelerations, values_of
 from avatar.pose_refinement.parameterization import (
     DEPTH_UNIT,
     FACE_CALM,
@@ -21,6 +20,17 @@ from avatar.pose_refinement.parameterization import (
     SPREAD_SHARE,
     TURN_UNIT,
     find_parameterization,
+)
+from avatar.pose_refinement.tracking_values import (
+    EXPRESSION,
+    EYELIDS,
+    EYES,
+    JAW,
+    NECK,
+    POSE,
+    SHIFT,
+    accelerations,
+    values_of,
 )
 
 CENTRE = torch.zeros(3)

@@ -13,9 +13,9 @@ import torch
 from drawn_clip import BACKGROUND, SIZE, drawn_clip, patterned_avatar
 
 from avatar.data.subject import Subject
-from avatar.pose_refinement import refine as refine_module
+from avatar.pose_refinement import refine_subject as refine_module
 from avatar.pose_refinement.progress import read_progress, write_progress
-from avatar.pose_refinement.refine import refine_subject
+from avatar.pose_refinement.refine_subject import refine_subject
 
 
 def test_progress_of_a_frame_without_a_head_is_read_back(tmp_path: Path) -> None:

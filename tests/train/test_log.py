@@ -1,4 +1,4 @@
-"""What the progress bar shows."""
+"""What the progress bar shows, and previews."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_runs import train_small
 
+from avatar.errors import UserError
 from avatar.losses.photometric import PhotometricLoss
+from avatar.runs.checkpoint import newest_checkpoint
 from avatar.train.log import TrainingLog
 
 
@@ -22,3 +25,15 @@ def test_no_psnr_is_shown_before_one_is_measured(tmp_path: Path, capsys: pytest.
             shown.append(capsys.readouterr().err)
     assert "loss=1.0" in shown[0] and "psnr" not in shown[0]
     assert "psnr=20.00" in shown[1] and "psnr=20.00" in shown[2]
+
+
+def test_a_preview_that_cannot_be_written_costs_no_checkpoint(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise UserError("no space")
+
+    monkeypatch.setattr(TrainingLog, "preview", refused)
+    with pytest.raises(UserError, match="no space"):
+        train_small(tracked_folder, tmp_path / "run")
+    assert newest_checkpoint(tmp_path / "run").step == 4

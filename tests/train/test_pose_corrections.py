@@ -14,7 +14,7 @@ from small_runs import small_config, train_small
 from avatar.data.camera_rig import RigCamera
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement.motion import HeadPose, moved_pose
+from avatar.pose_refinement.tracking_values import HeadPose, moved_pose
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 from avatar.train.loss import TrainingLoss, choose_perceptual
 from avatar.train.optimizer import make_optimizer

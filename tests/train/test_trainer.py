@@ -83,18 +83,6 @@ def test_a_resumed_run_has_the_bits_of_an_uninterrupted_one(
     assert len({(tmp_path / run / "curves.csv").read_text() for run in ("whole", "broken")}) == 1
 
 
-def test_a_preview_that_cannot_be_written_costs_no_checkpoint(
-    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*_: object) -> None:
-        raise UserError("no space")
-
-    monkeypatch.setattr(trainer_module.TrainingLog, "preview", refused)
-    with pytest.raises(UserError, match="no space"):
-        train_small(tracked_folder, tmp_path / "run")
-    assert newest_checkpoint(tmp_path / "run").step == 4
-
-
 @pytest.mark.parametrize("model", ["covariance", "ndgs", "splattingavatar", "monogaussianavatar"])
 def test_the_papers_other_systems_learn(tracked_folder: Path, tmp_path: Path, model: str) -> None:
     """The pictures get nearer, and every parameter that the latent is weighed by leaves its start."""

@@ -14,7 +14,7 @@ from avatar.errors import UserError
 from data_prep.track.camera_rig.recording import Recording
 from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.first_pass import DETECTION_SIDE
-from data_prep.track.footage.pictures import resampled
+from data_prep.track.footage.picture_folder import resampled
 from data_prep.track.footage.source import Box, Footage, Span, View, whole
 from data_prep.track.frames import JPEG, frame_file, mask_file, write_image
 

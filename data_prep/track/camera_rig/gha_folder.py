@@ -19,7 +19,7 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from data_prep.formats.frame_track import BadFrame, pinhole_of, rigid_motion, vector
 from data_prep.track.camera_rig.recording import Camera, Recording, refuse_lengths, without_pictures
-from data_prep.track.footage.pictures import footage_of
+from data_prep.track.footage.picture_folder import footage_of
 
 _IMAGE = re.compile(r"image_((?!lowres_).+)\.jpg")
 _CAMERA = re.compile(r"camera_([0-9]{1,20})\.npz")

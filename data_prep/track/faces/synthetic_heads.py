@@ -14,7 +14,7 @@ from avatar.head.normals import vertex_normals
 from avatar.head.rasterize import rasterize_mesh
 from avatar.types import HeadParams
 from data_prep.track.fit.expression_kind import is_statistical, used_expressions
-from data_prep.track.fit.motion import gaze_rotations, rotations
+from data_prep.track.fit.frame_poses import gaze_rotations, rotations
 
 SIZE = 384  # pixels, the whole picture
 EYE_DISTANCE = 78.0  # pixels between the eyes' centres of a head seen from in front

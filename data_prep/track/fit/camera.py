@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.frame_poses import Motion
 
 
 class Pinhole(NamedTuple):

@@ -21,10 +21,10 @@ from data_prep.track.faces.embedding import LandmarkEmbedding, as_points, iris_e
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.expression_kind import is_statistical, used_expressions
+from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.initial_pose import start_poses
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg_marquardt import IdentityPrior, minimise
-from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.priors import Priors, make_priors
 from data_prep.track.fit.smoothness import Smoothness, make_smoothness
 from data_prep.track.fit.surface import SurfacePoints

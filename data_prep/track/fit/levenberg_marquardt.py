@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_prep.track.fit.motion import NUM_FIXED, Motion
+from data_prep.track.fit.frame_poses import NUM_FIXED, Motion
 from data_prep.track.fit.normal_equations import NormalEquations, NotPositiveDefinite, solve
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-8, 1e6

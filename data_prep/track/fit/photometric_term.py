@@ -15,7 +15,7 @@ from torch import Tensor
 from data_prep.track.fit.camera import Pinhole, by_pose, to_camera
 from data_prep.track.fit.chunks import over_chunks
 from data_prep.track.fit.crops import BlurredCrops
-from data_prep.track.fit.motion import Motion
+from data_prep.track.fit.frame_poses import Motion
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.surface import SurfacePoints
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.landmarks import BLENDSHAPES, Landmarks
-from data_prep.track.fit.motion import Columns, Motion
+from data_prep.track.fit.frame_poses import Columns, Motion
 from data_prep.track.fit.normal_equations import NormalEquations
 
 SCORE_SHARE = 0.7  # of a blendshape's score is expected in its coefficient

@@ -11,7 +11,7 @@ from torch import Tensor
 from avatar.head.assets import HeadAssets
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.fit.camera import to_camera
-from data_prep.track.fit.motion import Columns, Motion, cross_matrix
+from data_prep.track.fit.frame_poses import Columns, Motion, cross_matrix
 from data_prep.track.fit.normal_equations import NormalEquations
 
 NOMINAL_FPS = 25.0

@@ -20,7 +20,7 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import JAW, LEFT_EYE, NECK, RIGHT_EYE, ROOT
-from data_prep.track.fit.motion import Motion, cross_matrix, gaze_axes, gaze_rotations, left_jacobians, rotations
+from data_prep.track.fit.frame_poses import Motion, cross_matrix, gaze_axes, gaze_rotations, left_jacobians, rotations
 
 JOINTS = (JAW, LEFT_EYE, RIGHT_EYE)  # that turn
 FEATURES = 9 * len(JOINTS)  # pose features: the entries of R_j - 1

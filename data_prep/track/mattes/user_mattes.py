@@ -19,7 +19,7 @@ from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.prepare.mask_values import SAMPLES, coloured_sentence, is_coloured, judge_range, only_label
 from data_prep.track.faces.detect import Face
-from data_prep.track.footage.pictures import PictureFolder, open_footage, resampled
+from data_prep.track.footage.picture_folder import PictureFolder, open_footage, resampled
 from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
 from data_prep.track.footage.timing import DEFAULT_FPS

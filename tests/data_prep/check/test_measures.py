@@ -11,7 +11,7 @@ from some_tracks import track
 
 from data_prep.check.check_tracking import _camera
 from data_prep.check.coverage import Coverage, measure_coverage
-from data_prep.check.motion import head_angles, measure_jumps
+from data_prep.check.head_angles import head_angles, measure_jumps
 from data_prep.formats.frame_track import FrameTrack
 
 TRAIN, TEST = 20, 5

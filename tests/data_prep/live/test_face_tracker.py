@@ -16,7 +16,7 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from small_runs import train_small
 from videos import encode
 
-from avatar.demo.motion import perform
+from avatar.demo.performance import perform
 from avatar.demo.raw_video import filmed
 from avatar.demo.subject import make_subject
 from avatar.errors import UserError
@@ -24,7 +24,7 @@ from avatar.head.assets import load_head_assets
 from avatar.head.model import matrix_from_6d
 from data_prep.live import face_tracker
 from data_prep.live.face_tracker import LiveFaceTracker
-from data_prep.live.pictures import open_source
+from data_prep.live.picture_sources import open_source
 from data_prep.track.fit.fit_clip import find_embedding
 
 pytestmark = [pytest.mark.usefixtures("tracking_models"), pytest.mark.slow]

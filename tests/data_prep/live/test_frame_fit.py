@@ -13,9 +13,9 @@ from spoken_scene import FPS, SIZE, Scene, spoken_scene
 from data_prep.live.frame_fit import LOST_AFTER, FrameFit, _Fitted, _follows, _is_quick
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import concatenated
-from data_prep.track.fit.motion import Motion, at_rest
 
 CALIBRATED, FRAMES = 24, 36  # the first ones are calibrated on, the others followed; the clip's fit knows all
 

@@ -19,7 +19,7 @@ from videos import encode
 from avatar.commands import record
 from avatar.demo.raw_video import filmed
 from avatar.errors import UserError
-from data_prep.live.pictures import FILMED, LivePicture
+from data_prep.live.picture_sources import FILMED, LivePicture
 from data_prep.live.recording_guidance import ENDS, PROMPTS
 from data_prep.track.faces.detect import Face
 

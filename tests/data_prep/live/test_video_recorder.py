@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pytest
 
-from data_prep.live.pictures import LivePicture
+from data_prep.live.picture_sources import LivePicture
 from data_prep.live.video_recorder import SLACK, VideoRecorder
 
 RATE = 30.0

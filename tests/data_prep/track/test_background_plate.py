@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.raw_video import expose, make_room
 from avatar.demo.render import Renderer
 from data_prep.track.mattes import closed_form_matting

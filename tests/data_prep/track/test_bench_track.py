@@ -19,7 +19,7 @@ from avatar.config import load_config
 from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.subject import make_subject
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.types import HeadParams

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer
 from data_prep.track.masks.clothes import learn_colours
 from data_prep.track.masks.head_and_mouth import head_mask, neck_ring

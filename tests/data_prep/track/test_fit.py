@@ -21,8 +21,8 @@ from data_prep.track.faces.landmark_groups import LIPS
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.camera import to_camera
 from data_prep.track.fit.fit_clip import as_tracks
+from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import LandmarkFit, eye_distance, fit_landmarks
-from data_prep.track.fit.motion import Motion, at_rest
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.surface import SurfacePoints
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 from spoken_scene import SEED, SIZE, Scene, spoken_scene
 
-from avatar.demo.motion import perform
+from avatar.demo.performance import perform
 from data_prep.track.faces.landmark_groups import IRISES
 from data_prep.track.faces.landmarks import BLENDSHAPES, CLOSED_SCORE, Landmarks
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.fit_clip import as_tracks
 from data_prep.track.fit.focal import Focal
+from data_prep.track.fit.frame_poses import Motion
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import minimise
-from data_prep.track.fit.motion import Motion
 from data_prep.track.fit.result import Fit
 from data_prep.track.quality import grade_tracking, landmark_figures
 

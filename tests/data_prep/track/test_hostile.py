@@ -13,7 +13,7 @@ from videos import X264, encode, ffmpeg, talking
 
 from avatar.cli import main
 from data_prep.track.first_pass import look_at
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Span
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ from skimage.segmentation import find_boundaries
 
 from avatar.data.subject import FAINTEST_MATTE
 from avatar.demo.identity import sample_identity
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import Renderer
 from avatar.errors import UserError
 from data_prep.check.overlay import draw_mesh, outline

@@ -30,7 +30,7 @@ from avatar.files.third_party import (
     ThirdPartyFile,
     sha256_of,
 )
-from avatar.pipeline.track import tracking_lacks
+from avatar.pipeline.cached_tracking import tracking_lacks
 from data_prep.track import track as tracking
 from data_prep.track.mattes import clip_mattes, matting_network, segmentation_network
 from data_prep.track.mattes.matting_network import open_matting

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from data_prep.track.fit.frame_poses import NUM_FIXED, Motion, at_rest
 from data_prep.track.fit.levenberg_marquardt import IdentityPrior, minimise
-from data_prep.track.fit.motion import NUM_FIXED, Motion, at_rest
 from data_prep.track.fit.normal_equations import NormalEquations, NotPositiveDefinite, solve
 
 T, D, G = 5, 3, 2

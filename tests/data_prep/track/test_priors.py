@@ -11,8 +11,8 @@ from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.landmark_groups import LEFT_IRIS, RIGHT_IRIS
 from data_prep.track.faces.landmarks import BLENDSHAPES, CLOSED_SCORE, NUM_POINTS, Landmarks
 from data_prep.track.fit.camera import Pinhole
+from data_prep.track.fit.frame_poses import Columns
 from data_prep.track.fit.landmark_fit import faded, point_units
-from data_prep.track.fit.motion import Columns
 from data_prep.track.fit.priors import BOX, JAW_PER_SCORE, SCORE_SHARE, make_priors
 
 NAMES = ExpressionNames(("mouthSmileLeft", "browInnerUp", "e2", "e3", "e4"))

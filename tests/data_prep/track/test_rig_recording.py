@@ -19,7 +19,7 @@ from avatar.head.assets import load_head_assets
 from data_prep.track.camera_rig import gha_folder, recording, track_rig
 from data_prep.track.camera_rig.camera_pictures import Times
 from data_prep.track.camera_rig.recording import Recording
-from data_prep.track.footage.pictures import PictureFolder
+from data_prep.track.footage.picture_folder import PictureFolder
 from data_prep.track.footage.source import Span, stride, whole
 
 SERIALS = list(FILMED)

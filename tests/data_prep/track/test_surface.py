@@ -14,7 +14,7 @@ from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from avatar.types import HeadParams
-from data_prep.track.fit.motion import (
+from data_prep.track.fit.frame_poses import (
     NUM_FIXED,
     Columns,
     Motion,

@@ -13,9 +13,9 @@ from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
 from data_prep.track.fit.camera import Pinhole, to_camera
 from data_prep.track.fit.crops import BlurredCrops, cut_out
+from data_prep.track.fit.frame_poses import NUM_FIXED, Motion, at_rest, rotations
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg_marquardt import Term
-from data_prep.track.fit.motion import NUM_FIXED, Motion, at_rest, rotations
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
 from data_prep.track.fit.priors import make_priors

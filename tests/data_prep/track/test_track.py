@@ -11,7 +11,7 @@ import pytest
 from videos import encode
 
 from avatar.cli import main
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.raw_video import filmed
 from avatar.demo.render import render_frame
 from avatar.errors import UserError
@@ -21,7 +21,7 @@ from data_prep.formats.avatar_track import read_info
 from data_prep.prepare.open_subject import find_head
 from data_prep.track import tracking_stages
 from data_prep.track.faces.landmarks import load_landmarks
-from data_prep.track.footage.pictures import is_footage
+from data_prep.track.footage.picture_folder import is_footage
 from data_prep.track.footage.source import Box
 from data_prep.track.track import Choices, track
 

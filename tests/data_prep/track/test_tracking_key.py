@@ -17,7 +17,7 @@ from tracked_folder import write_head_model
 
 from avatar.files.third_party import FACE_LANDMARKER, FOLDER_VARIABLE, SELFIE_MULTICLASS
 from avatar.head.assets import load_head_assets
-from avatar.pipeline import track
+from avatar.pipeline import cached_tracking as caching
 from data_prep.track import inputs
 from data_prep.track.faces.embedding import OFFICIAL_FILE
 from data_prep.track.footage.source import Box, Span
@@ -154,11 +154,11 @@ def test_a_file_that_was_added_has_the_video_tracked_again(
 ) -> None:
     """As the program's own advice has it: put expression_names.json beside the model."""
     monkeypatch.setenv("AVATAR_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(track, "open_footage", lambda _: footage())
-    monkeypatch.setattr(track, "track", lambda video, out, *_, seal, **__: (out.mkdir(parents=True), seal(out)))
-    first = track.cached_tracking(tmp_path / "me.mp4", head)
+    monkeypatch.setattr(caching, "open_footage", lambda _: footage())
+    monkeypatch.setattr(caching, "track", lambda video, out, *_, seal, **__: (out.mkdir(parents=True), seal(out)))
+    first = caching.cached_tracking(tmp_path / "me.mp4", head)
     add_names(head)
-    assert track.cached_tracking(tmp_path / "me.mp4", head) != first
+    assert caching.cached_tracking(tmp_path / "me.mp4", head) != first
 
 
 def test_the_fit_of_a_folder_that_is_not_finished_is_made_again_too(head: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from data_prep.formats.avatar_track import read_info
 from data_prep.track import track as tracking
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.landmarks import load_landmarks
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.rotated import TURNS, turn_image, turned
 from data_prep.track.footage.source import Box, Span, View, whole
 from data_prep.track.track import Choices, track

@@ -16,7 +16,7 @@ from videos import LOSSLESS, X264, encode
 
 from avatar.errors import UserError
 from data_prep.formats.avatar_track import read_info
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Span, View, whole
 from data_prep.track.mattes.user_mattes import open_mattes, share_on
 from data_prep.track.track import Choices, track

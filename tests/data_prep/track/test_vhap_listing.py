@@ -22,7 +22,7 @@ from data_prep.track.camera_rig.camera_pictures import Times
 from data_prep.track.camera_rig.recording import Camera, Recording
 from data_prep.track.camera_rig.track_rig import _RigTracking
 from data_prep.track.camera_rig.vhap_listing import write_listing, write_parameters
-from data_prep.track.footage.pictures import PictureFolder
+from data_prep.track.footage.picture_folder import PictureFolder
 from data_prep.track.footage.source import Box, View
 from data_prep.track.stage_folder import StageFolder
 

@@ -9,7 +9,7 @@ import pytest
 from videos import LOSSLESS, X264, centre_of, encode, ffmpeg, spot
 
 from avatar.errors import UserError
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Box, Span, View, whole
 from data_prep.track.footage.tone_mapping import has_zimg
 from data_prep.track.footage.video import open_video

@@ -10,7 +10,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 
-from avatar.demo.motion import frame_camera, frame_params, perform
+from avatar.demo.performance import frame_camera, frame_params, perform
 from avatar.demo.render import render_frame
 
 X264 = ("-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p")

@@ -16,10 +16,17 @@ from drawn_clip import BACKGROUND, SIZE, Clip, drawn_clip, patterned_avatar, scr
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement import refine as refine_module
-from avatar.pose_refinement.motion import EXPRESSION, values_of
+from avatar.pose_refinement import refine_subject as refine_module
 from avatar.pose_refinement.record import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary
-from avatar.pose_refinement.refine import SAMPLES, Refined, estimated_seconds, fingerprint, frozen, refine_subject
+from avatar.pose_refinement.refine_subject import (
+    SAMPLES,
+    Refined,
+    estimated_seconds,
+    fingerprint,
+    frozen,
+    refine_subject,
+)
+from avatar.pose_refinement.tracking_values import EXPRESSION, values_of
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +242,7 @@ def test_the_record_tells_what_happened(avatar: Avatar, wrong: Clip, result: Ref
 
 
 def test_movements_are_the_turn_and_the_way_of_the_centre(clip: Clip) -> None:
-    from avatar.pose_refinement.motion import moved_tracks
+    from avatar.pose_refinement.tracking_values import moved_tracks
 
     values = values_of(clip.recording.tracks)
     values[:, 1], values[:, 3] = 0.02, 0.003

@@ -10,7 +10,7 @@ import pytest
 from videos import ffmpeg
 
 from avatar.errors import UserError
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Span, whole
 
 

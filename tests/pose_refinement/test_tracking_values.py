@@ -9,7 +9,7 @@ import torch
 from drawn_clip import EXPRESSIONS, true_tracks
 
 from avatar.head.model import matrix_from_6d
-from avatar.pose_refinement.motion import (
+from avatar.pose_refinement.tracking_values import (
     EXPRESSION,
     EYES,
     JAW,

@@ -29,11 +29,11 @@ from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.descent import Problem, curvature, descend
 from avatar.pose_refinement.frame_fitter import FrameFitter, Target, coarse_levels, head_psnr, targets
-from avatar.pose_refinement.motion import HeadPose, moved_tracks
 from avatar.pose_refinement.parallel import each_in_order
 from avatar.pose_refinement.parameterization import find_parameterization
 from avatar.pose_refinement.progress import read_progress, write_progress
 from avatar.pose_refinement.smoothing import smoothed
+from avatar.pose_refinement.tracking_values import HeadPose, moved_tracks
 from avatar.splat import CannotDraw
 
 COARSE_STEPS, FINE_STEPS = 3, 8

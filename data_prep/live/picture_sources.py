@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from avatar.errors import UserError
 from data_prep.ffmpeg import STALL_SECONDS
 from data_prep.track.faces.detect import quiet
-from data_prep.track.footage.pictures import open_footage
+from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.source import Footage, Span, View, check_size, whole
 
 LONGEST = 1280  # pixels of a picture; the landmarks come from 256 pixels around the face

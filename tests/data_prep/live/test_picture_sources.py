@@ -14,8 +14,8 @@ from videos import encode, spot
 from waiting import until
 
 from avatar.errors import UserError
-from data_prep.live.pictures import FILMED, FOLLOWED, Camera, LivePicture, Newest, VideoFile, open_source
-from data_prep.track.footage.pictures import open_footage
+from data_prep.live.picture_sources import FILMED, FOLLOWED, Camera, LivePicture, Newest, VideoFile, open_source
+from data_prep.track.footage.picture_folder import open_footage
 
 WIDTH, HEIGHT = 80, 64
 BLANK = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
