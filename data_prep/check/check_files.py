@@ -144,7 +144,7 @@ def _partners(clip: Clip) -> Iterator[Finding]:
             clip.names(alone),
         )
     skipped = sorted(set(gaps(images)) & set(gaps(tracking)))
-    if skipped and clip.files.is_one_folder:
+    if skipped and clip.files.is_numbered_by_names:
         yield Finding(
             "note",
             "gaps",

@@ -66,8 +66,14 @@ class FrameFiles:
 
     @cached_property
     def is_one_folder(self) -> bool:
-        """Whether the images lie in one folder, so that numbers which are missing are missing frames."""
+        """Whether the images lie in one folder."""
         return len({path.parent for path in self.images.values()}) == 1
+
+    @cached_property
+    def is_numbered_by_names(self) -> bool:
+        """Whether the images' names hold their numbers, so that numbers which are missing are missing frames."""
+        last = ((number, re.findall(r"[0-9]+", path.stem)[-1:]) for number, path in self.images.items())
+        return self.is_one_folder and all(digits and int(digits[0]) == number for number, digits in last)
 
     @cached_property
     def is_transparent(self) -> bool:

@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -132,14 +133,30 @@ def read_listings(folder: Path) -> list[ListedFrame]:
 
 
 def numbered(frames: Sequence[ListedFrame]) -> dict[int, ListedFrame]:
-    """The frames by number, from 0; between two folders of images a number is missing, as they are two sequences."""
+    """The frames by number, from 0. A number is missing between two folders of images, which are two sequences, and where
+    the numbers in the images' names skip more than they usually do."""
     found: dict[int, ListedFrame] = {}
-    number, folder = -1, None
-    for frame in frames:
-        place = frame.image.parent
-        number += 1 if folder in (None, place) else 2
-        found[number], folder = frame, place
+    number = -1
+    for _, group in groupby(frames, key=lambda frame: frame.image.parent):
+        inside = list(group)
+        steps = np.diff(_name_numbers([frame.image.stem for frame in inside]))
+        usual = np.median(steps) if len(steps) else 0
+        number += 2 if found else 1
+        for frame, skips in zip(inside, [*(steps > usual), False], strict=True):
+            found[number] = frame
+            number += 2 if skips else 1
+        number -= 1
     return found
+
+
+def _name_numbers(stems: list[str]) -> list[int]:
+    """The number in each name that tells them apart; 0, 1, ... where there is not one such."""
+    runs = [re.findall(r"[0-9]+", stem) for stem in stems]
+    if len({len(each) for each in runs}) == 1:
+        varying = [column for column in zip(*runs, strict=True) if len(set(column)) > 1]
+        if len(varying) == 1:
+            return [int(digits) for digits in varying[0]]
+    return list(range(len(stems)))
 
 
 def _in_order(frames: dict[Path, ListedFrame]) -> list[ListedFrame]:

@@ -108,7 +108,7 @@ def unusable(
 def _count_notes(files: FrameFiles) -> list[str]:
     notes = []
     for kind, found in files.of_kind().items():
-        missing = gaps(found) if files.is_one_folder else []
+        missing = gaps(found) if files.is_numbered_by_names else []
         if missing:
             notes.append(f"{files.title(kind)} skips the numbers {describe_numbers(missing)}")
         if kind != "checkpoint" and found and len(found) != len(files.images):

@@ -31,12 +31,21 @@ def listed(**values: Any) -> ListedFrame:
     return ListedFrame(Path("transforms.json"), 0, values, {}, None, Path())
 
 
-def test_numbered_frames_lack_a_number_between_two_folders() -> None:
-    paths = ["a/1.png", "a/2.png", "b/1.png", "b/2.png"]
-    frames = [listed(file_path=path) for path in paths]
-    assert {number: frame.values["file_path"] for number, frame in numbered(frames).items()} == dict(
-        zip((0, 1, 3, 4), paths, strict=True)
-    )
+@pytest.mark.parametrize(
+    ("paths", "numbers"),
+    [
+        ("a/1 a/2 b/1 b/2", (0, 1, 3, 4)),
+        ("a/1 a/2 a/3 a/9 a/10", (0, 1, 2, 4, 5)),
+        ("a/0_3 a/2_3 a/4_3 a/8_3 a/10_3 b/9_3", (0, 1, 2, 4, 5, 7)),  # every other frame, of camera 3
+        ("a/1_1 a/1_2 a/9_1 a/9_2", (0, 1, 2, 3)),  # of two cameras: their times are told apart elsewhere
+        ("a/x a/y9 b/c", (0, 1, 3)),
+    ],
+)
+def test_numbered_frames_lack_a_number_between_two_folders_and_where_names_skip(
+    paths: str, numbers: tuple[int, ...]
+) -> None:
+    frames = [listed(file_path=f"{path}.png") for path in paths.split()]
+    assert [*numbered(frames)] == [*numbers] and [*numbered(frames).values()] == frames
 
 
 @pytest.mark.parametrize("folder", ["person", "UNION_person"])
