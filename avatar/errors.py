@@ -24,5 +24,5 @@ def check_installed(what: str, extra: str, *packages: str) -> None:
 
 
 def refuse(message: str) -> NoReturn:
-    """What functions do with a problem unless they are told to gather problems instead."""
+    """What functions do with a problem by default; others gather problems."""
     raise UserError(message)

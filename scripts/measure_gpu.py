@@ -79,7 +79,7 @@ def check_repeats(scene: Scene, repeats: int) -> str:
 
 
 def check_no_waiting(rehearsal: Rehearsal, device: torch.device) -> str:
-    """Steps and frames with torch told to raise where the host waits for the GPU; the first ones may wait."""
+    """Steps and frames with torch set to raise where the host waits for the GPU; the first ones may wait."""
     renderer = Renderer(rehearsal.avatar, rehearsal.background)
     for mode in ("default", "error") if device.type == "cuda" else ("default",):
         if device.type == "cuda":

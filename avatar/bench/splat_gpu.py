@@ -12,6 +12,6 @@ def device_of(backend: str) -> torch.device:
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until a GPU has done what it was told."""
+    """Wait until a GPU has done all that was launched."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

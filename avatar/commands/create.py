@@ -172,16 +172,16 @@ def judge_tracking(info: TrackingInfo, subject: Path, anyway: bool) -> None:
     print(
         f"{', '.join(counts)} of {len(judged)} figures; look at {subject / 'overlay'}: does the mesh lie on the face?"
     )
-    told = [
+    figures = [
         f"{figure['name'].replace('  of', 'landmark error of')}: {figure['value']:.4g} {figure['unit']}".rstrip()
         + (f" -> {figure['advice']}" if figure["advice"] else "")
         for figure in judged
         if figure["grade"] == "poor"
     ]
-    if told and not anyway:
+    if figures and not anyway:
         advice = "film again by this advice, or add --anyway to go on with this video"
-        raise UserError("\n  ".join(["the tracking is poor:", *told]) + f"\n{advice}")
-    for line in told:
+        raise UserError("\n  ".join(["the tracking is poor:", *figures]) + f"\n{advice}")
+    for line in figures:
         print(f"  poor: {line}")
 
 

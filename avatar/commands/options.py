@@ -19,7 +19,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--format",
         metavar="NAME",
-        help="metrical-tracker, VHAP, INSTA, IMavatar, GaussianBlendshapes, NeRSemble or NHA (default: told by the files)",
+        help="metrical-tracker, VHAP, INSTA, IMavatar, GaussianBlendshapes, NeRSemble or NHA (default: by the files)",
     )
     parser.add_argument(
         "--cameras",

@@ -28,7 +28,7 @@ def add_export(export: argparse.ArgumentParser) -> None:
         "--format",
         choices=("web", "web-avatar", "avatar", "ply", "glb", "video"),
         help="web: a page that any browser opens; web-avatar: the file that <avatar-view> shows in pages of your own; "
-        "avatar: what the other commands take; ply: Gaussians; glb: a mesh (default: told from --out, else web)",
+        "avatar: what the other commands take; ply: Gaussians; glb: a mesh (default: by --out's ending, else web)",
     )
     export.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.html, .avatar, .ply ...")
     export.add_argument(

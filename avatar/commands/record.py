@@ -21,7 +21,7 @@ from data_prep.live.video_recorder import WARM_UP, VideoRecorder
 from data_prep.track.faces.detect import FaceDetector
 
 SUFFIXES = (".mp4", ".mov", ".mkv")
-OFTEN = 0.05  # share of the pictures above which what was wrong is told at the end
+OFTEN = 0.05  # share of the pictures above which what was wrong is named at the end
 
 
 class Screen:
@@ -102,7 +102,7 @@ def follow_prompts(
     wrong: Counter[str],
     interrupted: Callable[[], bool],
 ) -> None:
-    """Say each prompt in its time and what is wrong with the pictures; `seen` and `wrong` get what was seen and told."""
+    """Say each prompt in its time and what is wrong with the pictures; `seen` and `wrong` get what was seen and said."""
     adviser, begin, shown = RecordingAdvice(), None, -1
     while True:
         between_pictures(interrupted)
@@ -133,6 +133,8 @@ def report(screen: Screen, film: VideoRecorder, seen: list[Seen], wrong: Counter
             screen.say(f"Picture  {100 * count / wrong.total():.0f} % of the time: {problem}")
     for prompt, reached in zip(PROMPTS, reaches(seen), strict=True):
         got = {} if reached is None else reached
-        told = ", ".join(f"{name} {got[name]:.2g} of {least:g}" for name, least in prompt.least.items() if name in got)
+        reached = ", ".join(
+            f"{name} {got[name]:.2g} of {least:g}" for name, least in prompt.least.items() if name in got
+        )
         is_enough = reached is not None and all(got[name] >= least for name, least in prompt.least.items())
-        screen.say(f"{'Reached' if is_enough else 'Repeat':8} {prompt.words} {told if got else ''}".rstrip())
+        screen.say(f"{'Reached' if is_enough else 'Repeat':8} {prompt.words} {reached if got else ''}".rstrip())

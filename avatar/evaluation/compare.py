@@ -1,6 +1,6 @@
 """Runs side by side: means over the frames that all of them were evaluated on, and paired differences to the first run.
 
-Pairing by frame takes out what makes a frame hard for every avatar, so that a difference can be told from chance where the
+Pairing by frame takes out what makes a frame hard for every avatar, so that a difference stands out from chance where the
 intervals of the two means still overlap.
 """
 

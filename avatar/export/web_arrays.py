@@ -41,7 +41,7 @@ ARRAYS = (
     "log_scales",
     "opacity_logits",
     "sh",
-    "rigidity",
+    "skull_share",
 )
 LEAST_ALPHA = 1 / 255  # what is drawn at all
 
@@ -94,7 +94,7 @@ def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
         "log_scales": model.log_scales[seen],
         "opacity_logits": model.opacity_logits[seen],
         "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1)[seen],
-        "rigidity": empty if model.skull_logits is None else torch.sigmoid(model.skull_logits[seen]),
+        "skull_share": empty if model.skull_logits is None else torch.sigmoid(model.skull_logits[seen]),
     }
     sizes = {
         "vertices": len(used),
@@ -107,8 +107,8 @@ def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
         "coefficients": arrays["sh"].shape[1],
         "has_grid": int(grid is not None),
         "has_heads": int(folded is not None),
-        "has_rigidity": int(model.skull_logits is not None),
-        "has_facing": int(model.turning is not None),
+        "has_skull_binding": int(model.skull_logits is not None),
+        "has_head_rotation": int(model.turning is not None),
     }
     return WebArrays(
         sizes,

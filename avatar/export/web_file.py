@@ -48,7 +48,7 @@ SMALL: dict[str, tuple[str, str, int]] = {
     "log_scales": ("i2", "column", 2047),
     "opacity_logits": ("i2", "all", 1023),
     "sh": ("i1", "last two", 63),
-    "rigidity": ("i2", "all", 1023),
+    "skull_share": ("i2", "all", 1023),
 }
 MAX_MOTION = 1500  # frames: a minute at 25 a second
 
@@ -138,7 +138,7 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
         "parents": list(drawing.parents),
         "fps": recording.fps,
         "blur": trained.config.model.blur,
-        "facing": None if turning is None else {"turning": turning.flatten().tolist(), "limit": LIMIT},
+        "head_rotation": None if turning is None else {"turning": turning.flatten().tolist(), "limit": LIMIT},
         "background": list(trained.config.data.background),
         "expressions": [names[i] if i < len(names) and names[i] else f"expression {i}" for i in kept],
         "controls": [

@@ -1,4 +1,4 @@
-"""How the head is turned before the camera, as the deformation network is told.
+"""The head's rotation before the camera, as an input of the deformation network.
 
 Lights stay where they are when a head turns, and so do shadows on the neck, reflections on glasses, the collar and the
 torso: to the head all of them move. Colours that depend on the view can follow that only texel by texel; what the network

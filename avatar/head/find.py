@@ -27,7 +27,7 @@ def find_model_file(path: Path) -> Path:
     if not path.is_dir():
         if path.is_file() and (path.suffix.lower() in ARCHIVES or (path.suffix != ".npz" and zipfile.is_zipfile(path))):
             raise UserError(f"{path} is an archive; unpack it, and give --head the folder")
-        return path  # whoever reads it refuses what is no regular file
+        return path  # its reader refuses what is no regular file
     for depth in range(_DEPTH + 1):
         found = candidates(path, depth)
         named = [file for file in found if file.name in NAMED]

@@ -10,7 +10,7 @@ C33, C32, C31 = tl.constexpr(0.5900435899266435), tl.constexpr(2.890611442640554
 C30 = tl.constexpr(0.3731763325901154)
 
 
-# The degree is a number that the kernels are told, not one that they are compiled for: it rises during a training. The
+# The degree is an argument of the kernels, not a constant that they are compiled for: it rises during a training. The
 # functions of higher degrees are multiplied by 0.
 
 

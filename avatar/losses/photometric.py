@@ -124,7 +124,7 @@ def on_head(perceptual: Perceptual, margin: int = HEAD_MARGIN, least: int = MIN_
 
     The value is scaled by the box's share of the frame, so it weighs what the mean over the whole frame does: both images
     are black outside the mask. Only networks that see the frame's border where the box ends can tell. A head far away gets
-    a box of `least` pixels a side, which LPIPS needs, where the frame has them. Who knows the box may name it
+    a box of `least` pixels a side, which LPIPS needs, where the frame has them. A caller that knows the box may name it
     (`Frame.head_box`): to look for it is to wait for a GPU. Or `crop` holds the rows and columns, int64, which a CUDA graph
     reads (`crop_of_few_sizes`).
     """

@@ -1,8 +1,8 @@
 """The expressions that an avatar has seen in training: how far another one is from them, and the nearest that it can show.
 
-A network that was trained on one person's expressions guesses outside of them. Coordinates of a face are its expression
-coefficients and its jaw's rotation vector in units of 0.1 radians, about what a coefficient of one moves. Gaze and
-eyelids are left out: they act on a small part of the face and are seen from end to end in any video.
+A network that was trained on one person's expressions extrapolates outside of them. Coordinates of a face are its
+expression coefficients and its jaw's rotation vector in units of 0.1 radians, about what a coefficient of one moves.
+Gaze and eyelids are left out: they act on a small part of the face and are seen from end to end in any video.
 """
 
 from __future__ import annotations

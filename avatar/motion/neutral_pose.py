@@ -17,7 +17,7 @@ from avatar.types import HeadParams
 CALM_SHARE = 0.2  # of the frames with closed lips, those whose face is nearest to the generic neutral
 CALM_MOST = 2000  # frames; every one is compared with every other
 NEUTRAL_SHARE = 0.02  # of all frames, so many are averaged into the neutral expression
-CLOSEST_SHARE = 0.02  # of all frames close the lips: who speaks all the time does so in m, b and p
+CLOSEST_SHARE = 0.02  # of all frames close the lips: a person who speaks all the time does so in m, b and p
 LIPS_CLOSED = 0.0015  # metres farther apart than the closest ones: still closed, a tracker is no more exact than that
 LIPS_OPEN = 0.003  # metres: one sees the teeth
 EVERY = 4  # of so many vertices one is looked at, which moves the displacement of a face by less than 5%
@@ -64,7 +64,7 @@ def closed_frames(gap: Float[Tensor, " N"]) -> Int[Tensor, " M"]:
 
 
 def frame_rest(motion: Sequence[HeadParams], frame: int) -> RestPose:
-    """The pose of one frame as it is, for a person who knows which."""
+    """The pose of one frame as it is, where the user names the frame."""
     expression, jaw = stacked(motion[frame : frame + 1])
     return RestPose(expression[0], jaw[0], frame)
 

@@ -219,7 +219,7 @@ def say_distances(distances: Float[Tensor, " T"], say: Callable[[str], None]) ->
     if far:
         say(
             f"{far} of {len(distances)} frames are farther from the training expressions than 99% of those are (at most "
-            f"{float(distances.max()):.1f} times as far): the avatar guesses there; --transfer pca keeps to what it knows"
+            f"{float(distances.max()):.1f} times as far): the avatar extrapolates there; --transfer pca stays within them"
         )
 
 

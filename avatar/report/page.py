@@ -207,7 +207,7 @@ def _origin(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
         "head model": run.avatar.head.assets.fingerprint,
         **{f"version of {name}": value for name, value in versions().items()},
     }
-    told = tracking_lines(results["tracking"]) if results else []
-    notes = [element("p", note) for note in (results or {}).get("notes", ()) if note not in told]
+    lines = tracking_lines(results["tracking"]) if results else []
+    notes = [element("p", note) for note in (results or {}).get("notes", ()) if note not in lines]
     config = [[key, str(value)] for key, value in flatten(run.config.to_dict()).items()]
     return [*notes, data_table([], [list(row) for row in known.items()]), fold("Configuration", data_table([], config))]

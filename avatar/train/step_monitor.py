@@ -1,4 +1,4 @@
-"""Training on a GPU, which is told of many steps before anything is known about the first.
+"""Training on a GPU, where many steps are queued before the first has ended.
 
 To ask after each step whether it was finite would make the GPU wait for the question. So it answers itself: a step whose
 loss or gradient is not finite moves nothing, and neither does any after it. When the host reads of it the parameters are
@@ -47,7 +47,7 @@ class Guard:
 
 
 class Numbers(NamedTuple):
-    """What is told of a step; float32."""
+    """The figures of a step; float32."""
 
     is_nonfinite: float
     total: float

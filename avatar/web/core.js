@@ -6,11 +6,11 @@ const ARRAYS = [
   "shape", "expression_dirs", "pose_dirs", "weights", "eyelid_dirs", "joints_at_rest", "expression_joints", "barycentric",
   "of_code", "for_condition", "input_bias", "hidden_weights", "hidden_biases", "output_weights", "output_bias",
   "grid_weights", "head_matrix", "head_bias", "quats", "log_scales", "opacity_logits", "sh",
-  "rigidity",
+  "skull_share",
 ];
 const SIZES = [
   "vertices", "expressions", "gaussians", "nodes", "latent", "width", "layers", "coefficients", "has_grid", "has_heads",
-  "has_rigidity", "has_facing",
+  "has_skull_binding", "has_head_rotation",
 ];
 const TYPES = { f4: Float32Array, i2: Int16Array, i1: Int8Array, u4: Uint32Array, u2: Uint16Array };
 const MAX_BYTES = 2 ** 28; // of an unpacked file
@@ -97,8 +97,8 @@ function check(header, arrays) {
   need(c && finite(c.rotation, 9) && finite(c.translation, 3), "the camera is missing");
   need(finite(["fx", "fy", "cx", "cy", "aspect"].map((k) => c[k]), 5) && c.aspect > 0.1 && c.aspect < 10, "the camera is missing");
   need(header.blur >= 0 && header.blur <= 100, "its blur is missing");
-  const f = header.facing;
-  need(s.has_facing ? finite(f?.turning, 27) && f.limit > 0 && f.limit <= 100 : f === null, "how its head is turned is missing");
+  const f = header.head_rotation;
+  need(s.has_head_rotation ? finite(f?.turning, 27) && f.limit > 0 && f.limit <= 100 : f === null, "how its head is turned is missing");
   need(header.fps > 0 && header.fps <= 1000, "the frame rate is missing");
   need(header.size >= 1 && header.size <= 2 ** 16, "the size is missing");
   for (const name of [...ARRAYS, "corners", "cells", "motion", "poses"]) need(arrays.has(name), `${name} is missing`);
@@ -127,11 +127,11 @@ function scaled(values, { scales, by }, name) {
   return out;
 }
 
-/** How the head is turned before a camera, as the network is told: avatar/gaussians/head_rotation.py. */
-function facing(told, rotation) {
-  if (told === null) return [0, 0, 0];
-  const turn = (axis) => rotation.reduce((sum, value, k) => sum + told.turning[9 * axis + k] * value, 0);
-  return [0, 1, 2].map((axis) => Math.min(Math.max(turn(axis), -told.limit), told.limit));
+/** The head's rotation before a camera, as the network's input: avatar/gaussians/head_rotation.py. */
+function headRotationInput(learned, rotation) {
+  if (learned === null) return [0, 0, 0];
+  const turn = (axis) => rotation.reduce((sum, value, k) => sum + learned.turning[9 * axis + k] * value, 0);
+  return [0, 1, 2].map((axis) => Math.min(Math.max(turn(axis), -learned.limit), learned.limit));
 }
 
 /** The module with one avatar in it. */
@@ -190,7 +190,7 @@ export class AvatarCore {
    */
   pose(parameters, rotation) {
     this.#floats(this.#module.avatar_parameters(), parameters.length).set(parameters);
-    this.#floats(this.#module.avatar_facing(), 3).set(facing(this.header.facing, rotation));
+    this.#floats(this.#module.avatar_head_rotation(), 3).set(headRotationInput(this.header.head_rotation, rotation));
     guarded(() => this.#module.avatar_pose());
   }
 

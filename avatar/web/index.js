@@ -53,7 +53,7 @@ export class AvatarViewElement extends HTMLElement {
 
   #loadSource() {
     const source = this.getAttribute("src");
-    if (this.#isHere && source) this.load(source).catch(() => {}); // it is shown, and told by "error"
+    if (this.#isHere && source) this.load(source).catch(() => {}); // it is shown, and an "error" event says it
   }
 
   #close() {

@@ -1,4 +1,4 @@
-"""Which program's layout a tracked folder has, told from its files, never from its name."""
+"""Which program's layout a tracked folder has, found from its files, never from its name."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def open_tracked_folder(
 
 
 def detect_format(folder: Path, frames: list[ListedFrame]) -> str:
-    """A folder with imgs/ is metrical-tracker's; listings are told apart by what their first frame has, other folders by
+    """A folder with imgs/ is metrical-tracker's; listings are distinguished by what their first frame has, other folders by
     their files."""
     found = [METRICAL_TRACKER] if (folder / "imgs").is_dir() else []
     found += [name for name, module in _LISTED.items() if module.recognise(frames)]

@@ -6,7 +6,7 @@
     FOLDER/semantic/1.png                     class numbers of the face parsing network, if there are any
 
 Shared values: `shape_params`, and `intrinsics` = -fx, fy, cx, cy in units of the image's width and height (pixels of a
-512x512 image in an older form, told by cy > 1). An entry has `expression`, `pose` = 15 rotation-vector values of root,
+512x512 image in an older form, which has cy > 1). An entry has `expression`, `pose` = 15 rotation-vector values of root,
 neck, jaw, left and right eye, and `world_mat` [3, 4], from a world in which FLAME's head is four times its size to a
 camera with OpenGL's axes. There are no eyelids: they are zero.
 """

@@ -47,7 +47,7 @@ from data_prep.formats.transforms import (
 
 NAME = "VHAP"
 NAMES = KindNames("fg_masks/", "head masks", "mouth masks", images="images/", tracking="flame_param/")
-FRONTAL_FRAMES = 8  # by which the front camera is told
+FRONTAL_FRAMES = 8  # by which the front camera is found
 
 
 def recognise(frames: list[ListedFrame]) -> bool:

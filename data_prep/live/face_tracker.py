@@ -93,12 +93,12 @@ class LiveFaceTracker:
         Raises UserError when the pictures end before.
         """
         found: list[tuple[Face, float]] = []
-        told = ""
+        last = ""
 
         def tell(words: str) -> None:
-            nonlocal told
-            if words != told:
-                say(told := words)
+            nonlocal last
+            if words != last:
+                say(last := words)
 
         self.pictures.start()
         try:

@@ -175,7 +175,7 @@ class Newest:
             return picture
 
     def close(self) -> None:
-        """Whoever waits is told; a source that hangs is left behind."""
+        """Wakes those that wait; a source that hangs is left behind."""
         self.source.close()
         self._finish(f"{self.source.name} is closed")
         if self._thread.is_alive():
@@ -192,7 +192,7 @@ class Newest:
                     self._changed.notify_all()
         except UserError as error:
             end = str(error)
-        except Exception as error:  # whoever waits must hear of it
+        except Exception as error:  # those that wait must hear of it
             end = f"{self.source.name} breaks off ({error})"
         self._finish(end or f"{self.source.name} has ended after {self.read} pictures")
 

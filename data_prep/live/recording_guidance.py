@@ -1,4 +1,4 @@
-"""What a person is told while being filmed: what to do, what is wrong with the picture, and how far they went."""
+"""Instructions while a person is filmed: what to do, what is wrong with the picture, and how much is done."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _WORST = 5  # frames that are named
 
 @dataclass(frozen=True)
 class Figure:
-    """One measure. `good` and `fair` bound the grades; without them the figure is told and not judged."""
+    """One measure. `good` and `fair` bound the grades; without them the figure is shown and not graded."""
 
     name: str
     value: float
@@ -46,12 +46,12 @@ class Figure:
     def line(self) -> str:
         grade = self.grade
         judged = "" if grade is None else f"  {grade}"
-        told = f"  -> {self.advice}" if grade in GRADES[1:] and self.advice else ""
-        return f"  {self.name:34} {self.value:9.3f} {self.unit:5}{judged}{told}"
+        advice = f"  -> {self.advice}" if grade in GRADES[1:] and self.advice else ""
+        return f"  {self.name:34} {self.value:9.3f} {self.unit:5}{judged}{advice}"
 
     def to_json(self) -> dict[str, Any]:
-        told = {"name": self.name, "value": self.value, "unit": self.unit}
-        return told if self.grade is None else told | {"grade": self.grade, "advice": self.advice}
+        figure = {"name": self.name, "value": self.value, "unit": self.unit}
+        return figure if self.grade is None else figure | {"grade": self.grade, "advice": self.advice}
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
 
     Errors are mean distances between the embedded and the detected landmarks, in per cent of the distance between the
     irises in the picture (its 90th percentile over the clip, since turned heads show it shorter). What is the same in all
-    frames is told apart: it is where the embedding lies on this face, and not an error of the tracking. Of the irises it
+    frames is subtracted: it is where the embedding lies on this face, and not an error of the tracking. Of the irises it
     is an error: the gaze can follow them.
     """
     rows = list(fit.tracks)

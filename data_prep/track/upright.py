@@ -39,7 +39,7 @@ def sample_pictures(
 ) -> Iterator[TimedPicture]:
     """Some pictures from all over the span, made smaller, or as `view` says; without those that cannot be read.
 
-    Whoever reads all of them hears why, and where.
+    A caller that reads all of them learns why, and where.
     """
     view = view or whole(footage.width, footage.height, LONGEST)
     if footage.duration is None:

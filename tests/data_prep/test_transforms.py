@@ -37,7 +37,7 @@ def listed(**values: Any) -> ListedFrame:
         ("a/1 a/2 b/1 b/2", (0, 1, 3, 4)),
         ("a/1 a/2 a/3 a/9 a/10", (0, 1, 2, 4, 5)),
         ("a/0_3 a/2_3 a/4_3 a/8_3 a/10_3 b/9_3", (0, 1, 2, 4, 5, 7)),  # every other frame, of camera 3
-        ("a/1_1 a/1_2 a/9_1 a/9_2", (0, 1, 2, 3)),  # of two cameras: their times are told apart elsewhere
+        ("a/1_1 a/1_2 a/9_1 a/9_2", (0, 1, 2, 3)),  # of two cameras: their times are separated elsewhere
         ("a/x a/y9 b/c", (0, 1, 3)),
     ],
 )

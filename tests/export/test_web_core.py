@@ -32,8 +32,8 @@ MODELS = {
     "no HyperGaussians": ("model=flashavatar",),
     "covariance": ("model=covariance",),
     "detail": ("model.uv_detail=2",),
-    "rigidity": ("model.skull_binding=true",),
-    "facing": ("model.head_rotation=true",),
+    "skull binding": ("model.skull_binding=true",),
+    "head rotation": ("model.head_rotation=true",),
     "blur": ("model.blur=1.5",),
     "teeth": ("model.teeth=true",),
 }

@@ -1,4 +1,4 @@
-"""How a head is turned before its camera: what the network is told of it, and who hears it."""
+"""The head's rotation before its camera as an input of the network, and which models have it."""
 
 from __future__ import annotations
 
@@ -34,11 +34,13 @@ def turns() -> Tensor:
     return torch.cat((some, -some))
 
 
-def small_avatar(told: bool = True, **options: object) -> Avatar:
+def small_avatar(with_input: bool = True, **options: object) -> Avatar:
     extra = [f"{key}={value}" for key, value in options.items()]
     torch.manual_seed(2)
     avatar = make_avatar(
-        grid_head(), torch.zeros(3), load_config([*SMALL, f"model.head_rotation={str(told).lower()}", *extra]).model
+        grid_head(),
+        torch.zeros(3),
+        load_config([*SMALL, f"model.head_rotation={str(with_input).lower()}", *extra]).model,
     )
     assert avatar.hyper is not None
     with torch.no_grad():
@@ -55,16 +57,16 @@ def test_it_is_the_sines_of_the_turn_in_units_of_their_spread() -> None:
     vectors, mean = turns(), a_mean()
     R = rotations(vectors, mean)
     turning = learned_turning(R)
-    told = torch.stack([head_rotation_input(turning, r) for r in R])
+    inputs = torch.stack([head_rotation_input(turning, r) for r in R])
     angle = vectors.norm(dim=1, keepdim=True)
     sines = vectors / angle * angle.sin()
     expected = sines / sines.square().mean().sqrt()
-    torch.testing.assert_close(told, expected.clamp(-LIMIT, LIMIT), rtol=0, atol=1e-4)
-    assert (told.abs() == LIMIT).any(), "some are turned farther than is told"
+    torch.testing.assert_close(inputs, expected.clamp(-LIMIT, LIMIT), rtol=0, atol=1e-4)
+    assert (inputs.abs() == LIMIT).any(), "some are turned farther than the limit"
     torch.testing.assert_close(head_rotation_input(turning, mean), torch.zeros(3), rtol=0, atol=1e-5)
 
 
-def test_a_head_that_never_turns_is_told_nothing() -> None:
+def test_a_head_that_never_turns_has_input_zero() -> None:
     turning = learned_turning(a_mean().repeat(10, 1, 1))
     assert (turning == 0).all() and (head_rotation_input(turning, a_mean()) == 0).all()
 
@@ -81,7 +83,7 @@ def test_the_network_hears_it_and_the_mesh_does_not() -> None:
 
 
 def test_without_it_the_camera_makes_no_difference() -> None:
-    avatar, params = small_avatar(told=False), random_params()
+    avatar, params = small_avatar(with_input=False), random_params()
     avatar.learn_head_rotation(rotations(turns(), a_mean()))
     side = rotations(torch.tensor([[0.0, 0.1, 0.0]]), a_mean())[0]
     assert avatar.turning is None and not any("turning" in name for name in avatar.state_dict())
@@ -124,21 +126,21 @@ def test_an_avatar_is_drawn_with_its_own_blur() -> None:
 
 
 def test_a_camera_on_the_cpu_needs_nothing_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On torch's meta device, where nothing can be read back, what is told is computed beside the camera."""
+    """On torch's meta device, where nothing can be read back, the input is computed beside the camera."""
     import avatar.gaussians.base_model
 
     R = rotations(turns(), a_mean())
     avatar_there = small_avatar()
     avatar_there.learn_head_rotation(R)
     expected = head_rotation_input(torch.as_tensor(avatar_there.turning), R[3])
-    told: list[Tensor] = []
+    inputs: list[Tensor] = []
 
     def recorded(turning: Tensor, rotation: Tensor) -> Tensor:
-        told.append(head_rotation_input(turning, rotation))
-        return told[-1]
+        inputs.append(head_rotation_input(turning, rotation))
+        return inputs[-1]
 
     monkeypatch.setattr(avatar.gaussians.base_model, "head_rotation_input", recorded)
     avatar_there.to("meta")
     condition = avatar_there.condition(random_params(), R[3])
-    assert condition.is_meta and told[0].is_cpu
-    torch.testing.assert_close(told[0], expected, rtol=0, atol=0)
+    assert condition.is_meta and inputs[0].is_cpu
+    torch.testing.assert_close(inputs[0], expected, rtol=0, atol=0)

@@ -35,7 +35,7 @@ TINY = (
 def trained(
     folder: Path, run: Path, *overrides: str, on_cpu: bool = False, change: Callable[[Avatar], object] = id
 ) -> tuple[Avatar, list[float]]:
-    """An avatar, and the loss of each step as the log was told."""
+    """An avatar, and the loss of each step as the log was given."""
     config = small_config(*TINY, *overrides)
     _, subject, assets = open_small(folder, config)
     avatar = new_avatar(assets, subject, config)

@@ -97,7 +97,7 @@ print(bytes_of("VmHWM") - before, sum(need.size for need in needs))
     ],
     ids=["activations", "heads", "network", "covariances", "n-dimensional", "features"],
 )
-def test_training_takes_what_is_foretold(overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path) -> None:
+def test_training_takes_what_is_estimated(overrides: tuple[str, ...], tracked_folder: Path, tmp_path: Path) -> None:
     script = MEASURE.format(path=[str(p) for p in (TESTS / "helpers", TESTS / "data_prep")])
     process = subprocess.run(
         [sys.executable, "-c", script, str(tracked_folder), str(tmp_path), *overrides],
@@ -105,9 +105,9 @@ def test_training_takes_what_is_foretold(overrides: tuple[str, ...], tracked_fol
         text=True,
         check=True,
     )
-    taken, foretold = map(int, process.stdout.split())
-    assert foretold > 400 * MIB, "too small to tell from the libraries' own"
-    assert 0.75 < taken / foretold < 1.25, (taken / MIB, foretold / MIB)
+    taken, estimated = map(int, process.stdout.split())
+    assert estimated > 400 * MIB, "too small to tell from the libraries' own"
+    assert 0.75 < taken / estimated < 1.25, (taken / MIB, estimated / MIB)
 
 
 def test_the_largest_part_is_what_is_to_be_lowered() -> None:

@@ -1,4 +1,4 @@
-"""What a training is foretold to take."""
+"""The estimate of what a training takes."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_noise_of_several_steps_is_that_of_each(subject: Subject) -> None:
 def test_training_poses_the_mesh_without_it(
     share: float, tracked_folder: Path, subject: Subject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The network is told of every frame with noise; the mesh is posed, and previews are drawn, without."""
+    """The network's input has noise; the posed mesh and previews have none."""
     known, posed, told = set(), set(), set()
     for index in range(len(subject)):
         known.add(tuple(subject.recording.params(index).condition().tolist()))

@@ -13,7 +13,7 @@ from avatar.train.step_monitor import AsyncStepMonitor, Guard, NonFiniteStep
 
 
 class Log:
-    """What a TrainingLog is told."""
+    """What a TrainingLog is given."""
 
     def __init__(self) -> None:
         self.noted: list[tuple[int, float, dict[str, float], float]] = []

@@ -1,4 +1,4 @@
-"""A face in front of a camera as the avatar's: relative to both neutral faces, and told when it cannot be followed."""
+"""A face in front of a camera as the avatar's: relative to both neutral faces, and said when it cannot be followed."""
 
 from __future__ import annotations
 

@@ -35,14 +35,14 @@ extern "C" {
 // 0 when the sizes are absurd. Takes no memory: a caller compares the lengths with what it has before it allocates.
 EMSCRIPTEN_KEEPALIVE int avatar_measure(int vertices, int expressions, int gaussians, int nodes, int latent, int width,
                                         int layers, int coefficients, int has_grid, int has_heads,
-                                        int has_rigidity, int has_facing) {
+                                        int has_skull_binding, int has_head_rotation) {
     for (const int size : {vertices, gaussians, nodes, latent, width, layers, coefficients})
         if (size < 1 || size > 1 << 20) return 0;
     const bool is_square = coefficients == 1 || coefficients == 4 || coefficients == 9 || coefficients == 16;
     if (expressions < 0 || expressions > 4096 || !is_square || (!has_heads && latent != 10)) return 0;
     if (!has_grid && nodes != gaussians) return 0;
     measured = {vertices, expressions, gaussians, nodes, latent, width, layers, coefficients,
-                has_grid, has_heads, has_rigidity, has_facing};
+                has_grid, has_heads, has_skull_binding, has_head_rotation};
     avatar::web::array_lengths(measured, lengths);
     return 1;
 }
@@ -57,7 +57,7 @@ EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_corners() { return web_avatar->corners
 EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_cells() { return web_avatar->cells(); }
 EMSCRIPTEN_KEEPALIVE std::int32_t* avatar_parents() { return web_avatar->parents; }
 EMSCRIPTEN_KEEPALIVE float* avatar_parameters() { return web_avatar->parameters(); }
-EMSCRIPTEN_KEEPALIVE float* avatar_facing() { return web_avatar->facing; }
+EMSCRIPTEN_KEEPALIVE float* avatar_head_rotation() { return web_avatar->head_rotation; }
 EMSCRIPTEN_KEEPALIVE void avatar_set_blur(double blur) { web_avatar->blur = blur; }
 EMSCRIPTEN_KEEPALIVE double* avatar_camera() { return camera_values; }
 EMSCRIPTEN_KEEPALIVE float* avatar_background() { return background; }

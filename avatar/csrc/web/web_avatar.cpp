@@ -56,7 +56,7 @@ void array_lengths(const Sizes& s, std::int64_t lengths[kArrays]) {
         V * 3, E * V * 3, kPoseValues * V * 3, V * kJoints, kEyelids * V * 3, kJoints * 3, E * kJoints * 3, G * 3,
         M * W, condition_count(s) * W, W, H * W * W, H * W, W * s.latent, s.latent, s.has_grid ? G * 4 : 0,
         s.has_heads ? G * s.latent * kOffsets : 0, s.has_heads ? G * kOffsets : 0, G * 4, G * 3, G, G * s.coefficients * 3,
-        s.has_rigidity ? G : 0};
+        s.has_skull_binding ? G : 0};
     std::copy(values, values + kArrays, lengths);
 }
 
@@ -159,11 +159,11 @@ void WebAvatar::skin() {
             for (int k = 0; k < 3; ++k) sum += barycentric[3 * g + k] * posed_[3 * corners_[3 * g + k] + i];
             points_[3 * g + i] = sum;
         }
-    if (sizes_.has_rigidity) hold(R[0]);
+    if (sizes_.has_skull_binding) bind_to_skull(R[0]);
 }
 
 // Brings the points to the skull by their shares, as avatar/gaussians/skull_binding.py. `turn` is the torso's.
-void WebAvatar::hold(const Rotation& turn) {
+void WebAvatar::bind_to_skull(const Rotation& turn) {
     bool carried[kJoints] = {};
     for (int joint = kNeckJoint; joint < kJoints; ++joint)
         carried[joint] = joint == kNeckJoint || (parents[joint] >= 0 && carried[parents[joint]]);
@@ -182,12 +182,12 @@ void WebAvatar::hold(const Rotation& turn) {
                 arm[i] += b * (1 - share) * (shape[3 * v + i] - pivot[i]);
             }
         }
-        const float rigidity = arrays_[kRigidity][g];
+        const float share = arrays_[kSkullShare][g];
         for (int i = 0; i < 3; ++i) {
             float on_skull = at_rest[i];
             for (int k = 0; k < 3; ++k)
                 on_skull += (turn.m[3 * i + k] - (i == k ? 1.0f : 0.0f)) * arm[k];
-            points_[3 * g + i] += rigidity * (on_skull - points_[3 * g + i]);
+            points_[3 * g + i] += share * (on_skull - points_[3 * g + i]);
         }
     }
 }
@@ -199,7 +199,7 @@ void WebAvatar::evaluate_network() {
     const float* weights = arrays_[kForCondition].data();
     for (int c = 0; c < C; ++c)
         if (parameters_[c] != 0.0f) add_scaled(of_frame, weights + std::int64_t{c} * W, parameters_[c]);
-    for (int c = C; c < condition_count(sizes_); ++c) add_scaled(of_frame, weights + std::int64_t{c} * W, facing[c - C]);
+    for (int c = C; c < condition_count(sizes_); ++c) add_scaled(of_frame, weights + std::int64_t{c} * W, head_rotation[c - C]);
     const float* of_code = arrays_[kOfCode].data();
     for (std::int64_t m = 0; m < M; ++m)
         for (int j = 0; j < W; ++j) layer_[m * W + j] = std::max(of_code[m * W + j] + of_frame[j], 0.0f);

@@ -10,7 +10,7 @@
 namespace avatar::web {
 
 constexpr int kJoints = 5, kNeckJoint = 1, kPoseValues = 9 * (kJoints - 1), kOffsets = 10;
-constexpr int kJaw = 6, kEyes = 12, kEyelids = 2, kNeck = 6, kFacing = 3;
+constexpr int kJaw = 6, kEyes = 12, kEyelids = 2, kNeck = 6, kHeadRotation = 3;
 
 struct Sizes {
     std::int32_t vertices, expressions, gaussians;
@@ -18,14 +18,14 @@ struct Sizes {
     std::int32_t latent;        // values that the network gives; 10 where there are no HyperGaussians
     std::int32_t width, layers; // of the network
     std::int32_t coefficients;  // of the colour
-    std::int32_t has_grid, has_heads, has_rigidity, has_facing;
+    std::int32_t has_grid, has_heads, has_skull_binding, has_head_rotation;
 };
 
 // What moves the head in a frame, as HeadParams, in one array: expression, jaw, eyes, eyelids, neck.
 inline int parameter_count(const Sizes& s) { return s.expressions + kJaw + kEyes + kEyelids + kNeck; }
-// Of these, what the network is told; after it, with has_facing, how the head is turned.
+// Of these, the network's inputs; after them, with has_head_rotation, the head's rotation before the camera.
 inline int moving_count(const Sizes& s) { return s.expressions + kJaw + kEyes + kEyelids; }
-inline int condition_count(const Sizes& s) { return moving_count(s) + (s.has_facing ? kFacing : 0); }
+inline int condition_count(const Sizes& s) { return moving_count(s) + (s.has_head_rotation ? kHeadRotation : 0); }
 
 // Every array that does not change, in the order in which a caller fills them.
 enum Array {
@@ -51,7 +51,7 @@ enum Array {
     kLogScales,          // [G * 3]
     kOpacityLogits,      // [G]
     kSh,                 // [G * K * 3]
-    kRigidity,           // [G] the share of each Gaussian that keeps with the skull
+    kSkullShare,         // [G] the share of each Gaussian that keeps with the skull
     kArrays
 };
 
@@ -76,7 +76,7 @@ public:
     std::int32_t* cells() { return cells_.data(); }        // [G * 4] nodes around each Gaussian
     float* parameters() { return parameters_.data(); }     // of the next frame
     std::int32_t parents[kJoints] = {-1, 0, 1, 1, 1};
-    float facing[kFacing] = {}; // of the next frame: avatar/gaussians/head_rotation.py
+    float head_rotation[kHeadRotation] = {}; // of the next frame: avatar/gaussians/head_rotation.py
     double blur = 0.3;          // pixels^2 added to a splat's variances
 
     // False when an index lies outside of what it points into.
@@ -96,7 +96,7 @@ public:
 
 private:
     void skin();
-    void hold(const Rotation& turn);
+    void bind_to_skull(const Rotation& turn);
     void evaluate_network();
     void offset();
 

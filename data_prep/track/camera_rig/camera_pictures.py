@@ -18,7 +18,7 @@ from data_prep.track.footage.picture_folder import resampled
 from data_prep.track.footage.source import Box, Footage, Span, View, whole
 from data_prep.track.frames import JPEG, frame_file, mask_file, write_image
 
-_SAMPLES = 3  # first pictures, by which the front camera is told
+_SAMPLES = 3  # first pictures, by which the front camera is found
 _LEFT_EYE, _RIGHT_EYE, _MOUTH = 263, 33, 13  # landmarks of a plane that the face looks along the normal of
 _OFF = 0.3  # of the distance between two times, by which a picture may be off one
 

@@ -17,7 +17,7 @@ CLIP_FRAMES = 12  # that say how far it reaches
 _REACH = 64  # of these in the longer side is the farthest that is looked for
 _LEAST = 0.12  # share of the background's colour in the second pixel: with less, it is shading that would be taken out
 _GONE = 0.05  # share beyond which there is nothing to take out
-_DISTINCT = 0.15  # distance of colours in [0, 1]: those of person and background that are nearer cannot be told apart
+_DISTINCT = 0.15  # distance of colours in [0, 1]: those of person and background that are nearer cannot be separated
 _FEW = 20  # pixels
 
 

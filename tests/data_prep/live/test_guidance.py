@@ -1,4 +1,4 @@
-"""What a person is told while being filmed, by drawn faces whose state is known."""
+"""Instructions while a person is filmed, by drawn faces whose state is known."""
 
 from __future__ import annotations
 

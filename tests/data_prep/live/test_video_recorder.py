@@ -80,16 +80,16 @@ def test_nothing_is_written_before_it_begins_and_after_it_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "told"), [(29.97, 30), (30.2, 30), (24.9, 25), (15.1, 15), (7.4, 7.5), (17.5, 17.5), (33.0, 33.0)]
+    ("rate", "expected"), [(29.97, 30), (30.2, 30), (24.9, 25), (15.1, 15), (7.4, 7.5), (17.5, 17.5), (33.0, 33.0)]
 )
-def test_the_rate_is_the_cameras_own(rate: float, told: float) -> None:
+def test_the_rate_is_the_cameras_own(rate: float, expected: float) -> None:
     """Whatever its jitter, and with a picture missing in between; a common rate where it is near."""
     count = int(3 * rate)
     times = (np.arange(count) + np.random.default_rng(2).uniform(-0.1, 0.1, count)) / rate
     film = VideoRecorder(Timed(np.delete(times, count // 2)))
     for _ in film.pictures():
         pass
-    assert film.measured_rate() == pytest.approx(told, rel=0.02)
+    assert film.measured_rate() == pytest.approx(expected, rel=0.02)
 
 
 def test_a_rate_takes_two_seconds() -> None:

@@ -40,7 +40,7 @@ def test_figures_without_bounds_are_told_only() -> None:
 
 
 def test_errors_are_what_changes_from_frame_to_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In per cent of the irises' distance; where a landmark lies on this face in all frames is told apart."""
+    """In per cent of the irises' distance; where a landmark lies on this face in all frames is subtracted."""
     T, own = 40, (*NOSE, *LIPS)
     rng = np.random.default_rng(0)
     points = np.zeros((T, NUM_POINTS, 3), np.float32)

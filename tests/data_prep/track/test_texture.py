@@ -1,4 +1,4 @@
-"""Skin points' own values and the light of each frame, told apart."""
+"""Skin points' own values and the light of each frame, separated."""
 
 from __future__ import annotations
 

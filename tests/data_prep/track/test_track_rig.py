@@ -97,7 +97,7 @@ def test_check_and_training_take_it(truth: Path, tracked: Path, head: HeadAssets
 
 
 def test_a_folder_of_gaussian_head_avatar(truth: Path, head: HeadAssets, tmp_path: Path) -> None:
-    """Its front camera is told by the landmarks, its masks are used, and its pictures are made smaller."""
+    """Its front camera is found by the landmarks, its masks are used, and its pictures are made smaller."""
     said: list[str] = []
     folder = write_gha(truth, tmp_path / "gha", 1.0)
     track_rig([folder], tmp_path / "out", truth / "head_model", head, size=128, say=said.append)
