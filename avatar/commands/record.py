@@ -133,8 +133,8 @@ def report(screen: Screen, film: VideoRecorder, seen: list[Seen], wrong: Counter
             screen.say(f"Picture  {100 * count / wrong.total():.0f} % of the time: {problem}")
     for prompt, reached in zip(PROMPTS, reaches(seen), strict=True):
         got = {} if reached is None else reached
-        reached = ", ".join(
+        figures = ", ".join(
             f"{name} {got[name]:.2g} of {least:g}" for name, least in prompt.least.items() if name in got
         )
         is_enough = reached is not None and all(got[name] >= least for name, least in prompt.least.items())
-        screen.say(f"{'Reached' if is_enough else 'Repeat':8} {prompt.words} {reached if got else ''}".rstrip())
+        screen.say(f"{'Reached' if is_enough else 'Repeat':8} {prompt.words} {figures if got else ''}".rstrip())
