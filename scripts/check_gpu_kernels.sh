@@ -19,7 +19,7 @@ export OMP_NUM_THREADS=1 TRITON_CACHE_DIR=$work/triton # compiled anew, each tim
 part "the kernels in the interpreter"
 for tests in "tests/gpu" "tests/splat -k gpu"; do # the interpreter has one thread
   # shellcheck disable=SC2086
-  TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider -n "$jobs" --dist worksteal $tests
+  TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider -n "$jobs" --dist worksteal --durations=15 $tests
 done
 part "mistakes in the kernels"
 TRITON_INTERPRET=1 "$python" scripts/mutate_kernels.py --jobs "$jobs" --changed-only
