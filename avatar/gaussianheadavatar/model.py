@@ -47,6 +47,7 @@ BEYOND = 2  # one Gaussian beyond the mesh for so many on it
 STEPS = 600_000  # published; with fewer steps all rates are higher, by the root of the ratio
 MOST_BOOST = 10.0
 ZOOM = 0.8, 1.25
+COVERED = 0.1  # alpha from which on a pixel is the upsampler's alone
 POINT_RATE, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, NETWORK_RATE = 1e-5, 1e-5, 3e-5, 1e-4, 1e-4
 LAYERS = 46  # widths of floats that a Gaussian's networks keep in a step, measured
 FIT_STEPS, FIT_POINTS, FIT_RATE = 300, 4096, 1e-3  # of the colour networks to the first colours
@@ -186,9 +187,11 @@ class GaussianHeadAvatar(Avatar):
         height, width, factor = camera.height, camera.width, self.config.upsampling
         alphas = small.alpha[None, None]
         alpha = interpolate(alphas, scale_factor=factor, mode="bilinear")[0, 0, :height, :width]
-        reached = max_pool2d((alphas > 0).float(), 3, stride=1, padding=1)  # the others show the background
-        reached = interpolate(reached, scale_factor=factor)[0, 0, :height, :width, None] > 0
-        image = torch.where(reached, self.upsampler(small.image)[:height, :width], 1.0)
+        # A sigmoid is never 1: the upsampler's picture fades into the background where splats hardly cover it.
+        covered = max_pool2d(alphas, 3, stride=1, padding=1)
+        covered = interpolate(covered, scale_factor=factor, mode="bilinear")[0, 0, :height, :width, None]
+        share = (covered / COVERED).clamp(max=1.0)
+        image = 1.0 + share * (self.upsampler(small.image)[:height, :width] - 1.0)
         return over_background(Rendering(image, alpha), background)
 
     def learn_head_rotation(self, rotations: Float[Tensor, "T 3 3"]) -> None:

@@ -99,6 +99,15 @@ def test_another_background_shows_where_the_avatar_is_not() -> None:
     assert 0.1 < float(white.alpha.detach().mean()) < 1.0
 
 
+@pytest.mark.parametrize(("alpha", "share"), [(0.0, 0.0), (0.01, 0.1), (0.1, 1.0), (0.9, 1.0)])
+def test_the_picture_fades_into_the_background_where_splats_hardly_cover_it(alpha: float, share: float) -> None:
+    avatar = lively("gaussianheadavatar")
+    small = avatar.splatted(avatar(random_params()), CAMERA)
+    image = avatar.enlarged(small._replace(alpha=torch.full_like(small.alpha, alpha)), CAMERA, WHITE).image
+    upsampled = avatar.upsampler(small.image)[: CAMERA.height, : CAMERA.width]
+    torch.testing.assert_close(image, 1.0 + share * (upsampled - 1.0), rtol=0, atol=1e-6)
+
+
 def test_the_networks_see_the_heads_turn_against_its_mean() -> None:
     avatar = lively("gaussianheadavatar")
     mean = matrix_from_6d(random_params(4).neck)
