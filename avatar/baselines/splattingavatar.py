@@ -16,13 +16,15 @@ from avatar.gaussians.apply_offsets import quaternion_product
 from avatar.gaussians.base_model import Groups
 from avatar.gaussians.uv_base_model import UVAvatar
 from avatar.head.assets import HeadAssets
-from avatar.model import FlashAvatar
 from avatar.types import Gaussians, HeadParams
 
 
 class SplattingAvatar(UVAvatar):
     unknown_to_browsers = "points that have left their texel"
-    without_effect = *FlashAvatar.without_effect, "skull_binding", "head_rotation", "mlp_width", "mlp_layers"
+    without_effect = (
+        *("upsampling", "latent_dim", "latent_grid", "mlp_width", "mlp_layers"),
+        *("skull_binding", "head_rotation"),
+    )
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__(assets, identity, config)

@@ -12,8 +12,9 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -139,13 +140,13 @@ def numbered(frames: Sequence[ListedFrame]) -> dict[int, ListedFrame]:
     number = -1
     for _, group in groupby(frames, key=lambda frame: frame.image.parent):
         inside = list(group)
-        steps = np.diff(_name_numbers([frame.image.stem for frame in inside]))
-        usual = np.median(steps) if len(steps) else 0
+        steps = [after - before for before, after in pairwise(_name_numbers([frame.image.stem for frame in inside]))]
+        usual = median(steps) if steps else 0
         number += 2 if found else 1
-        for frame, skips in zip(inside, [*(steps > usual), False], strict=True):
+        found[number] = inside[0]
+        for frame, step in zip(inside[1:], steps, strict=True):
+            number += 2 if step > usual else 1
             found[number] = frame
-            number += 2 if skips else 1
-        number -= 1
     return found
 
 

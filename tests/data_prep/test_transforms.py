@@ -39,6 +39,7 @@ def listed(**values: Any) -> ListedFrame:
         ("a/0_3 a/2_3 a/4_3 a/8_3 a/10_3 b/9_3", (0, 1, 2, 4, 5, 7)),  # every other frame, of camera 3
         ("a/1_1 a/1_2 a/9_1 a/9_2", (0, 1, 2, 3)),  # of two cameras: their times are separated elsewhere
         ("a/x a/y9 b/c", (0, 1, 3)),
+        (f"a/{10**40} a/{10**40 + 1} a/{10**40 + 9}", (0, 1, 3)),
     ],
 )
 def test_numbered_frames_lack_a_number_between_two_folders_and_where_names_skip(
