@@ -140,13 +140,18 @@ def stopping_after(frames: int, seen: list[int]) -> Iterator[Callable[[], bool]]
     yield asked
 
 
+def interrupted_after(frames: int, avatar: Avatar, clip: Clip, folder: Path) -> Path:
+    """The progress of a refinement that was interrupted."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refine_module, "interruption", lambda: stopping_after(frames, []))
+        assert refined(avatar, clip, folder / "progress") is None
+    return folder / "progress"
+
+
 def test_an_interruption_is_gone_on_from_to_the_same_bits(
     avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    progress = tmp_path / "progress"
-    with monkeypatch.context() as patch:
-        patch.setattr(refine_module, "interruption", lambda: stopping_after(4, []))
-        assert refined(avatar, wrong, progress) is None
+    progress = interrupted_after(4, avatar, wrong, tmp_path)
     assert progress.is_file() and list(tmp_path.iterdir()) == [progress]
     worked: list[int] = []
     own = refine_module._Work.refine
@@ -162,12 +167,9 @@ def test_an_interruption_is_gone_on_from_to_the_same_bits(
 
 @pytest.mark.slow
 def test_progress_of_something_else_is_not_gone_on_from(
-    avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path
 ) -> None:
-    progress = tmp_path / "progress"
-    with monkeypatch.context() as patch:
-        patch.setattr(refine_module, "interruption", lambda: stopping_after(3, []))
-        assert refined(avatar, replace(wrong, data_hash="1" * 64), progress) is None
+    progress = interrupted_after(3, avatar, replace(wrong, data_hash="1" * 64), tmp_path)
     said: list[str] = []
     again = refined(avatar, wrong, progress, said)
     assert again is not None and same(again, result) and not said
