@@ -27,7 +27,7 @@ from copy import deepcopy
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -53,10 +53,12 @@ class NdGaussians(nn.Module):
         self.root = nn.Parameter(torch.zeros(triangle_size(latent_size), num_gaussians))  # B, row by row
         self.cross = nn.Parameter(torch.zeros(3, latent_size, num_gaussians))  # A
 
-    def forward(self, latents: Float[Tensor, "N n"]) -> Slice:
-        mean_a, mean_b = self.mean.split((3, self.latent_size))
-        whitened = substitute(self.root, latents.T - mean_b)
-        position = mean_a + (self.cross * whitened).sum(dim=1)
+    def forward(self, latents: Float[Tensor, "M n"], rows: Int[Tensor, " M"] | None = None) -> Slice:
+        """`rows` are the Gaussians of the latents; None: all of them."""
+        mean, root, cross = (part if rows is None else part[..., rows] for part in (self.mean, self.root, self.cross))
+        mean_a, mean_b = mean.split((3, self.latent_size))
+        whitened = substitute(root, latents.T - mean_b)
+        position = mean_a + (cross * whitened).sum(dim=1)
         return Slice(position.T, torch.exp(-0.5 * whitened.square().sum(dim=0)))
 
     def fold(self) -> Self:

@@ -18,7 +18,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -81,9 +81,11 @@ class HyperSet(nn.Module):
         self.lower = nn.Parameter(torch.zeros(m * (m + 1) // 2, N))
         self.cross = nn.Parameter(torch.zeros(latents, m, N))
 
-    def forward(self, latents: Float[Tensor, "N n"]) -> Float[Tensor, "N m"]:
-        mean_a, mean_b = self.mean[: self.attribute_size], self.mean[self.attribute_size :]
-        return (mean_a - _Pull.apply(latents.T - mean_b, self.lower, self.cross)).T  # pyright: ignore
+    def forward(self, latents: Float[Tensor, "M n"], rows: Int[Tensor, " M"] | None = None) -> Float[Tensor, "M m"]:
+        """`rows` are the Gaussians of the latents; None: all of them."""
+        mean, lower, cross = (part if rows is None else part[..., rows] for part in (self.mean, self.lower, self.cross))
+        mean_a, mean_b = mean[: self.attribute_size], mean[self.attribute_size :]
+        return (mean_a - _Pull.apply(latents.T - mean_b, lower, cross)).T  # pyright: ignore
 
 
 class HyperSets(nn.Module):

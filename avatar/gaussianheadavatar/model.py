@@ -13,27 +13,28 @@ from frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, normalize
 
-from avatar.baselines.ndgs import NdGaussians
 from avatar.compute.device import to_device
 from avatar.compute.memory import Need
 from avatar.config import ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
-from avatar.gaussianheadavatar.hyper_sets import Attributes, HyperSets
+from avatar.gaussianheadavatar.hyper_sets import Attributes
 from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
+from avatar.gaussianheadavatar.initial_motion import MeshMotion, fit_motion
 from avatar.gaussianheadavatar.networks import ATTRIBUTES, Blended, Networks, Outputs, encode, nearness
 from avatar.gaussianheadavatar.start_points import landmarks
 from avatar.gaussianheadavatar.upsampler import Upsampler
 from avatar.gaussians.base_model import CONDITION_EXTRAS, Avatar, Groups
+from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import matrix_from_6d, nearest_rotation
@@ -112,10 +113,43 @@ class GaussianHeadAvatar(Avatar):
         start = initial_gaussians(self.head, texels, shown, len(self), self.centre, self.unit)
         self.positions.copy_(start.positions)
         self.log_scales.copy_(start.log_scales)
-        self.features.copy_(first_features((start.positions - self.centre) / self.unit))
+        self.features.copy_(first_features(self.normalized(start.positions)))
         first = self.features.new_zeros(len(self), channels_of(config))
         first[:, :3] = start.colours if colours else 0.5
         self.initialize_colours(first, shown)
+        self.initialize_motion(Embedding(self.head.assets, texels), [frame.params for frame in shown])
+
+    def initialize_motion(self, mesh: Embedding, params: list[HeadParams]) -> None:
+        """Fit the deformation near the face to the mesh's, with the head turned as on average."""
+        expression, pose = self.networks.expression.deformation, self.networks.pose.deformation
+        if self.hyper is None:  # else the pose's latents move nothing yet
+            for parameter in pose.layers[-1].parameters():
+                parameter.zero_()
+        near = self.nearness()
+        rows = near.nonzero()[:, 0]
+        near, codes = near[rows, None], encode(self.normalized(self.positions[rows]))
+        still = (1.0 - near) * pose(torch.cat((codes, encode(codes.new_zeros(6)).expand(len(codes), -1)), dim=-1))
+
+        def moved(heads: Sequence[HeadParams], chosen: Int[Tensor, "H P"]) -> tuple[Tensor, Tensor | None]:
+            theta = torch.stack([self.condition(params) for params in heads])
+            chosen, theta = chosen.flatten(), theta.repeat_interleave(chosen.shape[1], dim=0)
+            values = near[chosen] * expression(torch.cat((codes[chosen], theta), dim=-1)) + still[chosen]
+            shift, density = self.deformed(values, rows[chosen])
+            return SHIFT * self.unit * shift, density
+
+        target = MeshMotion(self.head, mesh, self.positions[rows])
+        fit_motion(moved, target, params, len(rows), list(expression.parameters()), self.motion_parameters())
+        self.zero_grad()
+
+    def deformed(
+        self, values: Float[Tensor, "M D"], rows: Int[Tensor, " M"] | None = None
+    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"] | None]:
+        """What the deformation networks' outputs are for Gaussians `rows`: shifts, and factors of the opacity."""
+        return values, None
+
+    def motion_parameters(self) -> list[nn.Parameter]:
+        """Of the Gaussians: what moves them beside the deformation networks."""
+        return []
 
     def initialize_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
         """Fit the colour networks to these, whatever the frame's parameters."""
@@ -127,7 +161,7 @@ class GaussianHeadAvatar(Avatar):
             params = frames[step % len(frames)].params
             given = self.condition(params), self.pose(params, None)
             with torch.enable_grad():
-                places = (self.positions[rows] - self.centre) / self.unit
+                places = self.normalized(self.positions[rows])
                 blended = self.networks(places, self.features[rows], *given, near[rows])
                 loss = (blended.colour - colours[rows]).square().mean()
                 optimizer.zero_grad()
@@ -136,9 +170,10 @@ class GaussianHeadAvatar(Avatar):
         self.zero_grad()
 
     def forward(self, params: HeadParams, vertices=None, rotation=None) -> FeatureGaussians:
-        places = (self.positions - self.centre) / self.unit
         given = self.condition(params), self.pose(params, rotation)
-        changes = self.attributes(self.networks(places, self.features, *given, self.nearness()))
+        changes = self.attributes(
+            self.networks(self.normalized(self.positions), self.features, *given, self.nearness())
+        )
         means = self.positions + SHIFT * self.unit * changes.position
         quats = normalize(self.quats + CHANGE * changes.rotation, dim=-1)
         scales = torch.exp(self.log_scales + CHANGE * changes.scale)
@@ -153,7 +188,11 @@ class GaussianHeadAvatar(Avatar):
 
     def nearness(self) -> Float[Tensor, " N"]:
         """How far each Gaussian follows the expression; the others follow the pose."""
-        return nearness((self.positions.detach() - self.centre) / self.unit, self.places, NEAR, FAR)
+        return nearness(self.normalized(self.positions.detach()), self.places, NEAR, FAR)
+
+    def normalized(self, points: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
+        """Half head lengths from the head's centre, of metres at rest."""
+        return (points - self.centre) / self.unit
 
     def pose(self, params: HeadParams, rotation: Float[Tensor, "3 3"] | None) -> Float[Tensor, " 6"]:
         """The pose's input: how the head is turned, against its mean, and the neck, both as axis times angle."""
@@ -200,18 +239,21 @@ class GaussianHeadAvatar(Avatar):
     def parameter_groups(self, trainer: TrainerConfig) -> Groups:
         """The published rates; a training of fewer steps has higher ones."""
         boost = min(math.sqrt(STEPS / trainer.iterations), MOST_BOOST)
-        networks = [*self.networks.parameters(), *self.upsampler.parameters()]
-        groups: Groups = {
+        branches = self.networks.expression, self.networks.pose
+        networks = [p for branch in branches for p in branch.deformation.parameters()]
+        motion = [*networks, *self.motion_parameters()]
+        own = [] if self.hyper is None else list(self.hyper.parameters())
+        learned = [*self.networks.parameters(), *self.upsampler.parameters(), *own]
+        moving = {id(parameter) for parameter in motion}
+        return {
             "positions": ([self.positions], boost * POINT_RATE * self.unit),
             "features": ([self.features], boost * POINT_RATE),
             "logits": ([self.opacity_logits], boost * OPACITY_RATE),
             "scale": ([self.log_scales], boost * SCALE_RATE),
             "rotation": ([self.quats], boost * ROTATION_RATE),
-            "network": (networks, boost * NETWORK_RATE),
+            "motion": (motion, math.sqrt(boost) * NETWORK_RATE),  # which starts as the mesh's
+            "network": ([parameter for parameter in learned if id(parameter) not in moving], boost * NETWORK_RATE),
         }
-        if self.hyper is not None:
-            groups["heads"] = list(self.hyper.parameters()), boost * NETWORK_RATE
-        return groups
 
     def zoom_limits(self, trainer: TrainerConfig) -> tuple[float, float] | None:
         """In as many steps as published; 600 steps end worse with it."""
@@ -227,49 +269,6 @@ class GaussianHeadAvatar(Avatar):
             Need("the upsampler's images", round(4 * values), "--size or model.mlp_width"),
             Need("the networks' layers", 4 * LAYERS * config.mlp_width * gaussians, "model.uv_size or model.mlp_width"),
         ]
-
-
-class HyperGaussianHeadAvatar(GaussianHeadAvatar):
-    """With HyperGaussians: the networks give five latents, which condition what the networks gave before."""
-
-    without_effect = WITHOUT_EFFECT
-
-    @staticmethod
-    def make_hyper(config: ModelConfig, N: int) -> nn.Module:
-        return HyperSets(N, channels_of(config), config.latent_dim)
-
-    @staticmethod
-    def outputs(config: ModelConfig) -> Outputs:
-        n = config.latent_dim
-        return Outputs(n, n, 3 * n)
-
-    def attributes(self, blended: Blended) -> Attributes:
-        assert isinstance(self.hyper, HyperSets)
-        return self.hyper(*blended)
-
-    def initialize_colours(self, colours: Float[Tensor, "N C"], frames: list[Frame]) -> None:
-        assert isinstance(self.hyper, HyperSets)
-        self.hyper.start_colour(colours)
-
-
-class NdgsHeadAvatar(GaussianHeadAvatar):
-    """With N-dimensional Gaussians, which the latent moves and fades; colours and shapes are the networks' own."""
-
-    without_effect = WITHOUT_EFFECT
-
-    @staticmethod
-    def make_hyper(config: ModelConfig, N: int) -> nn.Module:
-        return NdGaussians(N, config.latent_dim)
-
-    @staticmethod
-    def outputs(config: ModelConfig) -> Outputs:
-        return Outputs(config.latent_dim, channels_of(config), ATTRIBUTES)
-
-    def attributes(self, blended: Blended) -> Attributes:
-        assert self.hyper is not None
-        moved = self.hyper(blended.deformation)
-        own = super().attributes(blended._replace(deformation=moved.position))
-        return own._replace(density=moved.density)
 
 
 def channels_of(config: ModelConfig) -> int:

@@ -13,7 +13,8 @@ from avatar.baselines.ndgs import NdgsAvatar
 from avatar.baselines.splattingavatar import SplattingAvatar
 from avatar.config import ModelConfig
 from avatar.errors import UserError
-from avatar.gaussianheadavatar.model import GaussianHeadAvatar, HyperGaussianHeadAvatar, NdgsHeadAvatar
+from avatar.gaussianheadavatar.latent_models import HyperGaussianHeadAvatar, NdgsHeadAvatar
+from avatar.gaussianheadavatar.model import GaussianHeadAvatar
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.model import FlashAvatar, HyperGaussianAvatar
