@@ -13,7 +13,7 @@ from frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from avatar.config import ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
 from avatar.gaussianheadavatar.hyper_sets import Attributes
 from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
-from avatar.gaussianheadavatar.initial_motion import MeshMotion, fit_motion
+from avatar.gaussianheadavatar.initial_motion import MeshMotion, fit_motion, random_heads
 from avatar.gaussianheadavatar.networks import ATTRIBUTES, Blended, Networks, Outputs, encode, nearness
 from avatar.gaussianheadavatar.start_points import landmarks
 from avatar.gaussianheadavatar.upsampler import Upsampler
@@ -130,15 +130,15 @@ class GaussianHeadAvatar(Avatar):
         near, codes = near[rows, None], encode(self.normalized(self.positions[rows]))
         still = (1.0 - near) * pose(torch.cat((codes, encode(codes.new_zeros(6)).expand(len(codes), -1)), dim=-1))
 
-        def moved(heads: Sequence[HeadParams], chosen: Int[Tensor, "H P"]) -> tuple[Tensor, Tensor | None]:
-            theta = torch.stack([self.condition(params) for params in heads])
-            chosen, theta = chosen.flatten(), theta.repeat_interleave(chosen.shape[1], dim=0)
+        def moved(theta: Float[Tensor, "M C"], chosen: Int[Tensor, " M"]) -> tuple[Tensor, Tensor | None]:
             values = near[chosen] * expression(torch.cat((codes[chosen], theta), dim=-1)) + still[chosen]
             shift, density = self.deformed(values, rows[chosen])
             return SHIFT * self.unit * shift, density
 
-        target = MeshMotion(self.head, mesh, self.positions[rows])
-        fit_motion(moved, target, params, len(rows), list(expression.parameters()), self.motion_parameters())
+        heads = random_heads(params)
+        target = MeshMotion(self.head, mesh, self.positions[rows], heads)
+        conditions = torch.stack([self.condition(head) for head in heads])
+        fit_motion(moved, target, conditions, list(expression.parameters()), self.motion_parameters())
         self.zero_grad()
 
     def deformed(
