@@ -16,7 +16,7 @@ from torch import Tensor
 
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.head.model import HeadModel
-from avatar.types import HeadParams
+from avatar.types import IDENTITY_6D, HeadParams
 
 STEPS, POINTS = 500, 4096  # points of each step, each with a head at random
 HEADS = 1024
@@ -46,21 +46,22 @@ class MeshMotion:
 
 
 def random_heads(params: Sequence[HeadParams]) -> list[HeadParams]:
-    """Between two of the frames or a little beyond, for jaw, eyes, lids and expression each on its own, with noise.
+    """Between two of the frames or a little beyond, for jaw, eyes, lids and expression each on its own, with noise;
+    the neck is at rest, since the pose's network moves what follows it.
 
     An expression coefficient that the frames leave as it is gets as much noise as the others on average.
     """
     spread = torch.stack([p.condition() for p in params]).std(dim=0, correction=0)
     of_expression = spread[: len(params[0].expression)]
     of_expression.clamp_(min=float(of_expression.square().mean().sqrt()))
-    heads = []
+    heads, rest = [], replace(params[0], neck=params[0].neck.new_tensor(IDENTITY_6D))
     for _ in range(HEADS):
         drawn = {}
         for name in ("expression", "jaw", "eyes", "eyelids"):
             first, second = (getattr(params[i], name) for i in torch.randint(len(params), (2,)).tolist())
             drawn[name] = torch.lerp(first, second, float(torch.empty(()).uniform_(-BEYOND, 1.0 + BEYOND)))
-        condition = replace(params[0], **drawn).condition()
-        heads.append(params[0].with_condition(condition + SPREAD * spread * torch.randn_like(spread)))
+        condition = replace(rest, **drawn).condition()
+        heads.append(rest.with_condition(condition + SPREAD * spread * torch.randn_like(spread)))
     return heads
 
 

@@ -6,8 +6,8 @@
 Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
 
 Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. docs/bench/cameras.md lists
-what differs from them: there is no first stage, so `initialize_from` takes geometry from mesh and masks, and first colours
-from frames.
+what differs from them: there is no first stage, so `initialize_from` takes geometry and motion from mesh and masks, and
+first colours from frames.
 """
 
 from __future__ import annotations
