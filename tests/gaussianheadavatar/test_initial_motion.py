@@ -40,6 +40,7 @@ def test_random_heads_mix_jaw_expression_and_lids_of_different_frames_and_leave_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(initial_motion, "HEADS", 200)
+    monkeypatch.setattr(initial_motion, "SPREAD", 0.0)
     frames = [random_params(), rest_params()]
     heads = random_heads(frames)
     assert all(torch.equal(head.neck, frames[1].neck) for head in heads)
