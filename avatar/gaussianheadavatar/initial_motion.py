@@ -46,10 +46,10 @@ class MeshMotion:
 
 
 def random_heads(params: Sequence[HeadParams]) -> list[HeadParams]:
-    """Between two of the frames or a little beyond, for jaw, eyes, lids and expression each on its own, with noise;
-    the neck is at rest, since the pose's network moves what follows it.
+    """Heads between two frames or a little beyond; jaw, eyes, lids and expression each on its own, with noise.
 
-    An expression coefficient that the frames leave as it is gets as much noise as the others on average.
+    The neck is at rest: the pose's network moves what follows it. An expression coefficient that the frames leave as it is
+    gets as much noise as the others on average.
     """
     spread = torch.stack([p.condition() for p in params]).std(dim=0, correction=0)
     of_expression = spread[: len(params[0].expression)]

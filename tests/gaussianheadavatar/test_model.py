@@ -99,7 +99,7 @@ def test_another_background_shows_where_the_avatar_is_not() -> None:
     assert 0.1 < float(white.alpha.detach().mean()) < 1.0
 
 
-@pytest.mark.parametrize(("alpha", "share"), [(0.0, 0.0), (0.01, 0.1), (0.1, 1.0), (0.9, 1.0)])
+@pytest.mark.parametrize(("alpha", "share"), [(0.0, 0.0), (0.03, 0.1), (0.3, 1.0), (0.9, 1.0)])
 def test_the_picture_fades_into_the_background_where_splats_hardly_cover_it(alpha: float, share: float) -> None:
     avatar = lively("gaussianheadavatar")
     small = avatar.splatted(avatar(random_params()), CAMERA)
