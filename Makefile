@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 # On Linux the package index's torch is a CUDA build of several GB. A CPU-only machine can save them with
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
+# Python files are compiled when they are imported: to compile all that is installed takes half a minute.
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
 NATIVE := CMakeLists.txt $(shell find avatar/csrc -name '*.cpp' -o -name '*.h')
 DEMO ?= demo
 STRESS_EXAMPLES ?= 100000

@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 python=.venv/bin/python
 # shellcheck disable=SC2086
-if ! said=$("$python" -m pip install --quiet --disable-pip-version-check -c constraints.txt ${PIP_FLAGS:-} triton 2>&1); then
+if ! said=$("$python" -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt ${PIP_FLAGS:-} triton 2>&1); then
   echo "gpu-check: skipped, Triton cannot be installed here: $(tail -n 1 <<<"$said")"
   exit 0
 fi

@@ -13,7 +13,7 @@ tar xf "$work"/dist/*.tar.gz -C "$work/source" --strip-components=1
 "$checkout/.venv/bin/python" -m build --wheel --no-isolation --outdir "$work/dist" "$work/source"
 "$python" -m venv "$work/env"
 # shellcheck disable=SC2086
-"$work/env/bin/pip" install --quiet --disable-pip-version-check -c "$checkout/constraints.txt" ${PIP_FLAGS:-} "$work"/dist/*.whl
+"$work/env/bin/pip" install --quiet --no-compile --disable-pip-version-check -c "$checkout/constraints.txt" ${PIP_FLAGS:-} "$work"/dist/*.whl
 
 cd "$work"
 export AVATAR_CACHE=$work/cache
