@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from select import select
 from typing import Any
 
 import numpy as np
@@ -169,15 +171,22 @@ def test_the_minutes_count_every_part() -> None:
     assert create.training_seconds(config, 0, 1000, 800, "cuda") < alone
 
 
+# For each line, a folder: a process that makes it, its number and how it ended. It has imported all before.
 SCRIPT = f"""
-import sys
+import os, sys
 sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1] / "helpers")]!r}
 from pathlib import Path
-import pytest
+import pytest, torch._dynamo
 from test_create import GOOD, install_small
 from avatar.cli import main
-install_small(pytest.MonkeyPatch(), Path(sys.argv[1]), GOOD)
-sys.exit(main(sys.argv[2:]))
+tracked, video = Path(sys.argv[1]), sys.argv[2]
+install_small(pytest.MonkeyPatch(), tracked, GOOD)
+for line in sys.stdin:
+    if not (child := os.fork()):
+        os.dup2(2, 1)
+        sys.exit(main(["create", video, "--head", str(tracked / "head_model"), "--out", line.strip()]))
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
 # What a command has written when it is killed, in this order.
 MOMENTS = (
@@ -189,28 +198,33 @@ MOMENTS = (
 
 @pytest.mark.slow
 def test_killed_again_and_again_it_makes_the_same_page(video: Path, tracked_folder: Path) -> None:
-    out, whole = video.parent / "killed", video.parent / "whole"
-    head = tracked_folder / "head_model"
+    out, whole, log = video.parent / "killed", video.parent / "whole", video.parent / "log.txt"
+    command = [sys.executable, "-c", SCRIPT, str(tracked_folder), str(video)]
+    with (
+        log.open("w") as said,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, bufsize=0) as starter,
+    ):
+        assert starter.stdin and starter.stdout
 
-    def begin(folder: Path) -> subprocess.Popen[bytes]:
-        words = ["create", video, "--head", head, "--out", folder]
-        command = [sys.executable, "-c", SCRIPT, tracked_folder, *words]
-        return subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        def begin(folder: Path) -> int:
+            starter.stdin.write(f"{folder}\n".encode())
+            return int(starter.stdout.readline())
 
-    killed = 0
-    for moment in MOMENTS:
-        if any(out.glob(moment)):
-            continue  # the last one got so far
-        process = begin(out)
-        while process.poll() is None and not any(out.glob(moment)):
-            time.sleep(0.001)
-        process.kill()
-        output, _ = process.communicate()
-        killed += process.returncode == -signal.SIGKILL
-        assert process.returncode in (0, -signal.SIGKILL), output.decode()
-    assert killed >= 6
-    for folder in (out, whole):
-        process = begin(folder)
-        output, _ = process.communicate(timeout=300)
-        assert process.returncode == 0, output.decode()
+        killed = 0
+        for moment in MOMENTS:
+            if any(out.glob(moment)):
+                continue  # the last one got so far
+            process = begin(out)
+            while not any(out.glob(moment)) and not select([starter.stdout], [], [], 0.001)[0]:
+                pass
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+            status = int(starter.stdout.readline())
+            killed += status == -signal.SIGKILL
+            assert status in (0, -signal.SIGKILL), log.read_text()
+        assert killed >= 6
+        for folder in (out, whole):
+            begin(folder)
+            assert int(starter.stdout.readline()) == 0, log.read_text()
+        starter.stdin.close()
     assert (out / "avatar.html").read_bytes() == (whole / "avatar.html").read_bytes()
