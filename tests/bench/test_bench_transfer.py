@@ -12,10 +12,15 @@ from avatar.demo.head import demo_head
 from avatar.demo.subject import make_subject, tracking_bias
 from avatar.errors import UserError
 
+SMALL = transfer.Scale(size=64, target_frames=24, driver_frames=6, iterations=40)
+
 
 @pytest.mark.slow
-def test_quick_run_prints_a_table_and_writes_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quick_run_prints_a_table_and_writes_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Too small to rank the transfers: that takes the usual run."""
+    monkeypatch.setattr(transfer, "QUICK", SMALL)
     assert main(["bench", "transfer", "--quick", "--out", str(tmp_path)]) == 0
     written = json.loads((tmp_path / "bench_transfer.json").read_text())
     rows = {row["transfer"]: row for row in written["rows"]}
@@ -45,7 +50,7 @@ def test_the_bias_is_a_persons_own_and_shape_makes_up_for_most_of_it(tmp_path: P
 
 @pytest.mark.slow
 def test_avatars_of_disturbed_and_refined_tracking_are_driven_too(tmp_path: Path) -> None:
-    rows = transfer.measure(transfer.QUICK, tmp_path, ["trainer.iterations=40"], full=True)
+    rows = transfer.measure(SMALL, tmp_path, ["trainer.iterations=10"], full=True)
     by_tracking = {row.tracking: row for row in rows if row.transfer == "relative"}
     assert tuple(by_tracking) == transfer.TRACKINGS
     assert len({row.figures.psnr for row in by_tracking.values()}) == 3

@@ -64,15 +64,15 @@ def test_steps_have_the_losses_of_the_cpu(
     tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Across the steps where a spherical-harmonics degree, the perceptual term and a checkpoint come in."""
-    monkeypatch.setattr(loss_module, "SH_INTERVAL", 4)
-    steps = ("trainer.iterations=12", "trainer.checkpoint_every=5")
+    monkeypatch.setattr(loss_module, "SH_INTERVAL", 3)
+    steps = ("trainer.iterations=8", "trainer.checkpoint_every=5")
     _, expected = trained(tracked_folder, tmp_path / "cpu", *steps, on_cpu=True)
     avatar, found = trained(tracked_folder, tmp_path / "gpu", *steps)
-    assert len(found) == len(expected) == 12
+    assert len(found) == len(expected) == 8
     assert found == pytest.approx(expected, rel=1e-4)
     assert avatar.device.type == DEVICE.type
     saved = newest_checkpoint(tmp_path / "gpu")
-    assert saved.step == 12 and saved.meta["device"] == DEVICE.type
+    assert saved.step == 8 and saved.meta["device"] == DEVICE.type
     assert all(tensor.is_cpu for tensor in saved.tensors.values())
 
 
@@ -133,10 +133,10 @@ def test_a_step_that_is_finite_when_it_is_repeated_stops_all_the_same(tracked_fo
 def test_a_checkpoint_of_the_gpus_path_goes_on_there_to_the_same_bits_and_on_the_cpu_to_rounding(
     tracked_folder: Path, tmp_path: Path
 ) -> None:
-    steps = ("trainer.iterations=6", "trainer.checkpoint_every=3")
+    steps = ("trainer.iterations=4", "trainer.checkpoint_every=2")
     whole, _ = trained(tracked_folder, tmp_path / "run", *steps)
     halfway = load_checkpoint(list_checkpoints(tmp_path / "run" / "checkpoints")[0])
-    assert halfway.step == 3
+    assert halfway.step == 2
     config = small_config(*TINY, *steps)
     _, subject, assets = open_small(tracked_folder, config)
     term = choose_perceptual(config.trainer, lambda _: None, device=DEVICE)
