@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -31,7 +33,8 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     if not interpreted():
         yield
         return
-    from triton.runtime.interpreter import InterpretedFunction, interpreter_builder
+    import triton.language as tl
+    from triton.runtime import interpreter
 
     from avatar.gaussians import fused_gpu
     from avatar.losses import gpu as losses_gpu
@@ -46,18 +49,22 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     patch.setattr(losses_gpu, "LANES", 8192)
     patch.setattr(adam_gpu, "LANES", 1 << 16)
     # Its search for integers that overflow takes a quarter of the time, and tells nobody unless Triton is being debugged.
-    patch.setattr(interpreter_builder, "options", replace(interpreter_builder.options, sanitize_overflow=False))
-    call = InterpretedFunction.__call__
+    builder = interpreter.interpreter_builder
+    patch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
+    numpy_type = cache(interpreter._get_np_dtype)
 
-    def call_without_patching(self: Any, *arguments: Any, **named: Any) -> Any:
-        """The kernel that calls has replaced Triton's functions already, for each of ours as for itself."""
-        if self.fn.__module__.startswith("avatar.kernels"):
-            return self.rewrite()(*arguments, **named)
-        return call(self, *arguments, **named)
+    def numpy_type_of(kind: Any) -> np.dtype:
+        return np.dtype(np.uint64) if kind.scalar.is_ptr() else numpy_type(kind.scalar)
 
-    patch.setattr(InterpretedFunction, "__call__", call_without_patching)
-    with np.errstate(all="ignore"):  # lanes that are masked out later may overflow
-        yield
+    patch.setattr(interpreter, "_get_np_dtype", numpy_type_of)
+    # Triton's functions are replaced once, and not at each launch and call.
+    replaced = interpreter._patch_lang(SimpleNamespace(__globals__={"tl": tl, "core": tl.core}))
+    patch.setattr(interpreter, "_patch_lang", lambda _: interpreter._LangPatchScope())
+    try:
+        with np.errstate(all="ignore"):  # lanes that are masked out later may overflow
+            yield
+    finally:
+        replaced.restore()
 
 
 @contextmanager
