@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import group_norm, interpolate
+from torch.nn.functional import batch_norm, interpolate
 
 CAPACITY = 4  # times as many channels at the small size
 
@@ -24,8 +24,9 @@ class DoubleConvolution(nn.Module):
     def forward(self, image: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 D H W"]:
         for convolution in self.convolutions:
             image = convolution(image)
-            # Instance norm: a group for each channel. Unlike instance_norm it keeps the order in memory.
-            image = torch.relu_(group_norm(image, image.shape[1]))
+            # Instance norm, as there is one image. Unlike instance_norm it keeps the order in memory, and backward it
+            # takes a third of the time of group_norm.
+            image = torch.relu_(batch_norm(image, None, None, training=True))
         return image
 
 
