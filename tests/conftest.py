@@ -34,6 +34,8 @@ def _short_training() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("avatar.train.loss.SH_INTERVAL", 3)
         patch.setattr("avatar.train.log.LOG_EVERY", 2)
+        patch.setattr("avatar.gaussianheadavatar.initial_surface.STEPS", 10)
+        patch.setattr("avatar.gaussianheadavatar.initial_gaussians.CELLS", 24)
         patch.setattr("avatar.gaussianheadavatar.initial_motion.STEPS", 10)
         patch.setattr("avatar.gaussianheadavatar.initial_motion.HEADS", 20)
         yield

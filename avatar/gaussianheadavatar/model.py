@@ -6,8 +6,8 @@
 Lengths of the networks' side are in half head lengths, as in the paper, whose heads are 2 long.
 
 Source: Xu et al., Gaussian Head Avatar (CVPR 2024); HyperGaussians (CVPR 2026), supplement. docs/bench/cameras.md lists
-what differs from them: there is no first stage, so `initialize_from` takes geometry and motion from mesh and masks, and
-first colours from frames.
+what differs from them: `initialize_from` stands for the first stage. It takes motion from the mesh, and geometry and first
+colours from frames.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class GaussianHeadAvatar(Avatar):
 
     @torch.no_grad()
     def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
-        """Put the Gaussians on the mesh, the masks' visual hull and into the mouth. Raises UserError for masks that have
+        """Put the Gaussians on the mesh, on the surface beyond it and into the mouth. Raises UserError for masks that have
         nothing in common."""
         config, shown = self.config, list(frames)
         texels = bound_texels(self.head.assets, self.head.assets, config.uv_size, config.uv_detail)

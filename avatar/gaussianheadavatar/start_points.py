@@ -1,4 +1,4 @@
-"""Geometry to start from: the surface that the masks of many views leave, points in the mouth, and their first sizes."""
+"""Geometry to start from: what the masks of many views leave, points in the mouth, and their first sizes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from skimage.measure import marching_cubes
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from avatar.gaussianheadavatar.marching_tetrahedra import Grid
 from avatar.gaussians.mesh_embedding import knn_scales
 from avatar.types import Camera
 
@@ -21,26 +21,19 @@ JITTER = 1e-3  # of the points' extent, between points that are taken twice
 HALVINGS = 20  # of the search for a voxel's size
 
 
-def visual_hull(
-    views: Sequence[View], low: Float[Tensor, 3], high: Float[Tensor, 3], cells: int = 64, agree: float = 0.9
-) -> Float[Tensor, "M 3"]:
-    """The surface of what lies in the masks of at least the share `agree` of the views that see it; metres.
+def visual_hull(views: Sequence[View], grid: Grid, agree: float = 0.9) -> Bool[Tensor, "X Y Z"]:
+    """Which points of the grid lie in the masks of more than the share `agree` of the views that see them.
 
-    The box from `low` to `high`, in the head's own space, is cut into cubes, `cells` along its longest side; what
-    fewer than half of the views see is outside. Source of the surface: marching cubes (Lorensen and Cline, 1987).
-    Raises ValueError where the masks leave nothing.
+    What fewer than half of the views see is outside, as is the grid's border. Raises ValueError where the masks leave
+    nothing.
     """
-    size = float((high - low).max()) / cells
-    counts = torch.ceil((high - low) / size - 1e-4).long().tolist()
-    axes = [low[i] + size * (torch.arange(count) + 0.5) for i, count in enumerate(counts)]
-    places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
-    share = _share_inside(views, places).reshape(counts)
-    if not bool((share > agree).any()):
+    inside = (_share_inside(views, grid.points()) > agree).reshape(grid.shape)
+    border = torch.ones_like(inside)
+    border[1:-1, 1:-1, 1:-1] = False
+    inside &= ~border
+    if not bool(inside.any()):
         raise ValueError(f"no place in the box lies in the masks of {agree:.0%} of the views")
-    # A layer outside of the box closes the surface.
-    volume = np.pad(share.numpy(), 1)
-    vertices = marching_cubes(volume, level=agree)[0]
-    return low + size * (torch.from_numpy(vertices.astype(np.float32)) - 0.5)
+    return inside
 
 
 def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:

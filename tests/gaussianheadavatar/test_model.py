@@ -120,7 +120,7 @@ def test_the_networks_see_the_heads_turn_against_its_mean() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_starts_on_the_mesh_and_on_the_hull_in_the_colours_of_training_frames(
+def test_it_starts_on_the_mesh_and_on_the_surface_in_the_colours_of_training_frames(
     name: str, tracked_folder: Path
 ) -> None:
     config = small_config(f"model={name}")

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from avatar.gaussianheadavatar.marching_tetrahedra import Grid
 from avatar.gaussianheadavatar.start_points import (
     knn_log_scales,
     landmarks,
@@ -19,7 +20,8 @@ from avatar.types import Camera
 
 CENTRE = torch.tensor([0.01, -0.02, 0.015])
 RADIUS, SIZE = 0.1, 160
-LOW, HIGH = torch.full((3,), -0.15), torch.tensor([0.15, 0.15, 0.18])
+GRID = Grid(torch.full((3,), -0.15), 0.01, (31, 31, 34))
+Views = list[tuple[Camera, torch.Tensor]]
 
 
 def all_around(count: int) -> torch.Tensor:
@@ -47,66 +49,58 @@ def sees(camera: Camera) -> torch.Tensor:
     return ((centre - (rays @ centre)[..., None] * rays).norm(dim=-1) <= RADIUS).float()
 
 
-def sphere_views(count: int = 12) -> list[tuple[Camera, torch.Tensor]]:
+def sphere_views(count: int = 12) -> Views:
     cameras = [camera_at(0.8 * direction) for direction in all_around(count)]
     return [(camera, sees(camera)) for camera in cameras]
 
 
-def distances(vertices: torch.Tensor) -> torch.Tensor:
-    return (vertices - CENTRE).norm(dim=1)
+def hull_distances(views: Views, agree: float = 0.9) -> tuple[torch.Tensor, torch.Tensor]:
+    """From the sphere's centre: of the points in the hull, and of the others."""
+    inside = visual_hull(views, GRID, agree).flatten()
+    away = (GRID.points() - CENTRE).norm(dim=1)
+    return away[inside], away[~inside]
 
 
 @pytest.mark.parametrize("agree", [0.95, 0.9])
 def test_the_hull_of_a_sphere_is_the_sphere(agree: float) -> None:
-    cells = 32
-    vertices = visual_hull(sphere_views(), LOW, HIGH, cells, agree)
-    cell = 0.33 / cells
-    found = distances(vertices)
-    assert float(found.min()) > RADIUS - cell and float(found.max()) < RADIUS + cell
-    directions = normalize(vertices - CENTRE, dim=1)
-    assert float((all_around(100) @ directions.T).amax(dim=1).min()) > 0.98  # it is there all around
+    inside, outside = hull_distances(sphere_views(), agree)
+    assert float(inside.max()) < RADIUS + GRID.cell and float(outside.min()) > RADIUS - GRID.cell
 
 
 def test_a_wrong_mask_is_outvoted() -> None:
     views = sphere_views()
-    right = visual_hull(views, LOW, HIGH, 32, 0.8)
     views[4] = views[4][0], torch.zeros(SIZE, SIZE)
-    wrong = visual_hull(views, LOW, HIGH, 32, 0.8)
-    cell = 0.33 / 32
-    assert float(distances(wrong).min()) > RADIUS - cell and float(distances(wrong).max()) < RADIUS + 2 * cell
-    assert abs(float(distances(wrong).mean() - distances(right).mean())) < 0.5 * cell
+    inside, outside = hull_distances(views, 0.8)
+    assert float(inside.max()) < RADIUS + 2 * GRID.cell and float(outside.min()) > RADIUS - GRID.cell
     with pytest.raises(ValueError, match="100% of the views"):
-        visual_hull(views, LOW, HIGH, 32, 0.999)
+        visual_hull(views, GRID, 0.999)
 
 
 def test_views_that_do_not_see_a_place_do_not_vote() -> None:
     views = sphere_views()
     away = camera_at(torch.tensor([0.0, 0.0, -0.8]))
     behind = Camera(away.R_cam_world, torch.tensor([0.0, 0.0, -0.8]), 260.0, 260.0, 80.0, 80.0, SIZE, SIZE)
-    expected = visual_hull(views, LOW, HIGH, 24)
-    found = visual_hull([*views, (behind, torch.zeros(SIZE, SIZE))], LOW, HIGH, 24)
-    assert torch.equal(found, expected)
+    expected = visual_hull(views, GRID)
+    assert torch.equal(visual_hull([*views, (behind, torch.zeros(SIZE, SIZE))], GRID), expected)
     with pytest.raises(ValueError, match="no place in the box"):
-        visual_hull([(behind, torch.ones(SIZE, SIZE))], LOW, HIGH, 24)
+        visual_hull([(behind, torch.ones(SIZE, SIZE))], GRID)
 
 
 def test_a_mask_may_have_another_size_than_the_camera() -> None:
     views = [(camera.resized(2 * SIZE, 2 * SIZE), mask) for camera, mask in sphere_views()]
-    torch.testing.assert_close(visual_hull(views, LOW, HIGH, 24), visual_hull(sphere_views(), LOW, HIGH, 24))
+    assert torch.equal(visual_hull(views, GRID), visual_hull(sphere_views(), GRID))
 
 
-def test_a_box_that_is_full_has_the_box_as_its_hull() -> None:
+def test_a_grid_that_the_masks_fill_is_the_hull_but_for_its_border() -> None:
     views = [(camera, torch.ones(SIZE, SIZE)) for camera, _ in sphere_views()]
-    low, high = torch.tensor([-0.05, -0.04, -0.03]), torch.tensor([0.05, 0.04, 0.02])
-    vertices = visual_hull(views, low, high, 20)
-    torch.testing.assert_close(vertices.amin(dim=0), low, rtol=0, atol=0.0025)
-    torch.testing.assert_close(vertices.amax(dim=0), high, rtol=0, atol=0.0025)
+    hull = visual_hull(views, Grid(torch.full((3,), -0.04), 0.01, (9, 8, 7)))
+    assert bool(hull[1:-1, 1:-1, 1:-1].all()) and int(hull.sum()) == 7 * 6 * 5
 
 
 def test_without_masks_there_is_no_visual_hull() -> None:
     views = [(camera, torch.zeros_like(mask)) for camera, mask in sphere_views()]
     with pytest.raises(ValueError, match="no place in the box lies in the masks of 90% of the views"):
-        visual_hull(views, LOW, HIGH, 16)
+        visual_hull(views, GRID)
 
 
 @pytest.mark.parametrize("count", [1, 7, 500, 4999, 5000])
