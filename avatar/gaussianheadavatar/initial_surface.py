@@ -53,8 +53,9 @@ def fit_surface(
     distances, colours = start.clone().requires_grad_(), torch.full((len(start), 3), 0.5, requires_grad=True)
     optimizer = torch.optim.Adam([distances, colours], RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    generator = torch.Generator().manual_seed(0)
     for _ in tqdm(range(STEPS), desc="surface", unit="step", dynamic_ncols=True, leave=False):
-        chosen = int(torch.randint(len(frames), ()))
+        chosen = int(torch.randint(len(frames), (), generator=generator))
         with torch.enable_grad():
             surface = marching_tetrahedra(distances, tets)
             points = surface.of(places)

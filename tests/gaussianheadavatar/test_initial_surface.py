@@ -62,7 +62,6 @@ def test_the_surface_of_a_cube_becomes_the_sphere_that_moves_with_the_mesh_in_pi
     assets = grid_head()
     mesh = Embedding(assets, bound_texels(assets, assets, 8, 1))
     cube = (GRID.points().abs() < 0.9 * RADIUS).all(dim=1).reshape(GRID.shape)
-    torch.manual_seed(0)
     found = fit_surface(cube, GRID, HeadModel(assets, torch.zeros(3)), mesh, frames)
     started = marching_tetrahedra(signed_distances(cube), GRID.tetrahedra()).of(GRID.points())
     before, after = ((points.norm(dim=1) - RADIUS).abs().mean() for points in (started, found))
