@@ -65,12 +65,12 @@ def beyond_mesh(
     grid = Grid(centre - 0.5 * cell * (side - 1), cell, (side, side, side))
     try:
         hull = visual_hull([(frame.camera, frame.alpha * frame.head_mask) for frame in frames], grid)
+        surface = fit_surface(hull, grid, head, mesh, frames)
     except ValueError as error:
         raise UserError(
             f"the Gaussians have nowhere to start: {error}. The tracking and the masks of the training frames do not "
             "belong together; run avatar check on the folder"
         ) from None
-    surface = fit_surface(hull, grid, head, mesh, frames)
     distance, _ = KDTree(mesh.points(head.neutral_vertices()).numpy()).query(surface.numpy())
     beyond = surface[torch.from_numpy(distance) > APART]
     return beyond if len(beyond) else surface

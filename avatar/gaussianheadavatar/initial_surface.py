@@ -41,7 +41,7 @@ def fit_surface(
     """Points of the surface that looks as the frames do, head at rest, metres; it starts at the boundary of `hull`.
 
     Loss: L1 of the picture over white, 0.3 (1 - IoU) of the outline, 0.01 of squared uniform Laplacians and 0.001 of
-    the mesh's distances to the surface, both in cells.
+    the mesh's distances to the surface, both in cells. Raises ValueError where nothing is left.
     """
     start = signed_distances(hull)
     tets = grid.tetrahedra()
@@ -58,6 +58,8 @@ def fit_surface(
         chosen = int(torch.randint(len(frames), (), generator=generator))
         with torch.enable_grad():
             surface = marching_tetrahedra(distances, tets)
+            if not len(surface.faces):
+                raise ValueError("the surface that the pictures show has shrunk to nothing")
             points = surface.of(places)
             head_of_each = torch.full((len(points),), chosen)
             moved = points + motion(head_of_each, surface.edges[:, 0])

@@ -69,6 +69,14 @@ def test_the_surface_of_a_cube_becomes_the_sphere_that_moves_with_the_mesh_in_pi
     assert float(found[:, 1].mean().abs()) < 0.003  # as high as without the mesh's motion
 
 
+def test_a_surface_of_nothing_is_refused() -> None:
+    assets = grid_head()
+    mesh = Embedding(assets, bound_texels(assets, assets, 8, 1))
+    nothing = torch.zeros(GRID.shape, dtype=torch.bool)
+    with pytest.raises(ValueError, match="shrunk to nothing"):
+        fit_surface(nothing, GRID, HeadModel(assets, torch.zeros(3)), mesh, [picture(0, camera_at(0.0), SHIFT)])
+
+
 def test_distances_are_negative_inside_and_change_by_one_cell_at_the_boundary() -> None:
     inside = torch.zeros(5, 5, 7, dtype=torch.bool)
     inside[1:4, 1:4, 1:6] = True
