@@ -66,10 +66,10 @@ import resource, sys
 sys.path[:0] = {path!r}
 from pathlib import Path
 from small_runs import *
-from avatar.gaussianheadavatar import initial_motion
+from avatar.gaussianheadavatar import initial_motion, initial_surface
 from avatar.runs.memory_estimate import training_needs
 
-initial_motion.STEPS = 2  # each takes as much as the others
+initial_motion.STEPS = initial_surface.STEPS = 2  # each takes as much as the others
 
 def bytes_of(field):
     return 1024 * int(next(line for line in open("/proc/self/status") if line.startswith(field)).split()[1])
