@@ -23,6 +23,8 @@ MOST_STEPS = 99_999_999  # checkpoints are named with eight digits
 PROTOCOLS = "protocol"  # the folder of configs/ that holds evaluation protocols; no part of a configuration
 STEPS, WEIGHT, SHARE, RATE = Range(1, MOST_STEPS), Range(0, 10**6), Range(0, 1), Range(0, 10)
 
+Initialization = Literal["grey", "frames", "surface"]
+
 
 @dataclass
 class DataConfig:
@@ -101,8 +103,10 @@ class TrainerConfig:
     seed: Annotated[int, Range(0, 2**31 - 1), "seed of the initial weights and of the order of frames"] = 0
     learning_rates: LearningRates = field(default_factory=LearningRates)
     lr_decay: Annotated[bool, "warm up, then decay all learning rates along half a cosine; false: constant"] = True
-    initial_colours: Annotated[
-        Literal["grey", "frames"], "grey, or frames: the mean colour that training frames show at each Gaussian"
+    initialization: Annotated[
+        Initialization,
+        "grey; frames: the mean colour that training frames show at each Gaussian; surface: of gaussianheadavatar, also "
+        "points of a surface that is fitted to them",
     ] = "frames"
     perceptual: Annotated[
         Literal["auto", "lpips-squeeze", "lpips-vgg", "lpips-alex", "dssim", "none"],

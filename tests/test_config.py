@@ -29,7 +29,7 @@ from avatar.train.loss import perceptual_start
 
 def test_the_papers_recipe() -> None:
     config = load_config(["experiment=paper"])
-    assert (config.model.latent_grid, config.trainer.initial_colours) == (None, "grey")
+    assert (config.model.latent_grid, config.trainer.initialization) == (None, "grey")
     assert (config.trainer.lr_decay, config.trainer.sparse_lpips, config.trainer.perceptual) == (
         False,
         False,
@@ -90,7 +90,7 @@ def test_paper_recipe_lacks_every_addition_of_the_default() -> None:
         "trainer.learning_rates.scale": (2e-2, 5e-3),
         "trainer.learning_rates.rotation": (4e-3, 1e-3),
         "trainer.lr_decay": (True, False),
-        "trainer.initial_colours": ("frames", "grey"),
+        "trainer.initialization": ("frames", "grey"),
         "trainer.perceptual": ("auto", "lpips-vgg"),
         "trainer.sparse_lpips": (True, False),
         "trainer.dssim_weight": (0.2, 0.05),

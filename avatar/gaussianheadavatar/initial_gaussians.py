@@ -1,4 +1,4 @@
-"""Where the Gaussians start: on the mesh, on the surface that training pictures show beyond it, and in the mouth."""
+"""Where the Gaussians start: on the mesh, beyond it on the training masks' visual hull or a surface, and in the mouth."""
 
 from __future__ import annotations
 
@@ -14,15 +14,22 @@ from avatar.data.frame import Frame
 from avatar.errors import UserError
 from avatar.gaussianheadavatar.initial_surface import fit_surface
 from avatar.gaussianheadavatar.marching_tetrahedra import Grid
-from avatar.gaussianheadavatar.start_points import knn_log_scales, mouth_box, spread_points, visual_hull
+from avatar.gaussianheadavatar.start_points import (
+    AGREE,
+    knn_log_scales,
+    mouth_box,
+    share_inside,
+    spread_points,
+    visual_hull,
+)
 from avatar.gaussians.initial_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import UVTexels
 from avatar.head.model import HeadModel
 
-REACH = 1.8  # of the surface's box from the head's centre, half head lengths
-CELLS = 64  # of the box, a side
-APART = 0.004  # metres from the mesh from which the surface counts as beyond it
+REACH = 1.8  # of the grid from the head's centre, half head lengths
+CELLS = 64  # of the grid, a side
+APART = 0.004  # metres from the mesh from which a point counts as beyond it
 MOUTH_SHARE = 0.1  # of the points beyond the mesh
 MOUTH_COLOUR = 0.3  # dark: a mouth's inside
 UNSEEN = 0.5  # grey
@@ -35,9 +42,17 @@ class InitialGaussians(NamedTuple):
 
 
 def initial_gaussians(
-    head: HeadModel, texels: UVTexels, frames: Sequence[Frame], count: int, centre: Float[Tensor, 3], half: float
+    head: HeadModel,
+    texels: UVTexels,
+    frames: Sequence[Frame],
+    count: int,
+    centre: Float[Tensor, 3],
+    half: float,
+    fitted: bool = False,
 ) -> InitialGaussians:
     """`count` points, those of `texels` first; `centre` and `half` say where the head is and half its length, metres.
+
+    fitted  take a surface that is fitted to the frames in place of the masks' visual hull
 
     Raises UserError for masks that leave no common hull.
     """
@@ -47,8 +62,7 @@ def initial_gaussians(
     colours[~seen] = UNSEEN
     rest = count - len(on_mesh)
     in_mouth = round(MOUTH_SHARE * rest)
-    beyond = beyond_mesh(head, embedding, frames, centre, half)
-    outside = spread_points(beyond, rest - in_mouth)
+    outside = spread_points(beyond_mesh(head, embedding, frames, centre, half, fitted), rest - in_mouth)
     lips = head.neutral_vertices()[head.assets.regions.get("lips", torch.arange(head.assets.num_vertices))]
     mouth = mouth_box(lips, in_mouth, torch.Generator().manual_seed(0))
     positions = torch.cat((on_mesh, outside, mouth))
@@ -57,23 +71,29 @@ def initial_gaussians(
 
 
 def beyond_mesh(
-    head: HeadModel, mesh: Embedding, frames: Sequence[Frame], centre: Float[Tensor, 3], half: float
+    head: HeadModel, mesh: Embedding, frames: Sequence[Frame], centre: Float[Tensor, 3], half: float, fitted: bool
 ) -> Float[Tensor, "M 3"]:
-    """Points of the surface that are not on the mesh; all of its points where it is nowhere beyond it."""
+    """Points of hull or surface that are not on the mesh; all of its points where it is nowhere beyond it."""
     cell = 2.0 * REACH * half / CELLS
     side = CELLS + 2  # the border is outside
     grid = Grid(centre - 0.5 * cell * (side - 1), cell, (side, side, side))
+    vertices = head.neutral_vertices()
+    on_mesh = mesh.points(vertices)
     try:
-        hull = visual_hull([(frame.camera, frame.alpha * frame.head_mask) for frame in frames], grid)
-        surface = fit_surface(hull, grid, head, mesh, frames)
+        share = share_inside([(frame.camera, frame.alpha * frame.head_mask) for frame in frames], grid)
+        if fitted:
+            points = fit_surface(share > AGREE, grid, head, mesh, frames)
+            on_mesh = torch.cat((on_mesh, vertices, vertices[head.faces].mean(dim=1)))  # as dense as the surface
+        else:
+            points = visual_hull(share, grid)
     except ValueError as error:
         raise UserError(
             f"the Gaussians have nowhere to start: {error}. The tracking and the masks of the training frames do not "
             "belong together; run avatar check on the folder"
         ) from None
-    distance, _ = KDTree(mesh.points(head.neutral_vertices()).numpy()).query(surface.numpy())
-    beyond = surface[torch.from_numpy(distance) > APART]
-    return beyond if len(beyond) else surface
+    distance, _ = KDTree(on_mesh.numpy()).query(points.numpy())
+    beyond = points[torch.from_numpy(distance) > APART]
+    return beyond if len(beyond) else points
 
 
 def colours_beyond(

@@ -25,7 +25,7 @@ from torch.nn.functional import interpolate, max_pool2d, normalize
 
 from avatar.compute.device import to_device
 from avatar.compute.memory import Need
-from avatar.config import ModelConfig, TrainerConfig
+from avatar.config import Initialization, ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
 from avatar.gaussianheadavatar.hyper_sets import Attributes
 from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
@@ -63,6 +63,7 @@ class GaussianHeadAvatar(Avatar):
     has_colours = False
     unknown_to_browsers = "its upsampling network"
     without_effect = *WITHOUT_EFFECT, "latent_dim"
+    has_surface = True
     initial_frames = 48
     centre: Tensor  # of the head at rest, metres
     places: Tensor  # landmarks, half head lengths from the centre
@@ -105,17 +106,18 @@ class GaussianHeadAvatar(Avatar):
         return Outputs(3, channels_of(config), ATTRIBUTES)
 
     @torch.no_grad()
-    def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
-        """Put the Gaussians on the mesh, on the surface beyond it and into the mouth. Raises UserError for masks that have
-        nothing in common."""
+    def initialize_from(self, frames: Iterable[Frame], start: Initialization) -> None:
+        """Put the Gaussians on the mesh, on the masks' hull or a fitted surface, and into the mouth. Raises UserError for
+        masks that have nothing in common."""
         config, shown = self.config, list(frames)
         texels = bound_texels(self.head.assets, self.head.assets, config.uv_size, config.uv_detail)
-        start = initial_gaussians(self.head, texels, shown, len(self), self.centre, self.unit)
-        self.positions.copy_(start.positions)
-        self.log_scales.copy_(start.log_scales)
-        self.features.copy_(first_features(self.normalized(start.positions)))
+        fitted = start == "surface"
+        initial = initial_gaussians(self.head, texels, shown, len(self), self.centre, self.unit, fitted)
+        self.positions.copy_(initial.positions)
+        self.log_scales.copy_(initial.log_scales)
+        self.features.copy_(first_features(self.normalized(initial.positions)))
         first = self.features.new_zeros(len(self), channels_of(config))
-        first[:, :3] = start.colours if colours else 0.5
+        first[:, :3] = 0.5 if start == "grey" else initial.colours
         self.initialize_colours(first, shown)
         self.initialize_motion(Embedding(self.head.assets, texels), [frame.params for frame in shown])
 

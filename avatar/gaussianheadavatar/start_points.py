@@ -1,4 +1,4 @@
-"""Geometry to start from: what the masks of many views leave, points in the mouth, and their first sizes."""
+"""Geometry to start from: the surface that the masks of many views leave, points in the mouth, and their first sizes."""
 
 from __future__ import annotations
 
@@ -6,38 +6,30 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from skimage.measure import marching_cubes
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, pad
 
 from avatar.gaussianheadavatar.marching_tetrahedra import Grid
 from avatar.gaussians.mesh_embedding import knn_scales
 from avatar.types import Camera
 
 View = tuple[Camera, Tensor]  # and its mask [H, W], 1 inside, of any size
+AGREE = 0.9  # share of the views whose masks hold what is inside
 MOUTH_SIZE = 0.8  # the box reaches so many extents of the lips to both sides of its centre
 JITTER = 1e-3  # of the points' extent, between points that are taken twice
 HALVINGS = 20  # of the search for a voxel's size
 
 
-def visual_hull(views: Sequence[View], grid: Grid, agree: float = 0.9) -> Bool[Tensor, "X Y Z"]:
-    """Which points of the grid lie in the masks of more than the share `agree` of the views that see them.
+def share_inside(views: Sequence[View], grid: Grid) -> Float[Tensor, "X Y Z"]:
+    """The masks' mean at each point of the grid, over the views whose image holds it.
 
-    What fewer than half of the views see is outside, as is the grid's border. Raises ValueError where the masks leave
-    nothing.
+    0 on the grid's border, which closes the surface, and where fewer than half of the views see the point. Raises
+    ValueError where no point lies in the masks of 90 % of the views.
     """
-    inside = (_share_inside(views, grid.points()) > agree).reshape(grid.shape)
-    border = torch.ones_like(inside)
-    border[1:-1, 1:-1, 1:-1] = False
-    inside &= ~border
-    if not bool(inside.any()):
-        raise ValueError(f"no place in the box lies in the masks of {agree:.0%} of the views")
-    return inside
-
-
-def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """The masks' mean over the views whose image holds the place; 0 where these are fewer than half."""
+    places = grid.points()
     inside, seen = torch.zeros(len(places)), torch.zeros(len(places))
     for camera, mask in views:
         x, y, depth = camera.project(places).unbind(-1)
@@ -47,7 +39,20 @@ def _share_inside(views: Sequence[View], places: Float[Tensor, "P 3"]) -> Float[
         values = grid_sample(mask[None, None].float().cpu(), place, padding_mode="border", align_corners=False)
         inside[is_seen] += values[0, 0, 0]
         seen += is_seen
-    return torch.where(2.0 * seen >= len(views), inside / seen.clamp(min=1.0), 0.0)
+    share = torch.where(2.0 * seen >= len(views), inside / seen.clamp(min=1.0), 0.0).reshape(grid.shape)
+    share = pad(share[1:-1, 1:-1, 1:-1], (1,) * 6)
+    if not bool((share > AGREE).any()):
+        raise ValueError(f"no place in the box lies in the masks of {AGREE:.0%} of the views")
+    return share
+
+
+def visual_hull(share: Float[Tensor, "X Y Z"], grid: Grid) -> Float[Tensor, "M 3"]:
+    """The surface of what lies in the masks of at least 90 % of the views that see it; metres.
+
+    Source: marching cubes (Lorensen and Cline, 1987).
+    """
+    vertices = marching_cubes(share.numpy(), level=AGREE)[0]
+    return grid.low + grid.cell * torch.from_numpy(vertices.astype(np.float32))
 
 
 def spread_points(points: Float[Tensor, "M 3"], count: int) -> Float[Tensor, "count 3"]:

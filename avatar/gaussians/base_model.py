@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.memory import Need
-from avatar.config import ModelConfig, TrainerConfig
+from avatar.config import Initialization, ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
 from avatar.gaussians.deformation import DeformationMLP
 from avatar.gaussians.encoding import encoded_size
@@ -43,6 +43,7 @@ class Avatar(nn.Module):
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     has_colours = True  # whether each Gaussian has a colour; else `draw` makes colours of features
     without_effect: tuple[str, ...] = ("upsampling",)  # keys of `ModelConfig` that this model does not read
+    has_surface = False  # whether points can start on a surface that is fitted to training frames
     initial_frames = 16  # that `initialize_from` gets, evenly spread over the training frames
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`
 
@@ -82,8 +83,8 @@ class Avatar(nn.Module):
         self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(N, 1))
         self.opacity_logits = nn.Parameter(torch.logit(torch.tensor(config.initial_opacity)).repeat(N))
 
-    def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
-        """Before training: set from training frames what their pictures say; `colours`: colours too."""
+    def initialize_from(self, frames: Iterable[Frame], start: Initialization) -> None:
+        """Before training: set from training frames what `trainer.initialization` says."""
         raise NotImplementedError
 
     def make_network(self, config: ModelConfig, num_expressions: int, out_size: int) -> DeformationMLP:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from avatar.config import OPACITY_RATE, ModelConfig, TrainerConfig
+from avatar.config import OPACITY_RATE, Initialization, ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
 from avatar.gaussians.base_model import Avatar, Groups
 from avatar.gaussians.initial_colours import mean_colours
@@ -51,10 +51,10 @@ class UVAvatar(Avatar):
         return texels
 
     @torch.no_grad()
-    def initialize_from(self, frames: Iterable[Frame], colours: bool) -> None:
+    def initialize_from(self, frames: Iterable[Frame], start: Initialization) -> None:
         """Set the base colour of each Gaussian to the mean that the frames show at its place; those that no frame shows
         keep theirs."""
-        if not colours:
+        if start == "grey":
             return
         mean, seen = mean_colours(self.mesh, self.embedding, frames)
         self.sh_dc[seen, 0] = (mean[seen] - 0.5) / C0

@@ -15,6 +15,7 @@ from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
+from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.motion.neutral_pose import find_neutral
 from avatar.runs.avatar_file import AVATAR_FILE, write_avatar
@@ -127,10 +128,19 @@ def train(
 
 
 def initialize_from_frames(avatar: Avatar, subject: Subject, config: Config) -> None:
-    """Set what the avatar takes from training frames before its first step: `Avatar.initialize_from`."""
+    """Set what the avatar takes from training frames before its first step: `Avatar.initialize_from`.
+
+    Raises UserError where the model has no surface to fit.
+    """
+    start = config.trainer.initialization
+    if start == "surface" and not avatar.has_surface:
+        raise UserError(
+            f"trainer.initialization=surface is for model=gaussianheadavatar: the Gaussians of {config.model.name} start "
+            "on the mesh; leave it out"
+        )
     chosen = evenly_spread(subject.split.train, avatar.initial_frames)
     frames = (subject.frame(index, config.data.size) for index in chosen)
-    avatar.initialize_from(frames, colours=config.trainer.initial_colours == "frames")
+    avatar.initialize_from(frames, start)
 
 
 def save_avatar(

@@ -119,11 +119,11 @@ def test_the_networks_see_the_heads_turn_against_its_mean() -> None:
     torch.testing.assert_close(avatar.pose(params, half_turn)[:3].norm(), torch.tensor(torch.pi), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_it_starts_on_the_mesh_and_on_the_surface_in_the_colours_of_training_frames(
-    name: str, tracked_folder: Path
+@pytest.mark.parametrize(("name", "start"), [*((name, "frames") for name in NAMES), (NAMES[0], "surface")])
+def test_it_starts_on_the_mesh_and_on_hull_or_surface_in_the_colours_of_training_frames(
+    name: str, start: str, tracked_folder: Path
 ) -> None:
-    config = small_config(f"model={name}")
+    config = small_config(f"model={name}", f"trainer.initialization={start}")
     _, subject, assets = open_small(tracked_folder, config)
     found = []
     for one in (subject, poisoned(subject)):
@@ -147,7 +147,7 @@ def test_a_head_of_one_colour_starts_in_that_colour(name: str, tracked_folder: P
     _, subject, assets = open_small(tracked_folder, config)
     avatar, colour = new_avatar(assets, subject, config), torch.tensor([0.8, 0.1, 0.3])
     frames = [subject.frame(i) for i in subject.split.train[::4]]
-    avatar.initialize_from([replace(f, image=colour.expand_as(f.image)) for f in frames], True)
+    avatar.initialize_from([replace(f, image=colour.expand_as(f.image)) for f in frames], "frames")
     gaussians = avatar(frames[0].params)
     screen = frames[0].camera.project(gaussians.means.detach())
     nearest = screen[:, 2] < screen[:, 2].median()  # the side that faces the camera
@@ -161,7 +161,7 @@ def test_masks_that_have_nothing_in_common_get_a_sentence(tracked_folder: Path) 
     avatar = new_avatar(assets, subject, config)
     frames = [subject.frame(i) for i in subject.split.train[:4]]
     with pytest.raises(UserError, match="nowhere to start.*avatar check"):
-        avatar.initialize_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], True)
+        avatar.initialize_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], "frames")
 
 
 def test_fewer_steps_have_higher_rates() -> None:

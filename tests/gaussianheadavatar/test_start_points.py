@@ -8,11 +8,13 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from avatar.gaussianheadavatar import start_points
 from avatar.gaussianheadavatar.marching_tetrahedra import Grid
 from avatar.gaussianheadavatar.start_points import (
     knn_log_scales,
     landmarks,
     mouth_box,
+    share_inside,
     spread_points,
     visual_hull,
 )
@@ -20,7 +22,7 @@ from avatar.types import Camera
 
 CENTRE = torch.tensor([0.01, -0.02, 0.015])
 RADIUS, SIZE = 0.1, 160
-GRID = Grid(torch.full((3,), -0.15), 0.01, (31, 31, 34))
+GRID = Grid(torch.full((3,), -0.155), 0.01, (32, 32, 35))
 Views = list[tuple[Camera, torch.Tensor]]
 
 
@@ -54,53 +56,66 @@ def sphere_views(count: int = 12) -> Views:
     return [(camera, sees(camera)) for camera in cameras]
 
 
-def hull_distances(views: Views, agree: float = 0.9) -> tuple[torch.Tensor, torch.Tensor]:
-    """From the sphere's centre: of the points in the hull, and of the others."""
-    inside = visual_hull(views, GRID, agree).flatten()
-    away = (GRID.points() - CENTRE).norm(dim=1)
-    return away[inside], away[~inside]
+def hull_of(views: Views) -> torch.Tensor:
+    return visual_hull(share_inside(views, GRID), GRID)
+
+
+def distances(vertices: torch.Tensor) -> torch.Tensor:
+    return (vertices - CENTRE).norm(dim=1)
 
 
 @pytest.mark.parametrize("agree", [0.95, 0.9])
-def test_the_hull_of_a_sphere_is_the_sphere(agree: float) -> None:
-    inside, outside = hull_distances(sphere_views(), agree)
-    assert float(inside.max()) < RADIUS + GRID.cell and float(outside.min()) > RADIUS - GRID.cell
+def test_the_hull_of_a_sphere_is_the_sphere(agree: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start_points, "AGREE", agree)
+    vertices = hull_of(sphere_views())
+    found = distances(vertices)
+    assert float(found.min()) > RADIUS - GRID.cell and float(found.max()) < RADIUS + GRID.cell
+    directions = normalize(vertices - CENTRE, dim=1)
+    assert float((all_around(100) @ directions.T).amax(dim=1).min()) > 0.98  # it is there all around
 
 
-def test_a_wrong_mask_is_outvoted() -> None:
+def test_a_wrong_mask_is_outvoted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start_points, "AGREE", 0.8)
     views = sphere_views()
+    right = distances(hull_of(views))
     views[4] = views[4][0], torch.zeros(SIZE, SIZE)
-    inside, outside = hull_distances(views, 0.8)
-    assert float(inside.max()) < RADIUS + 2 * GRID.cell and float(outside.min()) > RADIUS - GRID.cell
+    wrong = distances(hull_of(views))
+    assert float(wrong.min()) > RADIUS - GRID.cell and float(wrong.max()) < RADIUS + 2 * GRID.cell
+    assert abs(float(wrong.mean() - right.mean())) < 0.5 * GRID.cell
+    monkeypatch.setattr(start_points, "AGREE", 0.999)
     with pytest.raises(ValueError, match="100% of the views"):
-        visual_hull(views, GRID, 0.999)
+        share_inside(views, GRID)
 
 
 def test_views_that_do_not_see_a_place_do_not_vote() -> None:
     views = sphere_views()
     away = camera_at(torch.tensor([0.0, 0.0, -0.8]))
     behind = Camera(away.R_cam_world, torch.tensor([0.0, 0.0, -0.8]), 260.0, 260.0, 80.0, 80.0, SIZE, SIZE)
-    expected = visual_hull(views, GRID)
-    assert torch.equal(visual_hull([*views, (behind, torch.zeros(SIZE, SIZE))], GRID), expected)
+    expected = share_inside(views, GRID)
+    assert torch.equal(share_inside([*views, (behind, torch.zeros(SIZE, SIZE))], GRID), expected)
     with pytest.raises(ValueError, match="no place in the box"):
-        visual_hull([(behind, torch.ones(SIZE, SIZE))], GRID)
+        share_inside([(behind, torch.ones(SIZE, SIZE))], GRID)
 
 
 def test_a_mask_may_have_another_size_than_the_camera() -> None:
     views = [(camera.resized(2 * SIZE, 2 * SIZE), mask) for camera, mask in sphere_views()]
-    assert torch.equal(visual_hull(views, GRID), visual_hull(sphere_views(), GRID))
+    torch.testing.assert_close(share_inside(views, GRID), share_inside(sphere_views(), GRID))
 
 
 def test_a_grid_that_the_masks_fill_is_the_hull_but_for_its_border() -> None:
     views = [(camera, torch.ones(SIZE, SIZE)) for camera, _ in sphere_views()]
-    hull = visual_hull(views, Grid(torch.full((3,), -0.04), 0.01, (9, 8, 7)))
-    assert bool(hull[1:-1, 1:-1, 1:-1].all()) and int(hull.sum()) == 7 * 6 * 5
+    grid = Grid(torch.full((3,), -0.04), 0.01, (9, 8, 7))
+    share = share_inside(views, grid)
+    assert bool((share[1:-1, 1:-1, 1:-1] == 1.0).all()) and float(share.sum()) == 7 * 6 * 5
+    vertices = visual_hull(share, grid)
+    torch.testing.assert_close(vertices.amin(dim=0), grid.low + 0.009, rtol=0, atol=1e-6)
+    torch.testing.assert_close(vertices.amax(dim=0), grid.low + torch.tensor([0.071, 0.061, 0.051]), rtol=0, atol=1e-6)
 
 
 def test_without_masks_there_is_no_visual_hull() -> None:
     views = [(camera, torch.zeros_like(mask)) for camera, mask in sphere_views()]
     with pytest.raises(ValueError, match="no place in the box lies in the masks of 90% of the views"):
-        visual_hull(views, GRID)
+        share_inside(views, GRID)
 
 
 @pytest.mark.parametrize("count", [1, 7, 500, 4999, 5000])

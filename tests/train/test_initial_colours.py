@@ -12,6 +12,7 @@ from small_runs import new_avatar, open_small, small_config
 
 from avatar.data.frame import Frame
 from avatar.data.subject import Subject
+from avatar.errors import UserError
 from avatar.gaussians import initial_colours
 from avatar.gaussians.uv_base_model import UVAvatar
 from avatar.runs.model_registry import make_avatar
@@ -26,7 +27,7 @@ def seen_colours(avatar: UVAvatar, frame: Frame) -> tuple[torch.Tensor, torch.Te
 
 def colour_from_frames(avatar: UVAvatar, subject: Subject) -> int:
     """How many Gaussians got another colour than grey."""
-    initialize_from_frames(avatar, subject, small_config("trainer.initial_colours=frames"))
+    initialize_from_frames(avatar, subject, small_config("trainer.initialization=frames"))
     return int((avatar.sh_dc[:, 0] != 0).any(dim=-1).sum())
 
 
@@ -171,3 +172,10 @@ def test_the_matte_and_the_head_mask_are_weights(tracked_folder: Path) -> None:
     _, full = seen_colours(avatar, replace(frame, alpha=whole, head_mask=whole))
     _, less = seen_colours(avatar, replace(frame, alpha=half, head_mask=half))
     torch.testing.assert_close(less, 0.25 * full)
+
+
+def test_a_model_whose_gaussians_start_on_the_mesh_has_no_surface(tracked_folder: Path) -> None:
+    config = small_config("trainer.initialization=surface")
+    _, subject, assets = open_small(tracked_folder, config)
+    with pytest.raises(UserError, match="initialization=surface is for model=gaussianheadavatar.*hypergaussians"):
+        initialize_from_frames(new_avatar(assets, subject, config), subject, config)
