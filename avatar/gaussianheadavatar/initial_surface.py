@@ -26,7 +26,7 @@ from avatar.splat import splat_features
 from avatar.types import Camera, FeatureGaussians
 
 STEPS = 400
-SIDE = 256  # pixels: larger pictures are made smaller by a whole factor
+SIDE = 256  # pixels, which larger pictures are brought near by a whole factor
 BAND = 4.0  # cells from the hull, as far as the surface can move
 RATE = 0.1  # Adam's at the start, of distances (cells) and of colours; it decays along half a cosine
 OUTLINE, SMOOTH, ON_MESH = 0.3, 0.01, 0.001  # weights beside the colour's
@@ -82,7 +82,7 @@ def signed_distances(inside: Bool[Tensor, "X Y Z"]) -> Float[Tensor, " P"]:
 
 
 def small_view(frame: Frame) -> tuple[Camera, Float[Tensor, "H W 4"]]:
-    """The frame over white with its matte as a fourth channel, at most 256 pixels wide and high or a little more."""
+    """The frame over white with its matte as a fourth channel; the longer side is below 384 pixels."""
     matte = (frame.alpha * frame.head_mask)[..., None]
     target = torch.cat((frame.composite(frame.image.new_ones(3)), matte), dim=-1)
     height, width = target.shape[:2]
