@@ -1,10 +1,10 @@
-"""The mattes of a clip: by a matting network, or by a segmentation network, the colours at the person's edge, and what a
-still camera shows behind the person."""
+"""The mattes of a clip: by a matting network, or by a segmentation network, what frames of the same pose agree on, the
+colours at the person's edge, and what a still camera shows behind the person."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from avatar.files.third_party import MATTING_FILES, ThirdPartyFile
 from data_prep.progress import Progress
 from data_prep.track.frames import Read, ahead, mask_file, write_image, write_masks
 from data_prep.track.mattes import background_plate
+from data_prep.track.mattes.alike_frames import ClipFrame, clip_frame, person_alone
 from data_prep.track.mattes.matting_network import open_matting
 from data_prep.track.mattes.refine_segmentation import sharpened
 from data_prep.track.mattes.segmentation_network import open_segmentation
@@ -43,10 +44,17 @@ def write_mattes(
         return picture, own.matte(picture)
 
     of_clip = numbers[:: -(-len(numbers) // background_plate.CLIP_FRAMES)]
-    seen = ahead(of_clip, by_network, progress, "looking at the background")
-    behind = background_plate.learn_plate(pair for _, pair in seen)
+    clip: list[ClipFrame] = []
+
+    def looked_at() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for number, (picture, matte) in ahead(of_clip, by_network, progress, "looking at the background"):
+            clip.append(clip_frame(number, matte, points(number)))
+            yield picture, matte
+
+    behind = background_plate.learn_plate(looked_at())
 
     def one(number: int) -> np.ndarray:
-        return sharpened(*by_network(number), points(number), behind)
+        picture, matte = by_network(number)
+        return sharpened(picture, person_alone(number, matte, points(number), clip), points(number), behind)
 
     write_masks(folder, numbers, one, progress, _TITLE)

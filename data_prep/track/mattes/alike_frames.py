@@ -1,0 +1,72 @@
+"""What frames of the same pose agree on: passers-by and hands, which a network takes for the person, are in few of them.
+
+Frames of a clip whose faces are alike in place, size and pose are laid over a frame by a similarity of the landmarks. The
+person is where most of them show one, and near it: as far from it as those faces are from the frame's, and a margin.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+SIDE = 256  # pixels of the longer side at which frames are compared, those of a network
+ALIKE = 9  # frames
+APART = 6  # frames between the frame and one that it is compared with: nearer ones show the same passer-by
+_MARGIN = 1 / 40  # of the longer side
+_HALF = 127  # of 255
+
+
+class ClipFrame(NamedTuple):
+    number: int
+    matte: UInt8[np.ndarray, "h w"]  # of a network, with `SIDE` pixels at most
+    points: Float[np.ndarray, "L 2"]  # landmarks, in its pixels
+
+
+def clip_frame(number: int, matte: UInt8[np.ndarray, "H W"], points: Float[np.ndarray, "L 2"]) -> ClipFrame:
+    """`points` are in pixels of the matte."""
+    scale = min(1.0, SIDE / max(matte.shape))
+    width, height = (max(1, round(side * scale)) for side in matte.shape[::-1])
+    return ClipFrame(number, cv2.resize(matte, (width, height), interpolation=cv2.INTER_AREA), points * scale)
+
+
+def person_alone(
+    number: int, matte: UInt8[np.ndarray, "H W"], points: Float[np.ndarray, "L 2"], clip: list[ClipFrame]
+) -> UInt8[np.ndarray, "H W"]:
+    """The matte without what the frames of the most alike pose in `clip` do not show; as it is where they are too few."""
+    frame = clip_frame(number, matte, points)
+    others = [one for one in clip if abs(one.number - number) >= APART and np.isfinite(one.points).all()]
+    if len(others) < ALIKE or not np.isfinite(points).all():
+        return matte
+    away = [float(np.sqrt(np.square(one.points - frame.points).sum(axis=1).mean())) for one in others]
+    alike = np.argsort(away, kind="stable")[:ALIKE]
+    height, width = frame.matte.shape
+    laid = [
+        cv2.warpAffine(
+            others[i].matte,
+            similarity(others[i].points, frame.points),
+            (width, height),
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        for i in alike
+    ]
+    agreed = np.median(laid, axis=0).astype(np.uint8)
+    reach = 2 * round(_MARGIN * max(height, width) + float(np.median(np.array(away)[alike]))) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    near = cv2.dilate((agreed > _HALF).astype(np.uint8), disc)
+    most = np.where(near > 0, 255, agreed).astype(np.uint8)
+    return np.minimum(matte, cv2.resize(most, matte.shape[::-1], interpolation=cv2.INTER_LINEAR))
+
+
+def similarity(source: Float[np.ndarray, "L 2"], target: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "2 3"]:
+    """Turn, scale and shift that bring `source` nearest to `target`, for pixels counted from their centres.
+
+    Points are complex numbers: target = a source + b, with a and b by least squares.
+    """
+    start, end = ((points - 0.5) @ np.array([1.0, 1.0j]) for points in (source, target))
+    a = np.vdot(start - start.mean(), end - end.mean()) / np.vdot(start - start.mean(), start - start.mean())
+    b = end.mean() - a * start.mean()
+    return np.array([[a.real, -a.imag, b.real], [a.imag, a.real, b.imag]])
