@@ -1,7 +1,8 @@
-"""What frames of the same pose agree on: passers-by and hands, which a network takes for the person, are in few of them.
+"""What frames of the same pose agree on: what a network is unsure of, as passers-by, is the person in few of them.
 
-Frames of a clip whose faces are alike in place, size and pose are laid over a frame by a similarity of the landmarks. The
-person is where most of them show one, and near it: as far from it as those faces are from the frame's, and a margin.
+Frames of a clip whose faces are alike in place, size and pose are laid over a frame by a similarity of the landmarks. Where
+the network is unsure, the person is where most of them show one, and near it: as far from it as those faces are from the
+frame's, and a margin. What it is sure of stays: hands and lifted shoulders.
 """
 
 from __future__ import annotations
@@ -12,11 +13,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from data_prep.track.mattes.background_plate import dilated
+
 SIDE = 256  # pixels of the longer side at which frames are compared, those of a network
 ALIKE = 9  # frames
 APART = 6  # frames between the frame and one that it is compared with: nearer ones show the same passer-by
 _MARGIN = 1 / 40  # of the longer side
-_HALF = 127  # of 255
+_HALF, _SURE = 127, 229  # of 255
+_EDGE = 4  # pixels of soft edge that belong to what the network is sure of
 
 
 class ClipFrame(NamedTuple):
@@ -35,7 +39,10 @@ def clip_frame(number: int, matte: UInt8[np.ndarray, "H W"], points: Float[np.nd
 def person_alone(
     number: int, matte: UInt8[np.ndarray, "H W"], points: Float[np.ndarray, "L 2"], clip: list[ClipFrame]
 ) -> UInt8[np.ndarray, "H W"]:
-    """The matte without what the frames of the most alike pose in `clip` do not show; as it is where they are too few."""
+    """The matte without unsure parts that the frames of the most alike pose in `clip` do not show.
+
+    It stays as it is where the clip has too few frames.
+    """
     frame = clip_frame(number, matte, points)
     others = [one for one in clip if abs(one.number - number) >= APART and np.isfinite(one.points).all()]
     if len(others) < ALIKE or not np.isfinite(points).all():
@@ -54,10 +61,9 @@ def person_alone(
         for i in alike
     ]
     agreed = np.median(laid, axis=0).astype(np.uint8)
-    reach = 2 * round(_MARGIN * max(height, width) + float(np.median(np.array(away)[alike]))) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    near = cv2.dilate((agreed > _HALF).astype(np.uint8), disc)
-    most = np.where(near > 0, 255, agreed).astype(np.uint8)
+    reach = round(_MARGIN * max(height, width) + float(np.median(np.array(away)[alike])))
+    kept = dilated(agreed > _HALF, reach) | dilated(frame.matte > _SURE, _EDGE)
+    most = np.where(kept, 255, agreed).astype(np.uint8)
     return np.minimum(matte, cv2.resize(most, matte.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 

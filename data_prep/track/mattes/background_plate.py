@@ -46,7 +46,7 @@ def learn_plate(frames: Iterable[tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndar
     for image, matte in frames:
         somebody = limited(matte) > _NOBODY
         pictures.append(limited(image))
-        empty.append(~_dilated(somebody, _CLEAR * band_radius(*somebody.shape)))
+        empty.append(~dilated(somebody, _CLEAR * band_radius(*somebody.shape)))
     if len(pictures) < _SEEN:
         return None
     seen = np.sum(empty, axis=0) >= _SEEN
@@ -72,9 +72,9 @@ def learn_plate(frames: Iterable[tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndar
 def shown(plate: Plate, image: UInt8[np.ndarray, "h w 3"], person: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Where a picture shows the plate, about the edge of what a network takes for the `person`."""
     radius = band_radius(*person.shape)
-    inside = ~_dilated(~person, _ABOUT * radius)
+    inside = ~dilated(~person, _ABOUT * radius)
     same = _distance(plate, image) < _SAME
-    about = ~inside & _dilated(person, _ABOUT * radius)
+    about = ~inside & dilated(person, _ABOUT * radius)
     return about & plate.known & same & _rare(same, inside & plate.guessed, radius)
 
 
@@ -112,6 +112,6 @@ def _rare(what: Bool[np.ndarray, "h w"], within: Bool[np.ndarray, "h w"], radius
     return (total > 0) & (found <= _BELIEVED * total)
 
 
-def _dilated(mask: Bool[np.ndarray, "h w"], radius: int) -> Bool[np.ndarray, "h w"]:
+def dilated(mask: Bool[np.ndarray, "h w"], radius: int) -> Bool[np.ndarray, "h w"]:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return cv2.dilate(mask.astype(np.uint8), disc) > 0
