@@ -62,20 +62,21 @@ def read_serials(folder: Path) -> set[str]:
 
 
 def _poses_and_lenses(path: Path) -> tuple[dict[str, Any], Any]:
-    raw = _read(path)
+    raw = read_calibration(path)
     poses, lenses = (raw.get(key) for key in ("world_2_cam", "intrinsics")) if isinstance(raw, dict) else (None, None)
     if not isinstance(poses, dict) or lenses is None:
         raise UserError(f"{path} lacks world_2_cam or intrinsics; download it again")
     return poses, lenses
 
 
-def _read(path: Path) -> Any:
+def read_calibration(path: Path, remedy: str = "download it again") -> Any:
+    """The values of a JSON file. Raises UserError, which ends with `remedy`, where it is none or has a name twice."""
     try:
         return json.loads(read_text(path, _MAX_BYTES), object_pairs_hook=_without_repeats)
     except BadFrame as error:
-        raise UserError(f"{path}: {error}; download it again") from None
+        raise UserError(f"{path}: {error}; {remedy}") from None
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read as JSON ({error}); download it again") from None
+        raise UserError(f"{path} cannot be read as JSON ({error}); {remedy}") from None
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

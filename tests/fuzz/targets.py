@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import pickle
 import zipfile
 from dataclasses import replace
@@ -46,6 +47,7 @@ from data_prep.formats.obj_mesh import read_mesh
 from data_prep.formats.root_pose import Joint
 from data_prep.prepare.prepare import prepare
 from data_prep.track.camera_rig.gha_folder import read_calibration
+from data_prep.track.camera_rig.recording import COLOURS, read_colour_matrices
 
 PROTOCOLS = Path(__file__).resolve().parents[2] / "configs" / "protocol"
 
@@ -175,6 +177,11 @@ def make_targets(place: Path) -> dict[str, Target]:
         "NeRSemble calibration": Target(
             [(person / CALIBRATION).read_bytes()],
             on_disk(person / CALIBRATION, lambda p: read_cameras(p.parents[1], {TRAINED: (WIDTH, HEIGHT)})),
+        ),
+        "NeRSemble colours": Target(
+            [json.dumps({TRAINED: np.eye(3).tolist()}).encode()],
+            on_disk(person / COLOURS, lambda p: read_colour_matrices(p.parents[1], [TRAINED])),
+            0.5,
         ),
         "NeRSemble tracking": Target([rotations], on_disk(tracked_sequence, sequence), 0.5),
         "NeRSemble tracking, checksums right": Target(

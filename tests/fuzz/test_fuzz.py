@@ -39,7 +39,7 @@ CASES = int(os.environ.get("AVATAR_FUZZ_CASES", "600"))
 SECONDS = 5.0  # for one file of a few kilobytes, on a busy machine
 NAMES = (
     "pickle", "torch", "torch, checksums right", ".frame", "npz", "npz, checksums right", "VHAP listing",
-    "INSTA listing", "IMavatar listing", "NeRSemble calibration", "NeRSemble tracking",
+    "INSTA listing", "IMavatar listing", "NeRSemble calibration", "NeRSemble colours", "NeRSemble tracking",
     "NeRSemble tracking, checksums right", "INSTA mesh", "NHA tracking", "GaussianHeadAvatar camera",
     "NHA split",
     "manifest", "tracks", "checkpoint", "run.json", "UV obj", "head model",

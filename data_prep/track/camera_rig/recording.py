@@ -3,6 +3,7 @@
 NeRSemble's own, of one sequence; the calibration lies two folders above it:
 
     ID/calibration/camera_params.json         poses (world to camera, OpenCV's axes); intrinsics, for all or by serial
+    ID/calibration/color_calibration.json     by serial a matrix [3, T] (`colour_corrected.py`); may be missing
     ID/sequences/SEQ/images/cam_SERIAL.mp4    FOLDER is ID/sequences/SEQ
 
 What GaussianHeadAvatar's preprocessing makes (`gha_folder.py`).
@@ -11,22 +12,29 @@ What GaussianHeadAvatar's preprocessing makes (`gha_folder.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.read import is_there
 from data_prep.ffmpeg import count_pictures
+from data_prep.formats.frame_track import BadFrame, vector
 from data_prep.formats.nersemble import TRAINED_CAMERA, camera_videos
-from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras, read_serials
+from data_prep.formats.nersemble_cameras import CALIBRATION, read_calibration, read_cameras, read_serials
+from data_prep.track.footage.colour_corrected import TERMS, colour_corrected
 from data_prep.track.footage.joined import join
 from data_prep.track.footage.source import Footage, stride
 from data_prep.track.footage.video import open_video
 
+COLOURS = CALIBRATION.with_name("color_calibration.json")
 NOMINAL_RATE = 25.0
 MAX_DIFFERENCE = 2  # pictures, in length; of more, one is not whole
+_MAX_FACTOR = 1e6  # of a colour's terms, which are at most 1
+_REMEDY = "download it again, or remove it to leave the colours as they are"
 
 
 @dataclass(frozen=True)
@@ -61,12 +69,39 @@ def open_recording(folder: Path) -> Recording:
             "ID/sequences/SEQUENCE of a folder ID that has its calibration"
         )
     unused = without_pictures(set(videos), read_serials(person), person / CALIBRATION)
-    footage = {serial: open_video(path) for serial, path in videos.items()}
+    matrices = read_colour_matrices(person, videos)
+    footage: dict[str, Footage] = {serial: open_video(path) for serial, path in videos.items()}
     counts = {serial: count_pictures(path, "v:0") for serial, path in videos.items()}
     refuse_lengths({videos[serial]: count for serial, count in counts.items()})
     calibrated = read_cameras(person, {serial: (one.width, one.height) for serial, one in footage.items()})
+    for serial, matrix in matrices.items():
+        footage[serial] = colour_corrected(footage[serial], matrix, person / COLOURS)
     cameras = {serial: Camera(footage[serial], *calibrated[serial][:3]) for serial in videos}
     return Recording(folder, cameras, TRAINED_CAMERA if TRAINED_CAMERA in cameras else None, unused)
+
+
+def read_colour_matrices(person: Path, serials: Iterable[str]) -> dict[str, np.ndarray]:
+    """A matrix [3, T] for each serial; nothing where there is no COLOURS. Raises UserError for one that has none."""
+    path = person / COLOURS
+    if not is_there(path):
+        return {}
+    raw = read_calibration(path, _REMEDY)
+    try:
+        return {serial: _colour_matrix(raw, serial) for serial in serials}
+    except BadFrame as error:
+        raise UserError(f"{path}: {error}; {_REMEDY}") from None
+
+
+def _colour_matrix(raw: Any, serial: str) -> np.ndarray:
+    if not isinstance(raw, dict) or serial not in raw:
+        raise BadFrame(f"there is nothing on camera {serial}, which has videos")
+    name = f"the matrix of camera {serial}"
+    values, shape = vector(raw[serial], name), np.shape(raw[serial])
+    if len(shape) != 2 or shape[0] != 3 or shape[1] not in TERMS:
+        raise BadFrame(f"{name} has the shape {list(shape)}, not [3, T] with T of {', '.join(map(str, TERMS))}")
+    if np.abs(values).max() > _MAX_FACTOR:
+        raise BadFrame(f"{name} holds numbers beyond {_MAX_FACTOR:g}")
+    return values.reshape(shape)
 
 
 def join_recordings(recordings: Sequence[Recording]) -> Recording:

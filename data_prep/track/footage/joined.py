@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from avatar.errors import UserError
-from data_prep.track.footage.source import Footage, Span, TimedPicture, View
+from data_prep.track.footage.source import Footage, Span, TimedPicture, View, common_fields
 from data_prep.track.stage_folder import hash_of
 
 
@@ -45,7 +45,7 @@ def join(parts: Sequence[Footage], starts: Sequence[float]) -> JoinedFootage:
                 f"{part.path} has {part.width}x{part.height} pixels at {part.rate} a second, but {first.path} has "
                 f"{first.width}x{first.height} at {first.rate}; track recordings of different cameras by themselves"
             )
-    values: dict[str, Any] = {field.name: getattr(first, field.name) for field in fields(Footage)}
+    values = common_fields(first)
     folder = first.path.parents[2]
     values |= {
         "path": folder / "*" / first.path.relative_to(folder / first.path.parents[1].name),

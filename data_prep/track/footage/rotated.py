@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from data_prep.track.footage.source import Box, Footage, Span, TimedPicture, View
+from data_prep.track.footage.source import Box, Footage, Span, TimedPicture, View, common_fields
 
 TURNS = (0, 90, 180, 270)  # degrees clockwise
 
@@ -46,7 +45,7 @@ def turned(footage: Footage, degrees: int) -> Footage:
     """The footage with its pictures turned clockwise by a multiple of 90 degrees."""
     if not degrees:
         return footage
-    values: dict[str, Any] = {field.name: getattr(footage, field.name) for field in fields(Footage)}
+    values = common_fields(footage)
     if degrees % 180:
         values |= {"width": footage.height, "height": footage.width}
     return Turned(**values, footage=footage, degrees=degrees)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -81,6 +81,11 @@ class Footage(ABC):
     @abstractmethod
     def content_hash(self) -> str:
         """SHA-256 of all that is read."""
+
+
+def common_fields(footage: Footage) -> dict[str, Any]:
+    """What every Footage has, for one that wraps this one."""
+    return {field.name: getattr(footage, field.name) for field in fields(Footage)}
 
 
 def stride(rate: float | None) -> int:

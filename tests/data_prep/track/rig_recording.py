@@ -6,6 +6,7 @@ Both are made of a folder in VHAP's layout that holds the truth, in a world that
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,15 +48,25 @@ def lens(entry: Entry) -> np.ndarray:
     )
 
 
+def tinted(picture: np.ndarray, undo: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The sRGB picture before its linear colours [H, W, 3] were corrected by what `undo` inverts."""
+    encoded = picture / 255
+    before = undo(np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4))
+    assert before.min() >= 0 and before.max() <= 1
+    encoded = np.where(before <= 0.0031308, 12.92 * before, 1.055 * before ** (1 / 2.4) - 0.055)
+    return np.round(255 * encoded).astype(np.uint8)
+
+
 def write_raw(truth: Path, root: Path, unit: float, times: int | None = None, fps: float = 25.0) -> Path:
-    """ROOT/person/sequences/SPEECH and the calibration above it."""
+    """ROOT/person/sequences/SPEECH, each camera darker than the one before, and the calibration above it."""
     sequence = root / "person" / "sequences" / truth.name
     (sequence / "images").mkdir(parents=True)
     listed = entries(truth)
     own = {serial(entry): entry for entry in listed}
+    gains = {name: 1 + 0.15 * index for index, name in enumerate(own)}
     for name in own:
         files = [truth / entry["file_path"] for entry in listed if serial(entry) == name][:times]
-        pictures = [cv2.imread(str(file))[..., ::-1] for file in files]
+        pictures = [tinted(cv2.imread(str(file))[..., ::-1], lambda x, gain=gains[name]: x / gain) for file in files]
         encode(sequence / "images" / f"cam_{name}.mp4", pictures, fps)
     (root / "person" / "calibration").mkdir()
     calibration = {
@@ -63,6 +74,8 @@ def write_raw(truth: Path, root: Path, unit: float, times: int | None = None, fp
         "intrinsics": {name: lens(entry).tolist() for name, entry in own.items()},
     }
     (root / "person" / "calibration" / "camera_params.json").write_text(json.dumps(calibration))
+    matrices = {name: (gain * np.eye(3)).tolist() for name, gain in gains.items()}
+    (root / "person" / "calibration" / "color_calibration.json").write_text(json.dumps(matrices))
     return sequence
 
 

@@ -72,6 +72,7 @@ def test_the_head_lies_where_it_is_in_every_camera(truth: Path, tracked: Path, h
     said = (tracked.parent / "said.txt").read_text()
     assert "5 cameras; the front one is 222200002" in said and "median error falls from" in said
     assert "frames in front\n" in said and ".partial" not in said
+    assert said.count("note: colours are corrected by ") == 1
 
 
 def test_pictures_mattes_and_lenses(truth: Path, tracked: Path) -> None:
