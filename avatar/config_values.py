@@ -105,12 +105,12 @@ def check_device(name: str) -> None:
         raise UserError(f"device={shown(name)} is not one of auto, cpu, cuda, cuda:N (such as cuda:0)")
 
 
-def shown(value: Any) -> str:
-    """A value as it is typed, short enough for a message."""
+def shown(value: Any, most: int = 60) -> str:
+    """A value as it is typed, cut to `most` letters: short enough for a message."""
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         value = int(value)
     text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def cause(error: Exception) -> str:

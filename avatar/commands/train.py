@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.commands.outputs import check_run_folder
-from avatar.config import chosen_options, flatten, load_config
+from avatar.config import MAX_OVERRIDE, chosen_options, flatten, load_config
 from avatar.config_values import shown
 from avatar.data.source import Source
 from avatar.errors import UserError
@@ -80,7 +80,7 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
 def print_config(overrides: list[str]) -> None:
     """The configuration as overrides of itself."""
     for key, value in flatten(load_config(overrides).to_dict()).items():
-        text = shown(list(value) if isinstance(value, tuple) else value)
+        text = shown(list(value) if isinstance(value, tuple) else value, MAX_OVERRIDE)
         print(f"{key}={text.replace(', ', ',') if isinstance(value, tuple) else text}")
 
 

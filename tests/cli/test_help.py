@@ -78,6 +78,7 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(
 
 
 def test_the_printed_configuration_is_one_to_type() -> None:
-    asked = ["experiment=paper", "trainer.seed=3", "data.background=[0,0.5,1]"]
+    cameras = ",".join(f"2222000{number}" for number in range(10, 20))
+    asked = ["experiment=paper", "trainer.seed=3", "data.background=#123456", f"data.test_cameras={cameras}"]
     lines = avatar("train", "--print-config", *asked).splitlines()
     assert "trainer.seed=3" in lines and load_config(lines) == load_config(asked)
