@@ -7,6 +7,7 @@ from pathlib import Path
 from avatar.commands.eval import writing_figures
 from avatar.evaluation.evaluate import evaluate, facts_of
 from avatar.evaluation.previous_results import read_earlier
+from avatar.evaluation.protocol import builtin_protocols
 from avatar.evaluation.tracking_source import LABELS, parts
 from avatar.files.read import read_json
 from avatar.pipeline.open_inputs import open_run
@@ -18,7 +19,7 @@ def evaluate_or_read(path: Path) -> Path:
     Raises UserError as `evaluate` does.
     """
     run, folder = open_run(path, say=discard), path / "eval"
-    if read_earlier(folder, facts_of(run), ()).entries:
+    if builtin_protocols().keys() <= read_earlier(folder, facts_of(run), ()).entries.keys():
         return folder / "results.json"
     with writing_figures(path):
         return evaluate(run, None, write_frames=False, say=discard)

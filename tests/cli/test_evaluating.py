@@ -15,7 +15,9 @@ import pytest
 from command_line import avatar
 from small_runs import SMALL
 
+from avatar.commands.held_out_figures import evaluate_or_read, figures_line
 from avatar.evaluation import evaluate as evaluate_module
+from avatar.evaluation.protocol import builtin_protocols
 from avatar.files.lock import locked
 
 
@@ -55,6 +57,14 @@ def test_a_protocol_more_keeps_the_others_results(run: Path) -> None:
     assert "rgbavatar" in printed and "strict" not in printed, "the table shows what was asked for"
     compared = avatar("compare", run, run)
     assert all(name in compared for name in ("rgbavatar", "strict", "flashavatar"))
+
+
+def test_what_create_says_of_a_run_is_by_all_protocols(run: Path) -> None:
+    """Also where somebody has measured it by one of them before."""
+    shutil.rmtree(run / "eval")
+    avatar("eval", run, "--protocol", "rgbavatar")
+    results = evaluate_or_read(run)
+    assert figures_line(results).startswith("PSNR") and tables(run) == builtin_protocols().keys()
 
 
 @pytest.mark.slow
