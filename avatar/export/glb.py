@@ -16,7 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from avatar.export.bake_texture import bake_texture
-from avatar.motion.controls import JOINT_FIELD, expression_controls, joint_ranges, posed
+from avatar.motion.controls import expression_controls, joint_ranges, joint_values, posed
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 
@@ -44,7 +44,7 @@ def encode_glb(trained: TrainedAvatar, params: HeadParams, size: int, licence: s
         visual=TextureVisuals(uv=assets.uvs[of_uv].numpy(), material=material),
         process=False,
     )
-    targets = {name: (moved - base)[of_vertex] for name, moved in shapes(trained, params).items()}
+    targets = {name: moved[of_vertex] for name, moved in offsets(trained, params).items()}
     targets = {name: moved for name, moved in targets.items() if float(moved.abs().max()) > LEAST}
 
     def add_targets(buffer_items: Any, tree: dict[str, Any]) -> None:
@@ -77,19 +77,20 @@ def add_accessor(buffer_items: Any, tree: dict[str, Any], name: str, values: Flo
     return len(tree["accessors"]) - 1
 
 
-def shapes(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tensor, "V 3"]]:
-    """The mesh with each control and joint moved from `params` as far as the training video shows."""
+def offsets(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tensor, "V 3"]]:
+    """How the mesh moves when one control or joint goes as far as the training video shows, and the others stay."""
     train = list(trained.recording.split.train)
-    head, rest = trained.avatar.head, trained.rest_params()
-    moved: dict[str, HeadParams] = {}
+    head, found = trained.avatar.head, {}
+    start = head.vertices(params)
     for control in expression_controls(
-        trained.recording.tracks["expression"][trained.recording.times(train)], rest.expression, head
+        trained.recording.tracks["expression"][trained.recording.times(train)], trained.neutral.expression, head
     ):
         far = max(control.low, control.high, key=abs)
-        name = f"{control.part}: {control.name}"
-        moved[name] = replace(params, expression=params.expression + far * control.direction)
+        moved = replace(params, expression=params.expression + far * control.direction)
+        found[f"{control.part}: {control.name}"] = head.vertices(moved) - start
+    own = {joint: float(value) for joint, value in joint_values([params]).items()}
+    start = head.vertices(posed(params, None, own))
     for joint, (low, high) in joint_ranges(trained.recording.motion(train)).items():
-        turned = posed(rest, None, {joint: max(low, high, key=abs)})
-        field = JOINT_FIELD.get(joint, "eyes")
-        moved[joint.replace("_", " ")] = replace(params, **{field: getattr(turned, field)})
-    return {name: head.vertices(pose) for name, pose in moved.items()}
+        moved = posed(params, None, {**own, joint: max(low, high, key=abs)})
+        found[joint.replace("_", " ")] = head.vertices(moved) - start
+    return found

@@ -72,13 +72,19 @@ def principal_directions(values: Float[Tensor, "T E"]) -> Float[Tensor, "K E"]:
 
 
 def joint_ranges(training: Sequence[HeadParams]) -> dict[str, tuple[float, float]]:
-    """How far jaw, gaze, lids and torso have moved in training; what has not moved is left out.
+    """How far jaw, gaze, lids and torso have moved in training; what has not moved is left out."""
+    ranges = {name: shown_range(value.double().numpy()) for name, value in joint_values(training).items()}
+    return {name: (low, high) for name, (low, high) in ranges.items() if high - low > LEAST_RANGE}
+
+
+def joint_values(motion: Sequence[HeadParams]) -> dict[str, Float[Tensor, " T"]]:
+    """JOINTS in each frame; gaze is the left eye's.
 
     Radians about the x axis (jaw: opens; look_down; lean: the torso backwards) and the y axis (look_left: to the person's
     own left; turn: the torso to the right); lids from 0 (open) to about 1.
     """
-    stacked = {name: torch.stack([getattr(p, name) for p in training]) for name in ("jaw", "eyes", "neck", "eyelids")}
-    values = {
+    stacked = {name: torch.stack([getattr(p, name) for p in motion]) for name in ("jaw", "eyes", "neck", "eyelids")}
+    return {
         "jaw": _about_x(stacked["jaw"]),
         "look_down": _about_x(stacked["eyes"][:, :6]),
         "look_left": _about_y(stacked["eyes"][:, :6]),
@@ -87,8 +93,6 @@ def joint_ranges(training: Sequence[HeadParams]) -> dict[str, tuple[float, float
         "lean": _about_x(stacked["neck"]),
         "turn": _about_y(stacked["neck"]),
     }
-    ranges = {name: shown_range(value.double().numpy()) for name, value in values.items()}
-    return {name: (low, high) for name, (low, high) in ranges.items() if high - low > LEAST_RANGE}
 
 
 def posed(

@@ -19,7 +19,7 @@ from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
 
 from avatar.export.bake_texture import bake_texture
-from avatar.export.glb import encode_glb
+from avatar.export.glb import encode_glb, offsets
 from avatar.export.movie import limits_of, path_camera
 from avatar.export.ply import FIELDS, encode_ply
 from avatar.motion.orbit import seen_from
@@ -146,6 +146,15 @@ def test_a_mesh_has_the_pose_the_texture_and_the_expressions(trained: TrainedAva
     position = accessor(tree, buffer, gltf_mesh["primitives"][0]["attributes"]["POSITION"])
     assert position.shape == lid.shape
     np.testing.assert_allclose(position, mesh.vertices, atol=1e-6)
+
+
+def test_a_meshs_target_moves_one_joint_and_leaves_the_others(trained: TrainedAvatar) -> None:
+    """Whatever the others do in the frame: eyelids add up."""
+    params = trained.recording.params(4)
+    shut = replace(params, eyelids=torch.tensor([float(params.eyelids[0]), 0.7]))
+    of_open, of_shut = (offsets(trained, one)["left lid"] for one in (params, shut))
+    assert float(of_open.abs().max()) > 1e-4
+    torch.testing.assert_close(of_shut, of_open, atol=1e-6, rtol=0)
 
 
 def gltf_parts(data: bytes) -> tuple[dict, bytes]:
