@@ -40,7 +40,7 @@ _ENTRY = {
     "tracked": _FIGURES,
     "driven_by": ("tracked", "refined"),
     "frames": [str],
-    "lpips": {"note": str},
+    "lpips": {"note": str, "weights_sha256": str | None},
     "choices": {"summary": str},
     "bootstrap": {"block_frames": int},
 }
@@ -51,6 +51,11 @@ FORM = {
     "notes": [str],
     "tracking": {"tracker": str, "tracked": str, "refined": str, "rounds": [_ROUND]},
     "protocols": {"*": _ENTRY},
+}
+# Those of its keys that are there in every evaluation, beside `NEEDED`.
+_ALWAYS = {
+    *("choices", "lpips", "weights_sha256", "bootstrap", "block_frames", "means", "frames_sha256", "driven_by"),
+    *("tracker", "rounds", "measured_frames_trained_on"),
 }
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
 
@@ -172,8 +177,10 @@ def read_evaluation(label: str, run: Path) -> Evaluation:
 
 
 def _misfit(value: Any, form: Any, where: str = "") -> str:
-    """The first place where a value has another form; empty where it has this one."""
+    """The first place where a value has another form, or lacks a key of `_ALWAYS`; empty where it has this one."""
     if isinstance(form, dict) and isinstance(value, dict):
+        if lacking := sorted(_ALWAYS & form.keys() - value.keys()):
+            return f"{where}.{lacking[0]}"
         found = (_misfit(one, form.get(key, form.get("*", object)), f"{where}.{key}") for key, one in value.items())
         return next(filter(None, found), "")
     if isinstance(form, list) and isinstance(value, list):

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,13 @@ def test_damaged_and_missing_results_are_named(tmp_path: Path) -> None:
     (b / "eval" / "results.json").write_text(json.dumps(results))
     with pytest.raises(UserError, match="the names of its protocols"):
         compare_runs([a, b])
+    whole = json.loads((a / "eval" / "results.json").read_text())
+    for path in (("tracking", "rounds"), *(("protocols", "strict", key) for key in whole["protocols"]["strict"])):
+        damaged = json.loads(json.dumps(whole))
+        del reduce(dict.__getitem__, path[:-1], damaged)[path[-1]]
+        (b / "eval" / "results.json").write_text(json.dumps(damaged))
+        with pytest.raises(UserError, match=rf"results\.json is damaged \({'.'.join(path)}\): run avatar eval"):
+            compare_runs([a, b])
     (b / "eval" / "results.json").write_text("{")
     with pytest.raises(UserError, match=r"results\.json cannot be read"):
         compare_runs([a, b])

@@ -17,13 +17,14 @@ PLAIN, REFINED = "plain", "refined"
 
 def write_job(folder: Path, subject: str, variant: str, psnr: float, perceptual: str = "dssim", seen: int = 0) -> Job:
     job = Job(f"{subject}-{variant}", subject, variant, 0, {"folder": subject}, (), ("strict",))
-    entry: dict[str, Any] = {"driven_by": "tracked", "means": {"psnr": psnr}}
+    measured = {"choices": {}, "lpips": {"weights_sha256": None}, "bootstrap": {"block_frames": 1}}
+    entry: dict[str, Any] = {"driven_by": "tracked", "means": {"psnr": psnr}, "frames_sha256": ""}
     tracking: dict[str, Any] = {"tracker": "insta", "rounds": []}
     if subject == REFINED:
-        entry = {"driven_by": "refined", "means": {"psnr": psnr + 2}, "tracked": {"means": {"psnr": psnr}}}
+        entry = {**entry, "driven_by": "refined", "means": {"psnr": psnr + 2}, "tracked": entry}
         tracking |= {"refined": "fitted to its own picture", "rounds": [{"measured_frames_trained_on": seen}]}
     results = {"format": 3, "data_hash": "a", "head_fingerprint": "b", "image_size": [64, 64]}
-    results |= {"perceptual": perceptual, "tracking": tracking, "protocols": {"strict": entry}}
+    results |= {"perceptual": perceptual, "tracking": tracking, "protocols": {"strict": entry | measured}}
     path = folder / "jobs" / job.name / "run" / "eval" / "results.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(results))
