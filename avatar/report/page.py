@@ -65,14 +65,15 @@ def render_report(run: Run) -> str:
         "training frames": len(run.subject.split.train),
         "held-out frames": len(run.subject.split.test),
     }
+    title = f"Run {run.path.resolve().name}"
     parts = [
-        element("header", element("h1", f"Run {run.path.name}"), element("p", str(run.path), class_="soft")),
+        element("header", element("h1", title), element("p", str(run.path), class_="soft")),
         section("Held-out frames", *_main_figures(results), *_frames(run)),
         section("Held-out figures", *_figures(run, results)),
         section("Training", fold("Loss and PSNR", *_curves(run.path))),
         section("Run", tiles(facts), fold("Origin", *_origin(run, results))),
     ]
-    return document(f"Run {run.path.name}", parts, SCRIPT)
+    return document(title, parts, SCRIPT)
 
 
 def _main_figures(results: Mapping[str, Any] | None) -> list[Markup]:

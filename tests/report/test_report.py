@@ -97,9 +97,14 @@ def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
     assert "hypergaussians, by yaw" in page and "hypergaussians, by distance from the training expressions" in page
 
 
-def test_a_run_that_was_not_evaluated_says_so(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_was_not_evaluated_says_so(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "copy"))
     shutil.rmtree(copy / "eval")
+    monkeypatch.chdir(copy)
+    assert main(["report", "."]) == 0
+    assert "<h1>Run copy</h1>" in (copy / "report.html").read_text(encoding="utf-8")
     assert main(["report", str(copy)]) == 0
     assert "Not measured yet: avatar eval" in (copy / "report.html").read_text(encoding="utf-8")
     (copy / "eval").mkdir()
