@@ -30,6 +30,9 @@ MAX_ROUNDS = 10
 
 
 def run_train(arguments: Namespace) -> int:
+    if arguments.resume and (arguments.print_config or arguments.dry_run):
+        option = "--print-config" if arguments.print_config else "--dry-run"
+        raise UserError(f"{option} is for a new run: leave --resume out; a run's configuration is in its {RUN_FILE}")
     if arguments.print_config:
         print_config(config_overrides(arguments))
         return OK
@@ -87,8 +90,6 @@ def print_config(overrides: list[str]) -> None:
 def dry_run(arguments: Namespace) -> int:
     """What a new run would take, and its configuration."""
     overrides = config_overrides(arguments)
-    if arguments.resume:
-        raise UserError("--dry-run is for a new run: leave --resume out")
     if is_video(arguments.folder):
         raise UserError(f"{arguments.folder} is a video: give the folder that avatar track writes of it to --dry-run")
     if arguments.minutes is not None:

@@ -82,3 +82,8 @@ def test_the_printed_configuration_is_one_to_type() -> None:
     asked = ["experiment=paper", "trainer.seed=3", "data.background=#123456", f"data.test_cameras={cameras}"]
     lines = avatar("train", "--print-config", *asked).splitlines()
     assert "trainer.seed=3" in lines and load_config(lines) == load_config(asked)
+
+
+@pytest.mark.parametrize("option", ["--print-config", "--dry-run"])
+def test_a_printed_configuration_is_not_taken_for_a_runs(option: str) -> None:
+    assert f"{option} is for a new run" in avatar("train", "runs/me", "--resume", option, status=1)
