@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -49,12 +50,14 @@ def parse_backdrop(word: str) -> Backdrop:
     return Backdrop(word, torch.from_numpy(read_image(path)) / 255.0)
 
 
+@lru_cache(maxsize=1)  # every frame asks for the same
 def _covering(picture: Float[Tensor, "H W 3"], height: int, width: int) -> Float[Tensor, "height width 3"]:
-    """The middle of a picture that is scaled to cover a frame."""
-    scale = max(height / picture.shape[0], width / picture.shape[1])
-    size = max(round(picture.shape[1] * scale), width), max(round(picture.shape[0] * scale), height)
-    scaled = torch.from_numpy(
-        cv2.resize(picture.numpy(), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    """The middle of a picture that has the frame's shape, at the frame's size."""
+    H, W = picture.shape[:2]
+    rows, columns = min(H, max(1, round(W * height / width))), min(W, max(1, round(H * width / height)))
+    top, left = (H - rows) // 2, (W - columns) // 2
+    middle = picture[top : top + rows, left : left + columns].numpy()
+    shrinks = rows > height
+    return torch.from_numpy(
+        cv2.resize(middle, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     )
-    top, left = (size[1] - height) // 2, (size[0] - width) // 2
-    return scaled[top : top + height, left : left + width]

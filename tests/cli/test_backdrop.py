@@ -73,6 +73,9 @@ def test_what_lies_behind(run: Path, tracked_folder: Path, tmp_path: Path) -> No
     assert over.shape == (*rendering.alpha.shape, 3)
     corner, middle = over[0, 0].astype(int), over[0, over.shape[1] // 2].astype(int)
     assert abs(middle - [30, 200, 10]).max() < 4 or abs(corner - [30, 200, 10]).max() < 4, "the middle covers the frame"
+    cv2.imwrite(str(tmp_path / "narrow.png"), np.full((4000, 1, 3), (10, 200, 30), np.uint8))
+    over = parse_backdrop(str(tmp_path / "narrow.png")).pixels(rendering, trained.background)  # in little memory
+    assert over.shape == (*rendering.alpha.shape, 3) and abs(over[0, 0].astype(int) - [30, 200, 10]).max() < 4
 
 
 @pytest.mark.parametrize(("suffix", "options"), [(".mov", ()), (".webm", ("-c:v", "libvpx-vp9"))])
