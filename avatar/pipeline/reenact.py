@@ -102,6 +102,8 @@ def reenact(
     own = trained.rest_camera()
     cameras = choose_cameras(drive, own, choices.camera, choices.intrinsics)
     if choices.camera == "target" or drive.cameras is None:  # the torso turns against a head that does not
+        if choices.intrinsics == "target":
+            say("Note: --intrinsics target changes nothing: the avatar's own camera sees all frames")
         neck = trained.rest_params().neck
         moved = [replace(params, neck=neck) for params in moved]
     if choices.camera == "driver" and choices.intrinsics == "driver":

@@ -115,6 +115,8 @@ def test_another_lens_is_warned_of_where_it_shows(
     assert "Warning: the driver's camera sees 39.3 degrees, the avatar's 20.2" in warned
     assert "--intrinsics target keeps its own lens" in warned
     assert "Warning" not in avatar("reenact", trained, *options, "--intrinsics", "target")
+    still = ("--camera", "target", "--intrinsics", "target")
+    assert "--intrinsics target changes nothing" in avatar("reenact", trained, *options, *still)
     assert "Warning" not in avatar("reenact", trained, *options, "--camera", "target")
 
 
