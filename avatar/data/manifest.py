@@ -66,6 +66,13 @@ class Manifest:
     rig: CameraRig | None = None  # of several cameras; None: one. Size and intrinsics above are of its first camera
     labels: dict[str, int] = field(default_factory=dict)  # of masks that are label images: what is read as 255
 
+    def number(self, index: int) -> int:
+        """What a folder of refined tracking numbers a frame by: its image's number; with several cameras, as it was first
+        refined, its index."""
+        if self.rig is None:
+            return self.frames[index].tracking + self.frame_offset
+        return index if self.refinement is None else int(self.frames[index].name)
+
     def to_json(self) -> str:
         return json.dumps({"version": MANIFEST_VERSION, **asdict(self)}, indent=1, allow_nan=False)
 

@@ -103,13 +103,6 @@ class Subject:
         """With what the tracker left, where the tracking has been refined since."""
         return self if self.given is None else replace(self, recording=self.given, given=None)
 
-    def refuse_several_cameras(self, what: str) -> None:
-        """Raise UserError, where there are several cameras, for what one is needed for."""
-        if self.recording.rig is not None:
-            raise UserError(
-                f"{self.name} has {len(self.recording.cameras)} cameras, and {what} is for one; name it with --cameras"
-            )
-
     def image_size(self, size: int | None = None, index: int | None = None) -> tuple[int, int]:
         """As `Recording.image_size`."""
         return self.recording.image_size(size, index)

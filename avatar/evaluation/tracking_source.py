@@ -62,7 +62,7 @@ def describe_tracking(run: Run, measured: Sequence[int]) -> dict[str, Any]:
     refinement = manifest.refinement
     if refinement is None:
         return {"tracking": "tracked", "tracker": manifest.format, "tracked": OF_TRACKERS, "rounds": []}
-    numbers = [manifest.frames[index].tracking for index in measured]
+    numbers = [manifest.number(index) for index in measured]
     return {
         "tracking": "refined",
         "tracker": refinement.tracker,

@@ -34,7 +34,6 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
     if rounds:
         refuse_features(config.model, "--refine")
-        subject.refuse_several_cameras("--refine")
     check_divided(subject.split)
     config, size = config_for_subject(config, subject), subject.image_size(config.data.size)
     frames = len(subject.split.train)

@@ -140,8 +140,7 @@ def steps_in_time(
     Raises UserError where they allow too few.
     """
     config = load_config(overrides)
-    subject, assets = open_subject(source, config.data.test_frames, print)
-    subject.refuse_several_cameras("--refine")
+    subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
     frames = len(subject.split.train)
     asked = within_epochs(config.trainer, frames).iterations
     if minutes is None:

@@ -18,7 +18,7 @@ from avatar.pose_refinement.record import frames_csv, sheet, summary
 from avatar.pose_refinement.refine_subject import fingerprint, refine_subject
 from avatar.runs.model_registry import refuse_features
 from avatar.runs.run import Run
-from data_prep.formats.refined_folder import check_target, frame_numbers, write_folder
+from data_prep.formats.refined_folder import check_target, write_folder
 
 REFINED_FOLDER = "refined"
 MANY_PASSES = 2 * FIRST_PASSES
@@ -27,13 +27,14 @@ MANY_PASSES = 2 * FIRST_PASSES
 def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     """Write the run's subject with refined tracking to `target`; `device` stands in for the configuration's."""
     check_target(target)
-    run.subject.refuse_several_cameras("the refinement of a tracking")
     refuse_features(run.config.model, "the refinement of a tracking")
     run.avatar.to(choose_device(device or run.config.device, print))
     subject, config = run.subject, run.config
     background = torch.tensor(config.data.background)
+    recording = subject.recording
+    by = "" if recording.rig is None else f", pictures of {len(recording.times(range(len(subject))))} times,"
     print(
-        f"Refining {len(subject)} frames of {subject.name} through the avatar of {run.path}, trained on "
+        f"Refining {len(subject)} frames{by} of {subject.name} through the avatar of {run.path}, trained on "
         f"{len(subject.split.train)} of them"
     )
     begin = time.monotonic()
@@ -68,8 +69,7 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
 def next_refinement(run: Run) -> Refinement:
     """What the subject's refinement becomes by one more round through the run's avatar."""
     subject = run.subject
-    numbers = frame_numbers(subject)
-    trained_on = tuple(sorted(numbers[index] for index in subject.split.train))
+    trained_on = tuple(sorted(subject.manifest.number(index) for index in subject.split.train))
     this = Round(str(run.path.resolve()), run.step, fingerprint(run.avatar), trained_on)
     before = subject.manifest.refinement
     if before is None:

@@ -3,7 +3,9 @@
 How the picture changes with each value hardly differs between the frames of one person. So the curvature (Gauss-Newton,
 J^T J) is measured on a few frames once, by drawing each with every value moved a little, and serves all frames: the first
 step of a frame is a Gauss-Newton step for the price of a gradient. Corrections for the frame itself come from the
-gradients along the way. Source: Nocedal and Wright, "Numerical optimization" (2006), algorithm 7.4 (L-BFGS).
+gradients along the way. With several cameras a frame is what they all saw at one time.
+
+Source: Nocedal and Wright, "Numerical optimization" (2006), algorithm 7.4 (L-BFGS).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avatar.compute.device import on_gpu
-from avatar.pose_refinement.frame_fitter import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, FrameFitter, Target
+from avatar.pose_refinement.frame_fitter import HUBER_DELTA, OBSERVATIONS, PIXEL_SIGMA, FrameFitter, Pictures, Target
 from avatar.pose_refinement.parameterization import PoseParameterization
 from avatar.pose_refinement.tracking_values import HeadPose
 
@@ -31,49 +33,55 @@ COARSE_ENOUGH = 1e-2  # where a finer picture follows
 
 @dataclass(frozen=True)
 class Problem:
-    """One frame: what it shows and what its tracking may become."""
+    """One time: what its cameras saw and what its tracking may become."""
 
     given: HeadPose
-    targets: Sequence[Target]  # by level, full size first
-    frame: int  # of the parameterization
+    targets: Sequence[Sequence[Target]]  # by level, full size first; a target for each picture
+    row: int  # of the parameterization
     parameterization: PoseParameterization
 
 
 @torch.no_grad()
 def curvature(fitter: FrameFitter, problem: Problem, level: int) -> Float[Tensor, "F F"]:
-    """J^T J of the misfit in the frame's moves at the given tracking, pixels weighted as the Huber loss weights them."""
-    target, parameterization = problem.targets[level], problem.parameterization
+    """J^T J of the misfit in the time's moves at the given tracking, pixels weighted as the Huber loss weights them."""
+    targets, parameterization = problem.targets[level], problem.parameterization
     moves = torch.zeros(len(parameterization.index), device=parameterization.unit.device)
 
-    def picture(moves: Tensor) -> Tensor:
-        return fitter.picture(parameterization.values(problem.frame, moves), problem.given, target)
+    def pictures(moves: Tensor) -> Pictures:
+        return fitter.pictures(parameterization.values(problem.row, moves), problem.given, targets)
 
-    before = picture(moves)
-    error = (before - target.picture).abs()
-    root = torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt()
-    probes = PROBE * torch.eye(len(moves), dtype=torch.float64, device=moves.device)
-    columns = [
-        ((picture((moves.double() + probe).to(moves.dtype)) - before) * root).flatten() / PROBE for probe in probes
-    ]
-    jacobian = torch.stack(columns, dim=1)
-    return OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian.T @ jacobian) / (3.0 * target.area)
+    before = pictures(moves)
+    roots = []
+    for picture, target in zip(before, targets, strict=True):
+        error = (picture - target.picture).abs()
+        roots.append(torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt())
+    columns: list[list[Tensor]] = [[] for _ in targets]
+    for probe in PROBE * torch.eye(len(moves), dtype=torch.float64, device=moves.device):
+        probed = pictures((moves.double() + probe).to(moves.dtype))
+        for own, picture, still, root in zip(columns, probed, before, roots, strict=True):
+            own.append(((picture - still) * root).flatten() / PROBE)
+    found = []
+    for own, target in zip(columns, targets, strict=True):
+        jacobian = torch.stack(own, dim=1)
+        found.append(OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian.T @ jacobian) / (3.0 * target.area))
+    return torch.stack(found).sum(dim=0)
 
 
 class Descent(NamedTuple):
     moves: Float[Tensor, " F"]
-    picture: Float[Tensor, "h w 3"]  # with them, at full size
+    pictures: Pictures  # with them, at full size
 
 
 def descend(
     fitter: FrameFitter, problem: Problem, factors: Sequence[Float[Tensor, "F F"]], steps: Sequence[int]
 ) -> Descent:
-    """The moves of a frame that minimise misfit + half their squared length, within their bounds.
+    """The moves of a time that minimise misfit + half their squared length, within their bounds.
 
     factors   lower Cholesky factors of the curvature with the prior's, by level
     steps     of each level at most; the coarsest, which is the last, comes first
     """
     still = torch.zeros(len(problem.parameterization.index), device=problem.parameterization.unit.device)
-    found = Descent(still, problem.targets[0].picture)
+    found = Descent(still, [target.picture for target in problem.targets[0]])
     for level in reversed(range(len(problem.targets))):
         found = _descend_level(fitter, problem, level, found.moves, factors[level], steps[level])
     return found
@@ -82,13 +90,13 @@ def descend(
 def _descend_level(
     fitter: FrameFitter, problem: Problem, level: int, moves: Tensor, factor: Tensor, steps: int
 ) -> Descent:
-    low, high = problem.parameterization.bounds(problem.frame)
-    target, unit, index = problem.targets[level], problem.parameterization.unit, problem.parameterization.index
+    low, high = problem.parameterization.bounds(problem.row)
+    targets, unit, index = problem.targets[level], problem.parameterization.unit, problem.parameterization.index
 
     def evaluate(moves: Tensor) -> _Point:
-        fit = fitter.fit(problem.parameterization.values(problem.frame, moves), problem.given, target)
+        fit = fitter.fit(problem.parameterization.values(problem.row, moves), problem.given, targets)
         value = fit.misfit.double() + 0.5 * (moves @ moves).double()
-        return _Point(moves, value, fit.gradient[index] * unit + moves, fit.picture)
+        return _Point(moves, value, fit.gradient[index] * unit + moves, fit.pictures)
 
     decide = _Decisions(on_gpu(moves))
     memory: deque[_Curved] = deque(maxlen=MEMORY)
@@ -105,17 +113,17 @@ def _descend_level(
         gain = best.value - trial.value
         length = decide.choose(better, torch.ones_like(length), length * SHRINK)
         ended = ended | (better & (gain < (COARSE_ENOUGH if level else ENOUGH) * trial.value))
-        best = _Point(*(decide.choose(better, new, old) for new, old in zip(trial, best, strict=True)))
+        best = decide.choose_point(better, trial, best)
         if decide.is_sure(ended):
             break
-    return Descent(best.moves, best.picture)
+    return Descent(best.moves, best.pictures)
 
 
 class _Point(NamedTuple):
     moves: Float[Tensor, " F"]
     value: Float[Tensor, ""]  # float64
     gradient: Float[Tensor, " F"]
-    picture: Float[Tensor, "h w 3"]
+    pictures: Pictures
 
 
 class _Curved(NamedTuple):
@@ -141,6 +149,13 @@ class _Decisions(NamedTuple):
         if self.later:
             return torch.where(condition, new, old)
         return new if bool(condition) else old
+
+    def choose_point(self, condition: Bool[Tensor, ""], new: _Point, old: _Point) -> _Point:
+        if not self.later:
+            return new if bool(condition) else old
+        pairs = zip((*new[:3], *new.pictures), (*old[:3], *old.pictures), strict=True)
+        moves, value, gradient, *pictures = (torch.where(condition, *pair) for pair in pairs)
+        return _Point(moves, value, gradient, pictures)
 
 
 def _quasi_newton(

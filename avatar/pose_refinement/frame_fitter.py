@@ -1,7 +1,8 @@
-"""How well the avatar's picture of a frame fits the frame, as a function of the frame's tracking, with its gradient."""
+"""How well the avatar's pictures of a time fit what its cameras saw, as a function of the tracking, with its gradient."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -32,6 +33,7 @@ class Target(NamedTuple):
     """What the avatar is compared with, at one size."""
 
     camera: Camera
+    place: HeadPose | None  # of the camera: p_cam = R p_ref + t; None: it is the reference camera
     box: tuple[slice, slice]  # rows and columns that are compared
     picture: Float[Tensor, "h w 3"]  # of the box
     mask: Float[Tensor, "h w"]  # of the head
@@ -40,10 +42,13 @@ class Target(NamedTuple):
 
     def on(self, device: torch.device) -> Target:
         """The pictures there."""
-        return self._replace(picture=to_device(self.picture, device), mask=to_device(self.mask, device))
+        place = None if self.place is None else self.place.on(device)
+        return self._replace(picture=to_device(self.picture, device), mask=to_device(self.mask, device), place=place)
 
 
-def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Target] | None:
+def targets(
+    frame: Frame, background: Float[Tensor, 3], levels: int, place: HeadPose | None = None
+) -> list[Target] | None:
     """The frame at its own size and at `levels` - 1 halves of it; None where no head is to be seen."""
     picture, mask = frame.composite(background), frame.head_mask
     if bounding_box(mask) is None:
@@ -63,6 +68,7 @@ def targets(frame: Frame, background: Float[Tensor, 3], levels: int) -> list[Tar
         made.append(
             Target(
                 camera=camera,
+                place=place,
                 box=(rows, columns),
                 picture=small[rows, columns].contiguous(),
                 mask=head[rows, columns].contiguous(),
@@ -84,17 +90,25 @@ def resized(image: Tensor, width: int, height: int) -> Tensor:
     return torch.from_numpy(cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA))
 
 
-def head_psnr(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
-    """Of the head alone, dB, float64."""
-    return psnr(picture.clamp(0.0, 1.0), target.picture, target.mask)
+Pictures = Sequence[Float[Tensor, "_ _ 3"]]  # of each target its box
+
+
+def head_psnr(pictures: Pictures, targets: Sequence[Target]) -> Float[Tensor, ""]:
+    """Of the head alone, dB, float64; the mean over the pictures."""
+    return torch.stack(
+        [
+            psnr(picture.clamp(0.0, 1.0), target.picture, target.mask)
+            for picture, target in zip(pictures, targets, strict=True)
+        ]
+    ).mean()
 
 
 class Fit(NamedTuple):
-    """Of one frame at one tracking."""
+    """Of one time at one tracking."""
 
     misfit: Float[Tensor, ""]
-    gradient: Float[Tensor, " P"]  # of the misfit in the frame's values
-    picture: Float[Tensor, "h w 3"]
+    gradient: Float[Tensor, " P"]  # of the misfit in the time's values
+    pictures: Pictures
 
 
 @dataclass(frozen=True)
@@ -108,39 +122,48 @@ class FrameFitter:
     background: Float[Tensor, 3]
     centre: Float[Tensor, 3]  # that the head turns about, metres
 
-    def picture(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, "h w 3"]:
-        """The avatar in the target's box; without a gradient."""
+    def pictures(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Pictures:
+        """The avatar in the targets' boxes; without a gradient."""
         with torch.no_grad():
-            return self._draw(values, given, target)
+            return self._draw(values, given, targets)
 
-    def figures(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, 2]:
+    def figures(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Float[Tensor, 2]:
         """Misfit, and PSNR of the head alone in dB, where the avatar is, float64; without a gradient."""
-        picture = self.picture(values, given, target)
-        return torch.stack((misfit(picture, target).double(), head_psnr(picture, target)))
+        pictures = self.pictures(values, given, targets)
+        return torch.stack((misfit(pictures, targets).double(), head_psnr(pictures, targets)))
 
-    def fit(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Fit:
-        """How far the avatar's picture is from the target's, and how that changes with the values."""
+    def fit(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Fit:
+        """How far the avatar's pictures are from the targets', and how that changes with the values."""
         values = values.detach().requires_grad_()
-        picture = self._draw(values, given, target)
-        error = misfit(picture, target)
+        pictures = self._draw(values, given, targets)
+        error = misfit(pictures, targets)
         (gradient,) = torch.autograd.grad(error, values)
-        return Fit(error.detach(), gradient, picture.detach())
+        return Fit(error.detach(), gradient, [picture.detach() for picture in pictures])
 
     @cached_property
     def _mesh(self) -> HeadModel:
         return self.avatar.mesh.on(self.centre.device)
 
-    def _draw(self, values: Float[Tensor, " P"], given: HeadPose, target: Target) -> Float[Tensor, "h w 3"]:
+    def _draw(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Pictures:
         """Blurred by as much of the scene as at full size; differentiable in the values."""
         pose, params = moved_pose(values, given, self.centre), head_params(values)
         vertices = self._mesh.vertices(params) if torch.is_grad_enabled() else self.avatar.vertices(params)
         gaussians = self.avatar(params, vertices, pose.R)
-        camera = replace(target.camera, R_cam_world=pose.R, t_cam_world=pose.t)
-        blur = target.shrink * self.avatar.config.blur
-        return self.avatar.draw(gaussians, camera, self.background, region=target.box, blur=blur).image[target.box]
+        pictures = []
+        for target in targets:
+            R, t = pose if target.place is None else (target.place.R @ pose.R, target.place.R @ pose.t + target.place.t)
+            camera = replace(target.camera, R_cam_world=R, t_cam_world=t)
+            blur = target.shrink * self.avatar.config.blur
+            drawing = self.avatar.draw(gaussians, camera, self.background, region=target.box, blur=blur)
+            pictures.append(drawing.image[target.box])
+        return pictures
 
 
-def misfit(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
+def misfit(pictures: Pictures, targets: Sequence[Target]) -> Float[Tensor, ""]:
     """Half the sum of squared errors, in observations; of large errors less."""
+    return torch.stack([_misfit(*pair) for pair in zip(pictures, targets, strict=True)]).sum()
+
+
+def _misfit(picture: Float[Tensor, "h w 3"], target: Target) -> Float[Tensor, ""]:
     total = huber_loss(picture, target.picture, delta=HUBER_DELTA, reduction="sum")
     return OBSERVATIONS / PIXEL_SIGMA**2 * total / (3.0 * target.area)

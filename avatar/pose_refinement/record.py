@@ -28,15 +28,18 @@ SHEET_FRAMES = 4  # evenly spread over the held-out ones, besides those that gai
 
 
 def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> str:
-    """A line for each frame: how well the head fitted before and after (dB), and how far it was turned and shifted."""
+    """A line for each frame: how well the head fitted before and after (dB), and how far it was turned and shifted. With
+    several cameras a line for each time, with the name of its first picture."""
     turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    parts = {index: part for part in ("train", "test") for index in getattr(subject.split, part)}
-    for index, name in enumerate(subject.recording.names):
-        figures = (refined.before[index], refined.after[index], math.degrees(turns[index]), 1e3 * shifts[index])
-        writer.writerow((index, name, parts.get(index, ""), *(f"{figure:.4f}" for figure in figures)))
+    recording = subject.recording
+    parts = {row: part for part, rows in _rows_of_parts(recording).items() for row in rows}
+    for index in recording.moments(range(len(recording))):
+        row = recording.time(index)
+        figures = (refined.before[row], refined.after[row], math.degrees(turns[row]), 1e3 * shifts[row])
+        writer.writerow((row, recording.names[index], parts.get(row, ""), *(f"{figure:.4f}" for figure in figures)))
     return text.getvalue()
 
 
@@ -54,13 +57,14 @@ def movements(
 def summary(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> list[str]:
     """For people."""
     lines = []
-    for part, title in (("train", "training frames"), ("test", "held-out frames")):
-        chosen = list(getattr(subject.split, part))
-        before, after = (_mean(values[chosen]) for values in (refined.before, refined.after))
-        lines.append(
-            f"{title + ':':17} head-only PSNR {before:.2f} -> {after:.2f} dB with the avatar as it is, each frame "
-            "fitted to its own picture"
-        )
+    rows_of, titles = _rows_of_parts(subject.recording), {"train": "training frames", "test": "held-out frames"}
+    fitted = "each frame fitted to its own picture" if subject.recording.rig is None else "each time to its pictures"
+    for part, title in titles.items():
+        if rows := rows_of[part]:
+            before, after = (_mean(values[rows]) for values in (refined.before, refined.after))
+            lines.append(
+                f"{title + ':':17} head-only PSNR {before:.2f} -> {after:.2f} dB with the avatar as it is, {fitted}"
+            )
     turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
     turn, shift = math.degrees(float(np.median(turns))), 1e3 * float(np.median(shifts))
     lines.append(f"{'moved:':17} {turn:.2f} degrees and {shift:.2f} mm, medians")
@@ -78,7 +82,9 @@ def sheet(
     """A PNG file: a row for each of some frames, truth, avatar before and after, and the errors of both."""
     renderer = Renderer(avatar, background)
     rows: list[UInt8[np.ndarray, "H W 3"]] = []
-    for index in sheet_frames(subject.split.test, refined):
+    pictures = {subject.recording.time(index): index for index in subject.recording.moments(subject.split.test)}
+    for row in sheet_frames(list(pictures), refined):
+        index = pictures[row]
         frame = subject.frame(index, size)
         truth = frame.composite(background)
         weight = frame.head_mask[..., None]
@@ -90,8 +96,8 @@ def sheet(
         errors = [error_map(render * weight, truth * weight, ERROR_SCALE) for render in renders]
         captions = (
             f"truth of {frame.name}",
-            f"before, {refined.before[index]:.2f} dB",
-            f"after, {refined.after[index]:.2f} dB",
+            f"before, {refined.before[row]:.2f} dB",
+            f"after, {refined.after[row]:.2f} dB",
             f"error before, 0 to {ERROR_SCALE:g}",
             "error after",
         )
@@ -103,6 +109,13 @@ def sheet_frames(test: Sequence[int], refined: Refined) -> list[int]:
     """Held-out frames for the sheet, in order."""
     gain = np.where(np.isfinite(refined.after - refined.before), refined.after - refined.before, 0.0)[list(test)]
     return sorted({*evenly_spread(test, SHEET_FRAMES), test[int(gain.argmax())], test[int(gain.argmin())]})
+
+
+def _rows_of_parts(recording: Recording) -> dict[str, list[int]]:
+    """Rows of the tracks that training has seen, and the others that are measured."""
+    train, test = (recording.times(indices) for indices in recording.split)
+    seen = set(train)
+    return {"train": train, "test": [row for row in test if row not in seen]}
 
 
 def _mean(values: Float[np.ndarray, " T"]) -> float:

@@ -1,7 +1,8 @@
 """A whole subject: every frame's tracking moved until the trained avatar's picture of it fits, then smoothed over time.
 
 The avatar stands still; frames are independent until the smoothing, so that they are refined side by side and an
-interruption loses a few seconds. What is found does not depend on the number of threads.
+interruption loses a few seconds. What is found does not depend on the number of threads. With several cameras, a frame
+here is a row of the tracks: one time, and one move for the pictures of all its cameras.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from tqdm import tqdm
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.interruption import interruption
 from avatar.compute.native import thread_count
+from avatar.data.recording import Recording
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
@@ -80,11 +82,11 @@ def refine_subject(
         key = work.key()
         moves, figures = read_progress(progress, key, len(work.parameterization.index))
         if len(moves):
-            say(f"going on after {len(moves)} of {len(subject)} frames ({progress})")
+            say(f"going on after {len(moves)} of {work.count} frames ({progress})")
         matrices = work.curvatures()
         factors = work.factors(matrices)
-        todo = range(len(moves), len(subject))
-        with tqdm(total=len(subject), initial=len(moves), desc="refine", unit="frame", dynamic_ncols=True) as bar:
+        todo = range(len(moves), work.count)
+        with tqdm(total=work.count, initial=len(moves), desc="refine", unit="frame", dynamic_ncols=True) as bar:
             for found in work.refined(todo, factors):
                 moves.append(found.moves)
                 figures.append(found.figures)
@@ -117,7 +119,7 @@ def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, backgr
         list(work.refined(frames, factors))
         list(work.measured(frames, work.parameterization.given))
         end = time.perf_counter()
-    return (middle - begin) * SAMPLES / workers + (end - middle) * len(subject) / len(frames)
+    return (middle - begin) * SAMPLES / workers + (end - middle) * work.count / len(frames)
 
 
 @contextmanager
@@ -140,6 +142,33 @@ def fingerprint(avatar: Avatar) -> str:
     return digest.hexdigest()
 
 
+def fitted_pictures(recording: Recording) -> list[list[int]]:
+    """Of each row of the tracks the pictures that its tracking is fitted to.
+
+    With several cameras, of a time that training sees its training pictures alone. Of another one those of the cameras
+    that are trained on, if there are any.
+    """
+    of_row: dict[int, list[int]] = {}
+    for index in range(len(recording)):
+        of_row.setdefault(recording.time(index), []).append(index)
+    train = set(recording.split.train)
+    cameras = {recording.view(index) for index in train}
+    return [
+        [index for index in own if index in train]
+        or [index for index in own if recording.view(index) in cameras]
+        or own
+        for _, own in sorted(of_row.items())
+    ]
+
+
+def camera_place(recording: Recording, index: int) -> HeadPose | None:
+    """Of the camera that took a picture: p_cam = R p_ref + t; None with one camera."""
+    if recording.rig is None:
+        return None
+    camera = recording.cameras[recording.view(index)]
+    return HeadPose(torch.tensor(camera.R).reshape(3, 3), torch.tensor(camera.t))
+
+
 class _Work:
     """An avatar and a subject, with what refining any of its frames needs."""
 
@@ -149,7 +178,10 @@ class _Work:
         self.device, self.is_gpu = avatar.device, on_gpu(avatar.quats)
         self.fitter = FrameFitter(avatar, to_device(background, self.device), to_device(self.centre, self.device))
         self.tracks = subject.recording.tracks
-        self.parameterization = find_parameterization(self.tracks, subject.split.train, self.centre)
+        self.train = subject.recording.times(subject.split.train)
+        self.pictures = fitted_pictures(subject.recording)
+        self.count = len(self.pictures)
+        self.parameterization = find_parameterization(self.tracks, self.train, self.centre)
         self.there = self.parameterization.on(self.device)
         self.levels = coarse_levels(subject.image_size(size)[0])
 
@@ -162,9 +194,15 @@ class _Work:
     def pose(self, frame: int) -> HeadPose:
         return HeadPose(self.tracks["R"][frame], self.tracks["t"][frame]).on(self.device)
 
-    def targets(self, frame: int, levels: int) -> list[Target] | None:
-        made = targets(self.subject.frame(frame, self.size), self.background, levels)
-        return made if made is None else [target.on(self.device) for target in made]
+    def targets(self, frame: int, levels: int) -> list[list[Target]] | None:
+        """By level, of each picture in which a head is to be seen; None where there is none."""
+        by_picture = []
+        for index in self.pictures[frame]:
+            place = camera_place(self.subject.recording, index)
+            made = targets(self.subject.frame(index, self.size), self.background, levels, place)
+            if made is not None:
+                by_picture.append([target.on(self.device) for target in made])
+        return [list(level) for level in zip(*by_picture, strict=True)] or None
 
     def factors(self, matrices: Sequence[Float[Tensor, "F F"]]) -> list[Float[Tensor, "F F"]]:
         """Lower Cholesky factors, where the avatar is."""
@@ -172,7 +210,7 @@ class _Work:
 
     def samples(self, count: int) -> list[int]:
         """Training frames, evenly spread; fewer where there are fewer."""
-        return evenly_spread(self.subject.split.train, count)
+        return evenly_spread(self.train, count)
 
     def curvatures(self, count: int = SAMPLES) -> list[Float[Tensor, "F F"]]:
         """By level: the mean over a few training frames, with the prior's, which is one."""
@@ -224,14 +262,15 @@ class _Work:
         problem = Problem(self.pose(frame), made, frame, self.there)
         found = descend(self.fitter, problem, factors, [FINE_STEPS, *[COARSE_STEPS] * (self.levels - 1)])
         before = self.fitter.figures(self.there.given[frame], problem.given, made[0])
-        return torch.cat((found.moves.double(), before, head_psnr(found.picture, made[0])[None]))
+        return torch.cat((found.moves.double(), before, head_psnr(found.pictures, made[0])[None]))
 
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, keep the given tracking of frames that then fit no better than with it, and centre the rest."""
         parameterization = self.parameterization
-        numbers = np.array([record.tracking for record in self.subject.manifest.frames])
+        records = self.subject.manifest.frames
+        numbers = np.array([records[index].tracking for index in self.subject.recording.moments(range(len(records)))])
         trained_on = torch.zeros(len(moves), dtype=torch.bool)
-        trained_on[list(self.subject.split.train)] = True
+        trained_on[self.train] = True
         for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one
             given, own_numbers = parameterization.acceleration[part], numbers[part.numpy()]
             moves[part] = smoothed(moves[part], matrix, given, parameterization.calm, own_numbers)

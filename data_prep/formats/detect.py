@@ -38,9 +38,7 @@ def open_tracked_folder(
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
-        if cameras not in (None, ALL, FRONT):
-            raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
-        return refined_folder.open_folder(folder)
+        return refined_folder.open_folder(folder, cameras or ALL)
     is_listed = folder.is_dir() and (format is None or format in _LISTED)
     frames = read_listings(folder) if is_listed else []
     name = format or detect_format(folder, frames)

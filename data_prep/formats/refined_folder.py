@@ -1,12 +1,14 @@
 """The folder that `avatar refine` writes: one of avatar track's, with how it was refined and what it was before.
 
     FOLDER/tracking.json, tracking.npz, frames/, matte/, head/, mouth/    as in `avatar_track`
-    FOLDER/refinement.json     through which avatars, what they had been trained on, the division into training and test
+    FOLDER/refinement.json     through which avatars, what they had been trained on, the division into training and test;
+                               of several cameras their lenses and places, and the camera and time of each picture
     FOLDER/given.npz           the tracker's own tracking of the same frames, in the layout of tracking.npz
     FOLDER/refinement.csv      of each frame: how well it fitted before and after, and how far it moved
     FOLDER/refinement.png      some frames: as they are, with the tracking before and after
 
-Pictures and masks are hard links to those of the subject, or copies where there can be none.
+Pictures and masks are hard links to those of the subject, or copies where there can be none. With several cameras,
+tracking.npz has a row for each time, with the head's pose before the first of them, and pictures are numbered from 0.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -31,32 +34,36 @@ from avatar.files.read import is_there
 from data_prep.formats import avatar_track
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
 from data_prep.formats.frame_track import FrameTrack, Tracking
+from data_prep.formats.refined_rig import of_several_cameras, parse_pictures
 from data_prep.formats.tracked_folder import TrackedFolder
+from data_prep.formats.train_test_split import ALL, FRONT
 from data_prep.formats.transforms import read_json
 
 REFINEMENT_FILE, GIVEN_FILE = "refinement.json", "given.npz"
 HEAD_MODEL = "head_model"
-VERSION = 2
+VERSION = 3
 
 
-def open_folder(folder: Path) -> TrackedFolder:
-    """A folder of avatar track, refined or not. Raises UserError for one that is not whole."""
+def open_folder(folder: Path, cameras: str = ALL) -> TrackedFolder:
+    """A folder of avatar track, refined or not; `cameras` as in `vhap`. Raises UserError for one that is not whole."""
     tracked = avatar_track.open_folder(folder)
     path = folder / REFINEMENT_FILE
     if not is_there(path):
-        return tracked
+        return _of_one(tracked, cameras, folder)
     raw = read_json(path)
     if not isinstance(raw, dict) or raw.get("version") != VERSION:
         raise UserError(f"{path} is not of version {VERSION}, which this program reads; refine again")
     try:
         refinement = Refinement.from_dict(raw.get("refinement"))
         division = {int(number): str(part) for number, part in dict(raw["division"]).items()}
+        pictures = None if raw["rig"] is None else parse_pictures(raw["rig"])
     except (UserError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is damaged ({error}); refine again") from None
     last = refinement.rounds[-1]
     note = f"the tracking of {refinement.tracker} was refined through the avatar of {last.run} (step {last.step})"
-    files = replace(tracked.files, listings=(*tracked.files.listings, path, folder / GIVEN_FILE))
-    return replace(
+    given = folder / GIVEN_FILE
+    files = replace(tracked.files, listings=(*tracked.files.listings, path, given))
+    refined = replace(
         tracked,
         files=files,
         division=division,
@@ -64,6 +71,17 @@ def open_folder(folder: Path) -> TrackedFolder:
         refinement=refinement,
         read_given=lambda complain: _read_given(folder, files.tracking, complain),
     )
+    return (
+        _of_one(refined, cameras, folder)
+        if pictures is None
+        else of_several_cameras(refined, pictures, cameras, folder)
+    )
+
+
+def _of_one(tracked: TrackedFolder, cameras: str, folder: Path) -> TrackedFolder:
+    if cameras not in (ALL, FRONT):
+        raise UserError(f"--cameras is for folders of several cameras, and {folder} is of one")
+    return tracked
 
 
 def _read_given(folder: Path, tracked: Mapping[int, Path], complain: Callable[[str], object]) -> Tracking:
@@ -94,15 +112,25 @@ def write_folder(
         avatar_track.write_tracking(building, info, _frame_tracks(subject, given))
         (building / avatar_track.TRACKS_FILE).rename(building / GIVEN_FILE)
         avatar_track.write_tracking(building, info, _frame_tracks(subject, tracks))
-        content = {"version": VERSION, "refinement": refinement.to_dict(), "division": _division(subject)}
+        content = {
+            "version": VERSION,
+            "refinement": refinement.to_dict(),
+            "division": _division(subject),
+            "rig": _rig(subject),
+        }
         (building / REFINEMENT_FILE).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         for name, data in extras.items():
             (building / name).write_bytes(data)
 
 
 def frame_numbers(subject: Subject) -> list[int]:
-    """The number of each frame in a refined folder: its image's."""
-    return [record.tracking + subject.manifest.frame_offset for record in subject.manifest.frames]
+    """The number of each frame in a refined folder."""
+    return [subject.manifest.number(index) for index in range(len(subject))]
+
+
+def _rig(subject: Subject) -> dict[str, Any] | None:
+    rig = subject.recording.rig
+    return None if rig is None else rig.to_dict() | {"numbers": frame_numbers(subject)}
 
 
 def _link_pictures(building: Path, subject: Subject) -> None:
@@ -145,7 +173,8 @@ def _link(source: Path, target: Path) -> None:
 
 def _info(subject: Subject, head_path: str) -> TrackingInfo:
     manifest = subject.manifest
-    left_out = {int(match[0]): why for name, why in manifest.left_out.items() if (match := re.search(r"\d+$", name))}
+    numbered = {re.search(r"\d+$", name): why for name, why in manifest.left_out.items()}
+    left_out = {int(match[0]): why for match, why in numbered.items() if match and manifest.rig is None}
     focal, is_assumed = "that of the tracking before", False
     if manifest.format == avatar_track.NAME:
         before = avatar_track.read_info(Path(manifest.source))
@@ -168,6 +197,9 @@ def _info(subject: Subject, head_path: str) -> TrackingInfo:
 def _frame_tracks(subject: Subject, tracks: Mapping[str, Tensor]) -> dict[int, FrameTrack]:
     recording: Recording = subject.recording
     arrays = {name: value.double().numpy() for name, value in tracks.items()}
+    numbers = frame_numbers(subject)
+    if recording.rig is not None:  # of the times
+        numbers = [subject.manifest.frames[index].tracking for index in recording.moments(range(len(recording)))]
     return {
         number: FrameTrack(
             **{name: array[row] for name, array in arrays.items() if name != "shape"},
@@ -175,7 +207,7 @@ def _frame_tracks(subject: Subject, tracks: Mapping[str, Tensor]) -> dict[int, F
             intrinsics=np.array(recording.intrinsics),
             size=(recording.width, recording.height),
         )
-        for row, number in enumerate(frame_numbers(subject))
+        for row, number in enumerate(numbers)
     }
 
 

@@ -74,6 +74,15 @@ def find_rig(shots: Sequence[Shot], tracks: Sequence[FrameTrack]) -> FoundCamera
     return FoundCameras(rig, tuple(of_time[time] for time in times), tuple(heads[time] for time in times))
 
 
+def heads_before(rig: CameraRig, tracks: Sequence[FrameTrack]) -> tuple[list[FrameTrack], list[Pose]]:
+    """One frame of each time, and the head before the reference camera, as this rig's pictures have it."""
+    pictures = rig.moments(range(len(tracks)))
+    cameras = [rig.cameras[rig.views[picture]] for picture in pictures]
+    poses = [Pose(np.array(camera.R).reshape(3, 3), np.array(camera.t)) for camera in cameras]
+    rows = [tracks[picture] for picture in pictures]
+    return rows, [pose.inverse().after(Pose(row.R, row.t)) for pose, row in zip(poses, rows, strict=True)]
+
+
 def _by_frontality(shots: Sequence[Shot], tracks: Sequence[FrameTrack]) -> list[str]:
     """The cameras' names: the most frontal first, the others as they come."""
     facing: dict[str, list[float]] = {}

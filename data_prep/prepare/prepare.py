@@ -23,7 +23,7 @@ from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
 from data_prep.formats.train_test_split import split_frames_of
 from data_prep.prepare.cache import default_location, input_hash
-from data_prep.prepare.camera_rig import FoundCameras, Pose, find_rig
+from data_prep.prepare.camera_rig import FoundCameras, Pose, find_rig, heads_before
 from data_prep.prepare.check_alignment import check_sample, refuse_misplaced_cameras
 from data_prep.prepare.constant_parameters import constant_parameters
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
@@ -139,7 +139,8 @@ def prepare(
     arrays = _stack_tracks(used) if found is None else _stack_tracks(found.rows, found.heads)
     if tracked.read_given is not None:
         given_tracks = fit_coefficients(tracked.read_given(refuse), head)
-        given = _stack_tracks([given_tracks.frames[number] for _, number in pairing.pairs])
+        rows = [given_tracks.frames[number] for _, number in pairing.pairs]
+        given = _stack_tracks(rows) if found is None else _stack_tracks(*heads_before(found.rig, rows))
         arrays |= {f"{GIVEN}{name}": array for name, array in given.items()}
     names = files.frame_names()
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"

@@ -20,7 +20,7 @@ def refined(subject: Subject, trained_on: tuple[int, ...], first: int = 0) -> Su
     """The tracker found half of each expression, and another place. Frames are numbered from `first` on."""
     refinement = Refinement("metrical-tracker", (Round("runs/first", 100, "0" * 64, trained_on),))
     frames = tuple(replace(record, tracking=first + record.tracking) for record in subject.manifest.frames)
-    manifest = replace(subject.manifest, refinement=refinement, frames=frames)
+    manifest = replace(subject.manifest, refinement=refinement, frames=frames, frame_offset=0)
     own = subject.recording.tracks
     tracks = {**own, "expression": 0.5 * own["expression"], "t": own["t"] + torch.tensor([0.05, 0.0, 0.0])}
     return replace(subject, manifest=manifest, given=replace(subject.recording, tracks=tracks))

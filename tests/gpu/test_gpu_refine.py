@@ -59,7 +59,7 @@ def test_picture_misfit_and_gradient_are_those_of_the_cpu(avatar: Avatar, clip: 
         values = on_cpu.parameterization.values(FRAME, moves)
         expected = on_cpu.fitter.fit(values, on_cpu.pose(FRAME), made[0])
         figures = on_cpu.fitter.figures(values, on_cpu.pose(FRAME), made[0])
-        picture = on_cpu.fitter.picture(values, on_cpu.pose(FRAME), made[0])
+        (picture,) = on_cpu.fitter.pictures(values, on_cpu.pose(FRAME), made[0])
     work = work_on(avatar.to(DEVICE), clip)
     found_targets = work.targets(FRAME, 1)
     assert work.is_gpu and found_targets is not None
@@ -67,8 +67,8 @@ def test_picture_misfit_and_gradient_are_those_of_the_cpu(avatar: Avatar, clip: 
     found = work.fitter.fit(values, work.pose(FRAME), found_targets[0])
     assert float(found.misfit) == pytest.approx(float(expected.misfit), rel=1e-4)
     assert error(found.gradient, expected.gradient) < 1e-3
-    assert (found.picture.cpu() - expected.picture).abs().mean() < 1e-5
-    seen = work.fitter.picture(values, work.pose(FRAME), found_targets[0])
+    assert (found.pictures[0].cpu() - expected.pictures[0]).abs().mean() < 1e-5
+    (seen,) = work.fitter.pictures(values, work.pose(FRAME), found_targets[0])
     assert (seen.cpu() - picture).abs().mean() < 1e-5
     own = work.fitter.figures(values, work.pose(FRAME), found_targets[0])
     assert own.tolist() == pytest.approx(figures.tolist(), rel=1e-4)

@@ -80,7 +80,7 @@ def make_subject(folder: Path) -> Subject:
 def refined(subject: Subject, trained_on: tuple[int, ...] = tuple(range(TEST[0]))) -> Subject:
     """The subject as after a refinement through an avatar that was trained on the frames of these numbers."""
     rounds = (Round("runs/first", 1000, "fe" * 32, trained_on),)
-    manifest = replace(subject.manifest, refinement=Refinement("insta", rounds))
+    manifest = replace(subject.manifest, refinement=Refinement("insta", rounds), frame_offset=0)
     given = {**subject.recording.tracks, "expression": subject.recording.tracks["expression"] * 0.9}
     return replace(subject, manifest=manifest, given=replace(subject.recording, tracks=given))
 

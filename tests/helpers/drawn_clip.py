@@ -126,7 +126,7 @@ def drawn_clip(avatar: Avatar, frames: int = 10, train: int = 7) -> Clip:
 
 def picture(avatar: Avatar, recording: Recording, index: int) -> Frame:
     params, camera = recording.params(index), recording.camera(index)
-    drawing = avatar.draw(avatar(params, None, camera.R_cam_world), camera, BACKGROUND)
+    drawing = avatar.draw(avatar(params, None, camera.head_rotation), camera, BACKGROUND)
     head = (drawing.alpha > 1e-3).float()
     image = torch.lerp(BACKGROUND, drawing.image, head[..., None])
     ones, nothing = torch.ones_like(head), torch.zeros_like(head)
@@ -144,7 +144,7 @@ def wrongly_tracked(
     values = values_of(clip.recording.tracks)
     errors = torch.from_numpy(rng.standard_normal(values.shape)).float()
     if not common:
-        errors[:, POSE] -= errors[list(clip.recording.split.train), POSE].mean(dim=0)
+        errors[:, POSE] -= errors[clip.recording.times(clip.recording.split.train), POSE].mean(dim=0)
     scale = share * values.std(dim=0)
     scale[TURN], scale[SHIFT] = math.radians(degrees) / math.sqrt(3), 1e-3 * mm / math.sqrt(3)
     scale[SHIFT.stop - 1] = 0.0  # depth hardly shows

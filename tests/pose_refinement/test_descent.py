@@ -39,7 +39,9 @@ def problem(clip: Clip, fitter: FrameFitter, frame: int, levels: int = 1) -> Pro
     made = targets(clip.pictures[frame], BACKGROUND, levels)
     assert made is not None
     given = HeadPose(tracks["R"][frame], tracks["t"][frame])
-    return Problem(given, made, frame, find_parameterization(tracks, clip.split.train, fitter.centre))
+    return Problem(
+        given, [[target] for target in made], frame, find_parameterization(tracks, clip.split.train, fitter.centre)
+    )
 
 
 def factors(clip: Clip, fitter: FrameFitter, levels: int = 1) -> list[torch.Tensor]:
@@ -76,10 +78,12 @@ def test_pixels_that_are_far_off_count_less_in_the_curvature(avatar: Avatar, cli
     """By as much as in the Huber loss, whose slope is a quarter of the error there."""
     fitter = likeness_of(avatar)
     made = problem(clip, fitter, 2)
-    (target,) = made.targets
+    ((target,),) = made.targets
     still = torch.zeros(len(made.parameterization.index))
-    picture = fitter.picture(made.parameterization.values(2, still), made.given, target)
-    fits, off = (replace(made, targets=[target._replace(picture=picture + error)]) for error in (0.0, 4 * HUBER_DELTA))
+    (picture,) = fitter.pictures(made.parameterization.values(2, still), made.given, [target])
+    fits, off = (
+        replace(made, targets=[[target._replace(picture=picture + error)]]) for error in (0.0, 4 * HUBER_DELTA)
+    )
     whole = curvature(fitter, fits, 0)
     torch.testing.assert_close(curvature(fitter, off, 0), 0.25 * whole, rtol=1e-4, atol=1e-4 * float(whole.abs().max()))
 
@@ -91,7 +95,7 @@ def test_a_disturbed_frame_comes_back(avatar: Avatar, clip: Clip, levels: int) -
     for frame in (1, 9):
         made = problem(wrong, fitter, frame, levels)
         found = descend(fitter, made, common, [6, 3][:levels])
-        assert found.picture.shape == made.targets[0].picture.shape
+        assert found.pictures[0].shape == made.targets[0][0].picture.shape
         moves = torch.zeros(len(wrong), len(found.moves))
         moves[frame] = found.moves
         before, after = (
@@ -114,7 +118,7 @@ def test_the_last_picture_is_that_of_the_moves_and_no_worse_than_the_first(avata
     made = problem(wrong, fitter, 4)
     found = descend(fitter, made, factors(wrong, fitter), [2])
     values = made.parameterization.values(4, found.moves)
-    assert torch.allclose(found.picture, fitter.picture(values, made.given, made.targets[0]), atol=1e-5)
+    assert torch.allclose(found.pictures[0], fitter.pictures(values, made.given, made.targets[0])[0], atol=1e-5)
 
     def energy(moves: torch.Tensor) -> float:
         misfit = float(fitter.figures(made.parameterization.values(4, moves), made.given, made.targets[0])[0])

@@ -98,16 +98,16 @@ def test_the_gradient_knows_what_the_network_is_told_of_a_turn(tmp_path: Path) -
     assert target is not None
     with frozen(avatar):
         check_gradient(fitter, clip)
-        told = fitter.fit(values, pose, target[0]).gradient[:3]
+        told = fitter.fit(values, pose, [target[0]]).gradient[:3]
         avatar.turning *= 0.0
-        untold = fitter.fit(values, pose, target[0]).gradient[:3]
+        untold = fitter.fit(values, pose, [target[0]]).gradient[:3]
     assert float((told - untold).norm()) > 0.02 * float(told.norm())
 
 
 def check_gradient(fitter: FrameFitter, clip: Clip, level: int = 0) -> None:
     target = targets(clip.pictures[2], BACKGROUND, 2)[level]
     values, pose = mistracked(clip)
-    found = fitter.fit(values, pose, target)
+    found = fitter.fit(values, pose, [target])
 
     moving = values.clone().requires_grad_()
     moved = moved_pose(moving, pose, fitter.centre)
@@ -116,10 +116,10 @@ def check_gradient(fitter: FrameFitter, clip: Clip, level: int = 0) -> None:
     blur = target.shrink * fitter.avatar.config.blur
     options = {"backend": "reference", "region": target.box, "blur": blur}
     image = splat(gaussians, camera, BACKGROUND, **options).image[target.box]
-    misfit = misfit_of(image, target)
+    misfit = misfit_of([image], [target])
     (expected,) = torch.autograd.grad(misfit, moving)
     assert found.misfit == pytest.approx(misfit.item(), rel=1e-4)
-    assert torch.allclose(found.picture, image, atol=1e-3)
+    assert torch.allclose(found.pictures[0], image, atol=1e-3)
     assert torch.allclose(found.gradient, expected, rtol=5e-3, atol=1e-3 * float(expected[6:].abs().max()))
     assert float(expected[:3].abs().min()) > 1.0
 
@@ -129,27 +129,27 @@ def test_the_gradient_is_the_slope(fitter: FrameFitter, clip: Clip, monkeypatch:
     monkeypatch.setattr(Avatar, "draw", partialmethod(Avatar.draw, alpha_min=0.0, t_min=0.0))
     target = targets(clip.pictures[2], BACKGROUND, 1)[0]
     values, pose = mistracked(clip)
-    found = fitter.fit(values, pose, target)
-    assert found.misfit == pytest.approx(float(fitter.figures(values, pose, target)[0]), rel=1e-5)
+    found = fitter.fit(values, pose, [target])
+    assert found.misfit == pytest.approx(float(fitter.figures(values, pose, [target])[0]), rel=1e-5)
     # Turns out of the picture's plane also change which splat is in front of which, in jumps.
     for k, length in ((2, 1e-3), (3, 2e-4), (4, 2e-4), (5, 2e-4), (10, 1e-3), (22, 1e-3), (24, 1e-3)):
         step = torch.zeros(VALUES)
         step[k] = length
-        high, low = (float(fitter.figures(values + sign * step, pose, target)[0]) for sign in (1, -1))
+        high, low = (float(fitter.figures(values + sign * step, pose, [target])[0]) for sign in (1, -1))
         assert float(found.gradient[k]) == pytest.approx((high - low) / (2 * length), rel=0.03, abs=0.1), k
 
 
 def test_the_misfit_counts_squares_in_observations(fitter: FrameFitter, clip: Clip) -> None:
     target = targets(clip.pictures[0], BACKGROUND, 1)[0]
     values = values_of(clip.recording.tracks)[0]
-    fits = float(fitter.figures(values, given(clip, 0), target)[0])
-    grey = replace_picture(target, fitter.picture(values, given(clip, 0), target) + 0.02)
+    fits = float(fitter.figures(values, given(clip, 0), [target])[0])
+    grey = replace_picture(target, fitter.pictures(values, given(clip, 0), [target])[0] + 0.02)
     expected = 0.5 * OBSERVATIONS * (0.02 / PIXEL_SIGMA) ** 2 * target.picture[..., 0].numel() / target.area
-    assert float(fitter.figures(values, given(clip, 0), grey)[0]) == pytest.approx(expected, rel=1e-3)
+    assert float(fitter.figures(values, given(clip, 0), [grey])[0]) == pytest.approx(expected, rel=1e-3)
     assert fits < 0.1 * expected  # the clip is the avatar's own picture
-    far = replace_picture(target, fitter.picture(values, given(clip, 0), target) + 0.4)
+    far = replace_picture(target, fitter.pictures(values, given(clip, 0), [target])[0] + 0.4)
     # An outlier counts less than its square.
-    assert float(fitter.figures(values, given(clip, 0), far)[0]) < 400 * 0.5 * expected
+    assert float(fitter.figures(values, given(clip, 0), [far])[0]) < 400 * 0.5 * expected
 
 
 def replace_picture(target: fitter_module.Target, picture: torch.Tensor) -> fitter_module.Target:
@@ -172,18 +172,19 @@ def test_a_half_size_picture_looks_like_the_full_one(fitter: FrameFitter, clip: 
     full, half = targets(clip.pictures[1], BACKGROUND, 2)
     values = values_of(clip.recording.tracks)[1]
     sharp, thick = (
-        head_psnr(fitter.picture(values, given(clip, 1), half._replace(shrink=shrink)), half) for shrink in (0.25, 1.0)
+        head_psnr(fitter.pictures(values, given(clip, 1), [half._replace(shrink=shrink)]), [half])
+        for shrink in (0.25, 1.0)
     )
     assert sharp > thick + 3.0
-    assert head_psnr(fitter.picture(values, given(clip, 1), full), full) > 45.0
+    assert head_psnr(fitter.pictures(values, given(clip, 1), [full]), [full]) > 45.0
 
 
 def test_psnr_is_of_the_head_alone(clip: Clip) -> None:
     target = targets(clip.pictures[0], BACKGROUND, 1)[0]
     other = (target.picture + 0.1 * (1 - target.mask)[..., None]).clamp(0, 1)
-    assert head_psnr(other, target) == float("inf") or head_psnr(other, target) > 100
+    assert head_psnr([other], [target]) == float("inf") or head_psnr([other], [target]) > 100
     grey = target.picture * 0.9
-    assert head_psnr(grey, target) == pytest.approx(float(psnr(grey, target.picture, target.mask)))
+    assert head_psnr([grey], [target]) == pytest.approx(float(psnr(grey, target.picture, target.mask)))
 
 
 def test_the_pose_is_that_of_the_values(fitter: FrameFitter, clip: Clip) -> None:
@@ -198,4 +199,4 @@ def test_the_pose_is_that_of_the_values(fitter: FrameFitter, clip: Clip) -> None
     values[3:6] = (right.R @ centre + right.t) - (off.R @ centre + off.t)
     moved = moved_pose(values, off, centre)
     assert torch.allclose(moved.R, right.R, atol=1e-5) and torch.allclose(moved.t, right.t, atol=1e-6)
-    assert head_psnr(fitter.picture(values, off, target), target) > 45.0
+    assert head_psnr(fitter.pictures(values, off, [target]), [target]) > 45.0

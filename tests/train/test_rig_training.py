@@ -83,13 +83,24 @@ def test_it_drives_another_avatar_with_one_frame_of_each_time(place: Path, tmp_p
     assert [row[1] for row in table[1:]] == [f"{time:05d}_08" for time in range(6)]
 
 
-def test_refinement_is_refused_in_a_sentence(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (
-        ["refine", str(place / "whole"), "--out", str(tmp_path / "refined")],
-        ["train", str(place / "EMO"), "--out", str(tmp_path / "run"), "--refine", "1", *options(place)],
-    ):
-        assert main(command) != 0
-        assert "EMO has 3 cameras" in capsys.readouterr().err
+@pytest.mark.slow
+def test_its_tracking_is_refined_and_trained_on(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = place / "refining"
+    command = ["train", str(place / "EMO"), "--out", str(run), "--refine", "1", *options(place)]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "Refining 18 frames, pictures of 6 times, of EMO" in said
+    opened = open_run(run, say=lambda _: None).subject
+    whole = open_run(place / "whole", say=lambda _: None).subject
+    assert opened.recording.rig == whole.recording.rig and opened.split == whole.split
+    assert opened.manifest.refinement is not None and opened.given is not None
+    assert opened.manifest.refinement.rounds[0].trained_on == whole.split.train
+    assert main(["eval", str(run), "--protocol", "strict"]) == 0
+    assert "(!)" not in capsys.readouterr().out
+    results = json.loads((run / "eval" / "results.json").read_text())
+    entry = results["protocols"]["strict"]
+    assert {one["name"] for one in entry["by_held_out"]} == {"camera", "time", "time and camera"}
+    assert entry["tracked"]["means"]["psnr"] > 10.0
 
 
 def test_the_network_gets_the_same_turn_whichever_camera_looks(place: Path) -> None:
