@@ -18,7 +18,9 @@ from avatar.runs.run import Run
 Drive = Literal["tracked", "refined"]
 FRAMES_FILE, TRACKED_FILE = "frames.csv", "tracked.csv"
 OF_TRACKERS = "trackers fit each frame to its own picture, held out or not"
-OF_REFINEMENT = "each frame, measured ones too, was then fitted to its own picture through the avatar of another run"
+FITTED = "each frame, measured ones too, was then fitted to its own picture"
+FITTED_BY_RIG = "each time, measured ones too, was then fitted to the pictures of cameras that are trained on"
+OF_REFINEMENT = "through the avatar of another run"
 LABELS: dict[Drive, str] = {"tracked": "tracked", "refined": "refined, fitted"}  # of the figures in tables
 MARK = "(!)"  # beside the figures of a run whose measured frames were refined through an avatar that had seen them
 OF_MARK = (
@@ -67,7 +69,7 @@ def describe_tracking(run: Run, measured: Sequence[int]) -> dict[str, Any]:
         "tracking": "refined",
         "tracker": refinement.tracker,
         "tracked": OF_TRACKERS,
-        "refined": OF_REFINEMENT,
+        "refined": f"{FITTED if manifest.rig is None else FITTED_BY_RIG} {OF_REFINEMENT}",
         "rounds": [
             {
                 "run": one.run,
@@ -104,10 +106,10 @@ def legend(trackings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def tracking_notes(tracking: Mapping[str, Any]) -> list[str]:
     """Those lines that a refined subject adds."""
+    fitted = str(tracking.get("refined", "")).removesuffix(OF_REFINEMENT)
     lines = [
-        f"refined: each frame, measured ones too, was fitted to its own picture through the avatar of {one['run']} (step "
-        f"{one['step']}), which was trained on {one['frames_trained_on']} frames, "
-        f"{one['measured_frames_trained_on'] or 'none'} of them measured"
+        f"refined: {fitted}through the avatar of {one['run']} (step {one['step']}), which was trained on "
+        f"{one['frames_trained_on']} frames, {one['measured_frames_trained_on'] or 'none'} of them measured"
         for one in tracking["rounds"]
     ]
     return [*lines, *([OF_MARK] if is_marked(tracking) else [])]
