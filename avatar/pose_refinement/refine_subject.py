@@ -24,12 +24,12 @@ from tqdm import tqdm
 from avatar.compute.device import on_gpu, to_device
 from avatar.compute.interruption import interruption
 from avatar.compute.native import thread_count
-from avatar.data.recording import Recording
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.descent import Problem, curvature, descend
+from avatar.pose_refinement.fitted_pictures import camera_place, fitted_pictures
 from avatar.pose_refinement.frame_fitter import FrameFitter, Target, coarse_levels, head_psnr, targets
 from avatar.pose_refinement.parallel import each_in_order
 from avatar.pose_refinement.parameterization import find_parameterization
@@ -140,33 +140,6 @@ def fingerprint(avatar: Avatar) -> str:
     for name, value in sorted(avatar.state_dict().items()):
         digest.update(f"{name} {list(value.shape)}".encode() + value.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
-
-
-def fitted_pictures(recording: Recording) -> list[list[int]]:
-    """Of each row of the tracks the pictures that its tracking is fitted to.
-
-    With several cameras, of a time that training sees its training pictures alone. Of another one those of the cameras
-    that are trained on, if there are any.
-    """
-    of_row: dict[int, list[int]] = {}
-    for index in range(len(recording)):
-        of_row.setdefault(recording.time(index), []).append(index)
-    train = set(recording.split.train)
-    cameras = {recording.view(index) for index in train}
-    return [
-        [index for index in own if index in train]
-        or [index for index in own if recording.view(index) in cameras]
-        or own
-        for _, own in sorted(of_row.items())
-    ]
-
-
-def camera_place(recording: Recording, index: int) -> HeadPose | None:
-    """Of the camera that took a picture: p_cam = R p_ref + t; None with one camera."""
-    if recording.rig is None:
-        return None
-    camera = recording.cameras[recording.view(index)]
-    return HeadPose(torch.tensor(camera.R).reshape(3, 3), torch.tensor(camera.t))
 
 
 class _Work:

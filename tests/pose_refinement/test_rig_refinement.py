@@ -18,8 +18,10 @@ from avatar.data.recording import Recording
 from avatar.data.split import Split
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
+from avatar.pose_refinement import fitted_pictures as fitted_module
+from avatar.pose_refinement.fitted_pictures import fitted_pictures
 from avatar.pose_refinement.record import frames_csv, sheet, summary
-from avatar.pose_refinement.refine_subject import Refined, fitted_pictures, refine_subject
+from avatar.pose_refinement.refine_subject import Refined, refine_subject
 
 TIMES, VIEWS, HELD_OUT = 6, 3, 2  # times 4 and 5 and the last camera are held out
 
@@ -88,6 +90,15 @@ def test_fitted_pictures_are_those_of_a_held_out_camera_where_there_are_no_other
     rig = replace(clip.recording.rig, cameras=clip.recording.cameras, times=(0, 0, 1), views=(0, 1, 2))
     recording = replace(clip.recording, rig=rig, names=("a", "b", "c"), split=Split((0, 1), (2,)))
     assert fitted_pictures(recording) == [[0, 1], [2]]
+
+
+def test_fitted_pictures_of_many_cameras_are_those_far_apart(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference camera looks from in front; of those at 50, -40, 10 and -10 degrees the outer two are the farthest."""
+    cameras = [replace(clip.recording.cameras[0], R=R, t=t) for R, t in map(aside, (0.0, 10.0, 50.0, -10.0, -40.0))]
+    rig = replace(clip.recording.rig, cameras=tuple(cameras), times=(0,) * 5, views=(4, 1, 0, 3, 2))
+    recording = replace(clip.recording, rig=rig, names=tuple("abcde"), split=Split(tuple(range(5)), ()))
+    monkeypatch.setattr(fitted_module, "MOST_PICTURES", 3)
+    assert fitted_pictures(recording) == [[0, 2, 4]]
 
 
 def test_fitted_pictures_of_one_camera_are_its_frames(avatar: Avatar) -> None:
