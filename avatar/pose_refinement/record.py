@@ -82,7 +82,9 @@ def sheet(
     """A PNG file: a row for each of some frames, truth, avatar before and after, and the errors of both."""
     renderer = Renderer(avatar, background)
     rows: list[UInt8[np.ndarray, "H W 3"]] = []
-    pictures = {subject.recording.time(index): index for index in subject.recording.moments(subject.split.test)}
+    recording = subject.recording
+    of = "" if recording.rig is None else " where fitted"
+    pictures = {recording.time(index): index for index in recording.moments(subject.split.test)}
     for row in sheet_frames(list(pictures), refined):
         index = pictures[row]
         frame = subject.frame(index, size)
@@ -96,8 +98,8 @@ def sheet(
         errors = [error_map(render * weight, truth * weight, ERROR_SCALE) for render in renders]
         captions = (
             f"truth of {frame.name}",
-            f"before, {refined.before[row]:.2f} dB",
-            f"after, {refined.after[row]:.2f} dB",
+            f"before, {refined.before[row]:.2f} dB{of}",
+            f"after, {refined.after[row]:.2f} dB{of}",
             f"error before, 0 to {ERROR_SCALE:g}",
             "error after",
         )
