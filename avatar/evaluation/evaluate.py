@@ -32,7 +32,7 @@ from avatar.data.colours import colour_name
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import MissingPackage, UserError
-from avatar.evaluation.draw import contact_sheet, draw, panel, speed
+from avatar.evaluation.draw import contact_sheet, draw, panel
 from avatar.evaluation.find_lpips import find_networks
 from avatar.evaluation.frame_curves import curves
 from avatar.evaluation.held_out import views
@@ -114,7 +114,6 @@ def evaluate(
         "notes": notes,
         "left_out": left_out,
         "shown": shown,
-        "rendering": speed(renderer, subject, sorted(set().union(*indices.values())), run.config.data.size),
         "protocols": whole,
     }
     worst = next(iter(parts(whole[shown]).values())).figures["worst"]
