@@ -1,8 +1,4 @@
-"""avatar create: one command from a video to the avatar's page.
-
-OUT/subject        the tracked folder
-OUT/run            the run
-OUT/avatar.html    the page
+"""avatar create: one command from a video to the avatar's page; docs/track.md says where.
 
 What an interrupted command has done is not done again, and the page is the one that it would have made.
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
@@ -13,25 +13,18 @@ from avatar.compute.availability import has_gpu_driver
 from avatar.config_values import config_dir
 from avatar.errors import UserError, install
 from avatar.files.environment import named_path
-from avatar.files.read import check_file
 from avatar.files.third_party import (
     FETCHED_LPIPS,
     HEAD_VARIABLE,
-    LPIPS_FILES,
     TRACKING_FILES,
-    ThirdPartyFile,
-    check_sha256,
-    converted_lpips,
     find,
-    lpips_folder,
+    has_lpips,
+    is_published,
     lpips_place,
-    models_folder,
-    sha256_of,
 )
 from avatar.head.find import find_model_file
 from avatar.version import __version__
 
-DOWNLOAD = "avatar models --download"
 EXTRAS = {
     "mediapipe": ("track", "track videos"),
     "viser": ("view", "avatar view"),
@@ -43,25 +36,16 @@ class Finding(NamedTuple):
     name: str
     state: str
     advice: str = ""
-    addresses: tuple[str, ...] = ()  # of what is missing
     is_broken: bool = False  # and every command needs it
 
 
 def run_doctor(_: Namespace) -> int:
-    """Print the table of findings and the addresses of what is missing.
-
-    Returns 1 when something that every command needs does not work, else 0.
-    """
-    found = [*essentials(), gpu(), head_model(), *map(model_file, TRACKING_FILES), *map(lpips, LPIPS_FILES)]
-    found += [package(name) for name in EXTRAS]
+    """Print the table of findings. Returns 1 when something that every command needs does not work, else 0."""
+    found = [*essentials(), gpu(), head_model(), models(), *map(package, EXTRAS)]
     system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
     print(f"avatar {__version__}, Python {platform.python_version()}, {system}\n")
     for line in table(found):
         print(line)
-    if missing := [finding for finding in found if finding.addresses]:
-        print(f"\nAddresses: files go into {models_folder()}, those of LPIPS into {lpips_folder()}")
-        for finding in missing:
-            print("\n".join([f"  {finding.name}", *(f"    {address}" for address in finding.addresses)]))
     return 1 if any(finding.is_broken for finding in found) else 0
 
 
@@ -139,43 +123,12 @@ def head_model() -> Finding:
     return Finding("head model", "found")
 
 
-def model_file(file: ThirdPartyFile) -> Finding:
-    optional = "optional: " if file.is_optional else ""
-    path = find(file)
-    if path is None:
-        return Finding(file.name, "missing", f"{optional}{DOWNLOAD}", (file.url,))
-    return state_of(file.name, lambda: check_sha256(file, sha256_of(path, file.max_bytes), str(path)), DOWNLOAD)
-
-
-def lpips(net: str) -> Finding:
-    name, place = f"LPIPS {net}", lpips_place(net)
-    advice = DOWNLOAD if net in FETCHED_LPIPS else "optional: put its two files into the folder below"
-    converted, published = place / converted_lpips(net), [(file, place / file.name) for file in LPIPS_FILES[net]]
-
-    def check() -> None:
-        from safetensors import SafetensorError, safe_open
-
-        if converted.is_file():
-            check_file(converted, None)
-            try:
-                with safe_open(converted, framework="np"):
-                    return
-            except SafetensorError as error:
-                raise UserError(f"{converted} is damaged ({error})") from None
-        for file, path in published:
-            check_sha256(file, sha256_of(path, file.max_bytes), str(path))
-
-    if converted.is_file() or all(path.is_file() for _, path in published):
-        return state_of(name, check, advice)
-    return Finding(name, "missing", advice, tuple(file.url for file in LPIPS_FILES[net]))
-
-
-def state_of(name: str, check: Callable[[], None], advice: str) -> Finding:
-    try:
-        check()
-    except (UserError, OSError) as error:
-        return Finding(name, "damaged", f"{advice} ({str(error).partition(';')[0]})")
-    return Finding(name, "found")
+def models() -> Finding:
+    """Those that the program uses by default. Whether weights of LPIPS are whole is not found out, which takes PyTorch."""
+    needed = [file for file in TRACKING_FILES if not file.is_optional]
+    there = [(path := find(file)) is not None and is_published(file, path) for file in needed]
+    there += [has_lpips(lpips_place(net), net) for net in FETCHED_LPIPS]
+    return Finding("models", f"{sum(there)} of {len(there)} there", "avatar models lists them and the optional ones")
 
 
 def package(name: str) -> Finding:

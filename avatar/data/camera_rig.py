@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avatar.data.json_values import parse_intrinsics, parse_number
+from avatar.data.json_values import parse_object
 from avatar.types import Camera
 
 MOST_CAMERAS = 1000
@@ -89,23 +89,17 @@ def parse_rig(raw: Any, pictures: int) -> CameraRig:
 
 
 def _parse_camera(raw: Any) -> RigCamera:
-    size = raw["width"], raw["height"]
-    if any(not isinstance(side, int) or isinstance(side, bool) or not 1 <= side < 2**16 for side in size):
-        raise ValueError(f"a camera's image size of {size[0]}x{size[1]} is impossible")
-    intrinsics = parse_intrinsics(raw["intrinsics"])
-    if min(intrinsics[:2]) <= 0:
+    camera = parse_object(raw, RigCamera, "a camera")
+    if not all(1 <= side < 2**16 for side in (camera.width, camera.height)):
+        raise ValueError(f"a camera's image size of {camera.width}x{camera.height} is impossible")
+    if min(camera.intrinsics[:2]) <= 0:
         raise ValueError("a camera's focal length is not positive")
-    R, t = raw["R"], raw["t"]
-    if not isinstance(R, list) or not isinstance(t, list) or len(R) != 9 or len(t) != 3:
+    if len(camera.R) != 9 or len(camera.t) != 3:
         raise ValueError("a camera's pose is not 9 and 3 numbers")
-    name = raw["name"]
-    if not isinstance(name, str):
-        raise TypeError(f"a camera's name is a {type(name).__name__}, not a str")
-    numbers = tuple(parse_number(value, "a camera's R") for value in R)
-    matrix = torch.tensor(numbers, dtype=torch.float64).reshape(3, 3)
-    if not torch.allclose(matrix @ matrix.T, torch.eye(3, dtype=torch.float64), atol=1e-4) or torch.det(matrix) < 0:
+    R = torch.tensor(camera.R, dtype=torch.float64).reshape(3, 3)
+    if not torch.allclose(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-4) or torch.det(R) < 0:
         raise ValueError("a camera's R is not a rotation")
-    return RigCamera(name, *size, intrinsics, numbers, tuple(parse_number(value, "a camera's t") for value in t))
+    return camera
 
 
 def _positions(values: Any, key: str, count: int, stop: int) -> tuple[int, ...]:

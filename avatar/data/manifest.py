@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from avatar.data.camera_rig import CameraRig, parse_rig
 from avatar.data.images import EVERY_LABEL
-from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
+from avatar.data.json_values import parse_object, parse_positions
 from avatar.data.refinement import Refinement
 from avatar.errors import UserError
 from avatar.files.names import safe_name
@@ -99,34 +99,11 @@ def read_manifest(prepared: Path) -> Manifest:
 
 
 def _parse(raw: dict[str, Any]) -> Manifest:
-    frames = tuple(_parse_frame(entry) for entry in _of(raw, "frames", list))
-    count = len(frames)
-    manifest = Manifest(
-        name=safe_name(_of(raw, "name", str)),
-        format=_of(raw, "format", str),
-        source=_of(raw, "source", str),
-        tracking=_of(raw, "tracking", str),
-        width=_of(raw, "width", int),
-        height=_of(raw, "height", int),
-        fps=parse_number(raw["fps"], "fps"),
-        intrinsics=parse_intrinsics(raw["intrinsics"]),
-        frame_offset=_of(raw, "frame_offset", int),
-        offset_evidence=_of(raw, "offset_evidence", str),
-        frames=frames,
-        train=parse_positions(raw["train"], "train", count),
-        test=parse_positions(raw["test"], "test", count) if raw["test"] != [] else (),  # a single frame is not divided
-        left_out={str(k): str(v) for k, v in _of(raw, "left_out", dict).items()},
-        notes=tuple(str(note) for note in _of(raw, "notes", list)),
-        head_masks=_of(raw, "head_masks", str),
-        mouth_masks=_of(raw, "mouth_masks", str),
-        labels=_labels(_of(raw, "labels", dict)),
-        head_path=_of(raw, "head_path", str),
-        head_fingerprint=_of(raw, "head_fingerprint", str),
-        input_hash=_of(raw, "input_hash", str),
-        data_hash=_of(raw, "data_hash", str),
-        refinement=None if raw["refinement"] is None else _refinement(raw["refinement"]),
-        rig=None if raw["rig"] is None else parse_rig(raw["rig"], count),
-    )
+    manifest = parse_object(raw, Manifest, rig=None)
+    count = len(manifest.frames)
+    parse_positions(raw["train"], "train", count)
+    if manifest.test:  # a single frame is not divided
+        parse_positions(raw["test"], "test", count)
     if not 1 <= manifest.width < 2**16 or not 1 <= manifest.height < 2**16:
         raise ValueError(f"an image size of {manifest.width}x{manifest.height} is impossible")
     if manifest.fps <= 0 or min(manifest.intrinsics[:2]) <= 0:
@@ -134,57 +111,23 @@ def _parse(raw: dict[str, Any]) -> Manifest:
     for masks in (manifest.head_masks, manifest.mouth_masks):
         if masks not in ("source", "derived", "none"):
             raise ValueError(f"head_masks or mouth_masks is {masks!r}")
+    for kind, label in manifest.labels.items():
+        if kind not in MASKS or not EVERY_LABEL <= label < 255:
+            raise ValueError(f"the label of {kind} is {label}")
     if set(manifest.train) & set(manifest.test):
         raise ValueError("a frame is in both train and test")
-    return manifest
+    for one in manifest.frames:
+        for path in (one.image, one.alpha, one.head_mask, one.mouth_mask):
+            _check_relative(path)
+    rig = None if raw["rig"] is None else parse_rig(raw["rig"], count)
+    return replace(manifest, name=safe_name(manifest.name), rig=rig)
 
 
-def _labels(raw: dict[str, Any]) -> dict[str, int]:
-    for kind in raw:
-        if kind not in MASKS or not EVERY_LABEL <= _of(raw, kind, int) < 255:
-            raise ValueError(f"the label of {kind} is {raw[kind]}")
-    return raw
-
-
-def _refinement(raw: Any) -> Refinement:
-    try:
-        return Refinement.from_dict(raw)
-    except UserError as error:
-        raise ValueError(f"refinement: {error}") from None
-
-
-def _parse_frame(entry: Any) -> FrameRecord:
-    if not isinstance(entry, dict):
-        raise TypeError("an entry of frames is not an object")
-    return FrameRecord(
-        name=_of(entry, "name", str),
-        image=_relative(_of(entry, "image", str)),
-        tracking=_of(entry, "tracking", int),
-        alpha=_relative_or_none(entry["alpha"]),
-        head_mask=_relative_or_none(entry["head_mask"]),
-        mouth_mask=_relative_or_none(entry["mouth_mask"]),
-    )
-
-
-def _of(raw: dict[str, Any], key: str, kind: type) -> Any:
-    value = raw[key]
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise TypeError(f"{key} is a {type(value).__name__}, not a {kind.__name__}")
-    return value
-
-
-def _relative_or_none(value: Any) -> str | None:
-    if value is None:
-        return None
-    if not isinstance(value, str):
-        raise TypeError(f"a path is a {type(value).__name__}, not a str")
-    return _relative(value)
-
-
-def _relative(value: str) -> str:
+def _check_relative(path: str | None) -> None:
     """Frame files must stay inside the folder that the manifest names."""
-    escapes = any(p.is_absolute() or p.drive or ".." in p.parts for p in (PurePosixPath(value), PureWindowsPath(value)))
-    os.fsencode(value)  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
-    if not value or escapes or "\0" in value:
-        raise ValueError(f"the path {value!r} leaves the subject's folder")
-    return value
+    if path is None:
+        return
+    escapes = any(p.is_absolute() or p.drive or ".." in p.parts for p in (PurePosixPath(path), PureWindowsPath(path)))
+    os.fsencode(path)  # half a surrogate pair is no file's name; UnicodeEncodeError is a ValueError
+    if not path or escapes or "\0" in path:
+        raise ValueError(f"the path {path!r} leaves the subject's folder")

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from avatar.errors import UserError
-
 DEFAULT_FPS = 25.0  # of FlashAvatar's protocol, where neither the folder nor a person says otherwise
 MAX_FPS = 1000.0
 DEFAULT_LEFT_OUT = 0.05  # of the frames: if more cannot be used, something is wrong with the whole, not with a frame
@@ -32,25 +30,3 @@ class Source:
         """For a JSON file: absolute paths as text."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {key: str(value.resolve()) if isinstance(value, Path) else value for key, value in values.items()}
-
-    @classmethod
-    def from_dict(cls, values: Any) -> Source:
-        """What `to_dict` gave. Raises UserError naming what is missing or of the wrong type."""
-        kinds: dict[str, tuple[type, ...]] = {
-            "folder": (str,),
-            "head": (str,),
-            "tracking": (str, type(None)),
-            "frame_offset": (int, type(None)),
-            "format": (str, type(None)),
-            "fps": (int, float, type(None)),
-            "max_left_out": (int, float),
-            "ignore_misfit": (bool,),
-            "cameras": (str, type(None)),
-        }
-        if not isinstance(values, dict):
-            raise UserError("source is missing or not an object")
-        for key, kind in kinds.items():
-            if key not in values or not isinstance(values[key], kind):
-                raise UserError(f"source.{key} is missing or of the wrong type")
-        paths = {key: Path(values[key]) if values[key] is not None else None for key in ("folder", "head", "tracking")}
-        return cls(**{**{key: values[key] for key in kinds}, **paths})

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,18 +12,15 @@ from jaxtyping import UInt8
 from avatar.compute.device import to_device
 from avatar.data.colours import Colour
 from avatar.data.frame import Frame
-from avatar.data.subject import Subject
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import ImageFormat
 from avatar.files.video import error_map, side_by_side
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
-from avatar.splat.cpu import thread_count
 
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 SHEET_COLUMNS = 2
 SHEET_WIDTH = 1600  # pixels at most
-TIMED_FRAMES, WARM_UP = 30, 3
 
 
 def draw(renderer: Renderer, frame: Frame, formats: Iterable[ImageFormat]) -> dict[ImageFormat, Pair]:
@@ -68,26 +63,3 @@ def contact_sheet(panels: Sequence[UInt8[np.ndarray, "H W 3"]]) -> bytes:
         height = round(sheet.shape[0] * SHEET_WIDTH / sheet.shape[1])
         sheet = cv2.resize(sheet, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
     return cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
-
-
-def speed(renderer: Renderer, subject: Subject, indices: Sequence[int], size: int | None) -> dict[str, Any]:
-    """How long one frame takes, from head parameters to image, one frame at a time; for results files."""
-    count = min(TIMED_FRAMES, len(indices))
-    chosen = [indices[i * len(indices) // count] for i in range(count)]
-    seconds = []
-    for index in [*chosen[:1] * WARM_UP, *chosen]:
-        params, camera = subject.params(index), subject.camera(index, size)
-        begin = time.perf_counter()
-        renderer.render(params, camera).alpha[0, 0].item()  # a GPU is waited for
-        seconds.append(time.perf_counter() - begin)
-    timed = np.array(seconds[WARM_UP:]) * 1000.0
-    width, height = subject.image_size(size)
-    return {
-        "frames_per_second": float(1000.0 / np.median(timed)),
-        "median_ms": float(np.median(timed)),
-        "p95_ms": float(np.quantile(timed, 0.95)),
-        "frames": count,
-        "width": width,
-        "height": height,
-        "threads": thread_count(),
-    }

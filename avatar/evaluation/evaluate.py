@@ -1,15 +1,8 @@
 """Evaluation of a run on frames that it has not seen: figures, the pictures they come from, and a video.
 
-    RUN/eval/results.json                  every choice, what was evaluated, means, intervals; by the protocols of earlier
-                                           evaluations too, where they are of the same avatar and frames
-    RUN/eval/curves.png                    the figures of all of these protocols along the video; needs matplotlib
-    RUN/eval/worst.png                     truth, render and error of the worst frames by one of the protocols
-    RUN/eval/truth_render_error.mp4        frames and background of the same protocol
-    RUN/eval/<protocol>/frames.csv         the figures of each frame
-    RUN/eval/<protocol>/{renders,gt,masks,...}/%05d.png    with --frames; numbers are those of frames.csv
-
-Where the subject's tracking was refined, frames.csv and renders/ are of the refined tracking, and tracked.csv and
-tracked_renders/ of the tracker's; curves, worst frames and video show the tracker's.
+docs/evaluation.md lists the files. results.json and the curves have the figures by the protocols of earlier evaluations
+too, where they are of the same avatar and frames; worst frames and video are by one protocol. Where the subject's tracking
+was refined, curves, worst frames and video show the tracker's.
 
 Renders and truths are measured as the pictures that the PNG files hold, so that anyone can recompute a figure.
 """
@@ -32,7 +25,7 @@ from avatar.data.colours import colour_name
 from avatar.data.loader import FrameLoader
 from avatar.data.subject import Subject
 from avatar.errors import MissingPackage, UserError
-from avatar.evaluation.draw import contact_sheet, draw, panel, speed
+from avatar.evaluation.draw import contact_sheet, draw, panel
 from avatar.evaluation.find_lpips import find_networks
 from avatar.evaluation.frame_curves import curves
 from avatar.evaluation.held_out import views
@@ -114,7 +107,6 @@ def evaluate(
         "notes": notes,
         "left_out": left_out,
         "shown": shown,
-        "rendering": speed(renderer, subject, sorted(set().union(*indices.values())), run.config.data.size),
         "protocols": whole,
     }
     worst = next(iter(parts(whole[shown]).values())).figures["worst"]

@@ -49,7 +49,6 @@ def table(results: Mapping[str, Any]) -> str:
         f"{level:.0%} intervals of the means; jitter of the head in 8-bit levels",
         *_columns(lines, _intervals(lines)),
         *_details(name, next(iter(parts(entry).values())).figures),
-        _speed(results["rendering"]),
         "",
         *(f"{name}: {entry['choices']['summary']}" for name, entry in protocols.items()),
         *tracking,
@@ -174,13 +173,6 @@ def _items(title: str, items: Sequence[str]) -> list[str]:
     lines = textwrap.wrap(glued, WIDTH - ITEM_TITLE - 3, break_long_words=False, break_on_hyphens=False)
     heads = [title, *[""] * (len(lines) - 1)]
     return [f"  {head:{ITEM_TITLE}} {line}".replace("\0", " ") for head, line in zip(heads, lines, strict=True)]
-
-
-def _speed(rendering: Mapping[str, Any]) -> str:
-    return (
-        "Rendering at {width}x{height}: {frames_per_second:.1f} frames a second (median of {frames}, {median_ms:.1f} ms; "
-        "threads: {threads})"
-    ).format_map(rendering)
 
 
 def frames_csv(columns: Sequence[str], rows: Iterable[FrameResult], seen: Mapping[int, View] | None = None) -> str:

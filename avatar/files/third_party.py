@@ -137,11 +137,12 @@ def lpips_folder() -> Path:
 def lpips_place(net: str) -> Path:
     """The first folder that holds weights of this network: $AVATAR_LPIPS or the cache's, then those of $AVATAR_MODELS."""
     own = lpips_folder()
+    return next((folder for folder in (own, *search_folders()) if has_lpips(folder, net)), own)
+
+
+def has_lpips(folder: Path, net: str) -> bool:
     names = {converted_lpips(net)}, {file.name for file in LPIPS_FILES[net]}
-    for folder in (own, *search_folders()):
-        if any(all((folder / name).is_file() for name in wanted) for wanted in names):
-            return folder
-    return own
+    return any(all((folder / name).is_file() for name in wanted) for wanted in names)
 
 
 def converted_lpips(net: str) -> str:
@@ -162,7 +163,7 @@ def search_folders() -> list[Path]:
 def find(file: ThirdPartyFile) -> Path | None:
     """The first place where the published file lies; where none does, the first where anything has its name."""
     places = [path for folder in search_folders() if is_there(path := folder / file.name)]
-    return next((path for path in places if _is_published(file, path)), next(iter(places), None))
+    return next((path for path in places if is_published(file, path)), next(iter(places), None))
 
 
 def require(file: ThirdPartyFile) -> Path:
@@ -177,7 +178,7 @@ def require(file: ThirdPartyFile) -> Path:
     return path
 
 
-def _is_published(file: ThirdPartyFile, path: Path) -> bool:
+def is_published(file: ThirdPartyFile, path: Path) -> bool:
     try:
         check_sha256(file, sha256_of(path, file.max_bytes), str(path))
     except UserError:

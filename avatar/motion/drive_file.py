@@ -1,18 +1,6 @@
 """Drive files: motion for an avatar from any tracker, as .npz, .csv or .json; docs/reenact.md is their definition.
 
-An .npz holds, for T frames (only `expression` is required; what is missing is at rest):
-
-    expression      [T, at most E]            coefficients of the head model's expression basis
-    jaw             [T, 3] or [T, 6]          rotation vector in radians, or the matrix' first two rows
-    eyes            [T, 6] or [T, 12]         left then right, each as the jaw
-    eyelids         [T, 2]                    left, right; 1 is closed
-    neck            [T, 3] or [T, 6]          the head against the torso, as the jaw; R and t are the head's, neck included
-    fps             []                        frames a second; DEFAULT_FPS
-    R, t, K, size   [T,3,3] [T,3] [3,3] [2]   camera: world to camera (OpenCV axes), metres; pixels; width, height
-    shape           [at most 300]             identity coefficients of the driver, for finding the neutral face
-    names           [T] text                  of the frames
-    head            [] text                   fingerprint of the head model that the coefficients belong to
-
+`neck` is the head against the torso; `R` and `t` are the head's, neck included.
 VHAP's tracked_flame_params*.npz and SMIRK's outputs are read by their own names (`FLAME_KEYS`), without the head's pose.
 Nothing in a drive file can execute code.
 """

@@ -1,11 +1,4 @@
-"""Driving one person's avatar with another person's motion.
-
-NAME.mp4               the driver's picture, where there is one, beside the render; under them each frame's distance from
-                       the training expressions; with a backdrop the render alone
-NAME-00000.png ...     in place of the video, for NAME.png; those of an earlier, longer run are removed
-NAME.distances.csv     those distances
-NAME.choices.json      every choice that made the video
-"""
+"""Driving one person's avatar with another person's motion; docs/reenact.md says what is written."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import torch
 
 from avatar.compute.device import CPU
 from avatar.config import load_config
-from avatar.data.json_values import parse_number
+from avatar.data.json_values import parse_object
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
@@ -63,18 +63,12 @@ class Plan:
         if not isinstance(raw, dict) or raw.get("format") != PLAN_FORMAT:
             raise UserError(f"{path} was written by another version of this program; start a new run")
         try:
-            rounds, iterations = _whole(raw["rounds"]), _whole(raw["iterations"])
-            in_rounds = _whole(raw["round_iterations"])
-            minutes = None if raw["minutes"] is None else parse_number(raw["minutes"], "minutes")
-            spent = parse_number(raw["spent"], "spent")
-            overrides = raw["overrides"]
-            if not isinstance(overrides, list) or not all(isinstance(override, str) for override in overrides):
-                raise ValueError("overrides are no list of texts")
-        except KeyError as error:
-            raise UserError(f"{path} is damaged: {error.args[0]} is missing; start a new run") from None
+            plan = parse_object(raw, cls)
+            if min(plan.rounds, plan.iterations, plan.round_iterations) < 1:
+                raise ValueError("rounds and steps are 1 or more")
         except ValueError as error:
             raise UserError(f"{path} is damaged: {error}; start a new run") from None
-        return cls(rounds, Source.from_dict(raw.get("source")), tuple(overrides), minutes, iterations, in_rounds, spent)
+        return plan
 
     def replanned(self, times: RoundTimes, rounds: int, frames: int) -> Plan:
         """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
@@ -98,13 +92,6 @@ class Plan:
     def round_overrides(self) -> list[str]:
         """Of the avatars that are only refined through."""
         return [*self.overrides, f"trainer.iterations={self.round_iterations}"]
-
-
-def _whole(value: object) -> int:
-    """A count. Raises ValueError for what is none."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"{value!r} is no count")
-    return value
 
 
 def plan_file(run: Path) -> Path:
@@ -149,7 +136,7 @@ def steps_in_time(
     avatar = new_avatar(assets, subject, config, term.name, CPU)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
-    step = measure_cost(frame, assets, subject.identity, len(subject), config).step_seconds
+    step = measure_cost(frame, assets, subject.identity, config).step_seconds
     able = affordable_iterations(plannable(minutes) - spent, step, refinement, rounds, frames)
     fewest = min(LEAST_STEPS, asked)
     if able < fewest:

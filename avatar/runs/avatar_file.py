@@ -21,7 +21,7 @@ from torch import Tensor
 from avatar.compute.memory import check_memory
 from avatar.config import Config, config_from_dict
 from avatar.data.camera_rig import parse_rig
-from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions
+from avatar.data.json_values import parse_intrinsics, parse_number, parse_positions, parse_value
 from avatar.data.recording import TRACK_SHAPES, Recording, checked_tracks
 from avatar.data.split import Split
 from avatar.data.tensor_file import read_metadata, read_tensors
@@ -150,17 +150,15 @@ def _parse(header: dict[str, Any], tensors: dict[str, Tensor]) -> AvatarFile:
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise ValueError("frames is not a list of names")
     count = len(names)
-    width, height = header["size"]
+    width, height = parse_value(header["size"], tuple[int, int], "size")
+    if not 1 <= width < 2**16 or not 1 <= height < 2**16:
+        raise ValueError(f"an image size of {width}x{height} is impossible")
     fps = parse_number(header["fps"], "fps")
-    for value in (width, height):
-        if not isinstance(value, int) or not 1 <= value < 2**16:
-            raise ValueError(f"an image size of {width}x{height} is impossible")
     intrinsics = parse_intrinsics(header["intrinsics"])
     if fps <= 0 or min(intrinsics[:2]) <= 0:
         raise ValueError("fps and focal lengths must be positive")
     for key, kind in (("name", str), ("data_hash", str), ("head_fingerprint", str), ("perceptual", str), ("step", int)):
-        if not isinstance(header[key], kind):
-            raise TypeError(f"{key} is a {type(header[key]).__name__}, not a {kind.__name__}")
+        parse_value(header[key], kind, key)
     rig = parse_rig(header["rig"], count) if "rig" in header else None
     rows = count if rig is None else max(rig.times) + 1
     recording = Recording(

@@ -19,6 +19,7 @@ from typing import Any
 import torch
 
 from avatar.config import Config, config_from_dict
+from avatar.data.json_values import parse_object
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
@@ -129,14 +130,8 @@ def read_run_info(run: Path) -> RunInfo:
             f"{path} is of format {found}, and this program reads {RUN_FORMAT}; train again with this version"
         )
     try:
-        texts = {key: info[key] for key in ("perceptual", "data_hash", "head_fingerprint")}
-        if wrong := [key for key, value in texts.items() if not isinstance(value, str)]:
-            raise UserError(f"{wrong[0]} is not text")
-        options = info["options"]
-        if not isinstance(options, dict) or not all(isinstance(option, str) for option in options.values()):
-            raise UserError("options is not an object of texts")
-        return RunInfo(Source.from_dict(info.get("source")), config_from_dict(info["config"]), options, **texts)
-    except (KeyError, UserError) as error:
+        return parse_object(info, RunInfo, config=config_from_dict(info["config"]))
+    except (KeyError, ValueError, UserError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise UserError(f"{path} is damaged ({reason})") from None
 

@@ -1,16 +1,4 @@
-"""The file that says what a sweep trains; docs/sweep.md is its definition.
-
-subjects: [../anna, {folder: ../carla, head: ../head_model, frame_offset: 1}]
-head: ../head_model                            # of subjects that name none
-variants: {n8: [], n32: [model.latent_dim=32]} # or `product: {model.latent_dim: [8, 32], experiment: [demo, paper]}`
-overrides: [data.size=256]                     # of every job
-seeds: [0, 1, 2]
-protocols: [hypergaussians]                    # none: all of them
-threads: 2                                     # of a job
-memory_gb: 3
-gpus: 1                                        # of a job; 0.5 lets two share one. Default: see Spec.gpus_of_a_job
-retries: 2                                     # after a kill or a crash; a sentence is an answer, and not tried again
-"""
+"""The file that says what a sweep trains; docs/sweep.md is its definition."""
 
 from __future__ import annotations
 

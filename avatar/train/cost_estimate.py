@@ -13,7 +13,6 @@ from torch import Tensor
 
 from avatar.config import Config, TrainerConfig
 from avatar.data.frame import Frame
-from avatar.data.loader import BYTES_PER_PIXEL, CACHE_BYTES
 from avatar.head.assets import HeadAssets
 from avatar.runs.model_registry import make_avatar
 from avatar.train.loss import TrainingLoss, choose_perceptual, perceptual_start
@@ -23,7 +22,6 @@ from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
-_COPIES = 4  # of every parameter: itself, its gradient, Adam's two moments
 
 
 @dataclass(frozen=True)
@@ -32,22 +30,10 @@ class Cost:
     parameters: int
     step_seconds: float  # on this machine, the mean over the run; of each kind of step the median
     iterations: int
-    cache_bytes: int  # decoded frames that are kept
-    parameter_bytes: int  # with gradients and the optimizer's state
-
-    def facts(self) -> dict[str, str]:
-        hours, minutes = divmod(round(self.step_seconds * self.iterations / 60), 60)
-        return {
-            "Gaussians": f"{self.gaussians:,}",
-            "one training step on this machine": f"{self.step_seconds:.3f} s ({torch.get_num_threads()} threads)",
-            f"the recipe's {self.iterations:,} steps": f"{hours} h {minutes} min" if hours else f"{minutes} min",
-            "memory for decoded frames": f"{self.cache_bytes / 2**20:,.0f} MiB",
-            "memory for parameters and optimizer": f"{self.parameter_bytes / 2**20:,.0f} MiB",
-        }
 
 
-def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"], frames: int, config: Config) -> Cost:
-    """Train an avatar of this head on one of its frames for a few steps, and throw it away; the video has `frames`.
+def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"], config: Config) -> Cost:
+    """Train an avatar of this head on one of its frames for a few steps, and throw it away.
 
     Raises UserError for frames that are too small to train on.
     """
@@ -70,15 +56,11 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
 
     kinds = kinds_of_steps(config.trainer, term.every)
     total = sum(count * seconds(step) for count, step in kinds)
-    height, width = frame.image.shape[:2]
-    parameters = sum(p.numel() for p in avatar.parameters())
     return Cost(
         gaussians=len(avatar),
-        parameters=parameters,
+        parameters=sum(p.numel() for p in avatar.parameters()),
         step_seconds=total / config.trainer.iterations,
         iterations=config.trainer.iterations,
-        cache_bytes=min(width * height * BYTES_PER_PIXEL * frames, CACHE_BYTES),
-        parameter_bytes=4 * _COPIES * parameters,
     )
 
 

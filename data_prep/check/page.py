@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +22,12 @@ _BADGES = ("fine", "warning", "error")  # by exit status
 _FIT_COLUMNS = ("overlap", "inside", "overhang", "mouth", "mask_ratio", "size")
 
 
-def write_page(check: Check, cost: Mapping[str, str] | None, out: Path) -> Path:
+def write_page(check: Check, out: Path) -> Path:
     """Write OUT/index.html, which needs nothing else, and OUT/frames.csv; returns the page."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         page = out / PAGE
-        page.write_text(render_page(check, cost), encoding="utf-8", errors="replace")  # names may be none of UTF-8
+        page.write_text(render_page(check), encoding="utf-8", errors="replace")  # names may be none of UTF-8
         if check.clip is not None:
             write_frames(check.clip, out / TABLE)
     except OSError as error:
@@ -36,7 +35,7 @@ def write_page(check: Check, cost: Mapping[str, str] | None, out: Path) -> Path:
     return page
 
 
-def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
+def render_page(check: Check) -> str:
     badge = _BADGES[check.status]
     header = element(
         "header",
@@ -50,8 +49,6 @@ def render_page(check: Check, cost: Mapping[str, str] | None) -> str:
         if check.coverage is not None:
             plots = [*coverage_plots(check.coverage), *course_plots(check.clip)]
             parts.append(section("Coverage and course", element("div", *plots, class_="plots")))
-        if cost is not None:
-            parts.append(section("What training will take", tiles(cost)))
         figures = {name: _shown(value) for name, value in facts(check.clip, check.coverage).items()}
         evidence = figures.pop("offset found")
         parts.append(section("Figures", element("p", f"Offset: {evidence}.", class_="soft"), tiles(figures)))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from avatar.data.json_values import parse_number, parse_object, parse_value
 from avatar.errors import UserError, refuse
 from avatar.files.atomic import write_atomically
 from avatar.files.pickles import load_npz
@@ -106,35 +106,16 @@ def read_info(folder: Path) -> TrackingInfo:
             f"{path} has version {raw.get('version')!r}, this program reads {VERSION}; track the video again"
         )
     try:
-        intrinsics = tuple(float(v) for v in raw["intrinsics"])
-        info = TrackingInfo(
-            fps=float(raw["fps"]),
-            width=int(raw["width"]),
-            height=int(raw["height"]),
-            intrinsics=intrinsics,  # type: ignore[arg-type]  # its length is checked below
-            focal=str(raw["focal"]),
-            focal_is_assumed=bool(raw["focal_is_assumed"]),
-            head_path=str(raw["head_path"]),
-            head_fingerprint=str(raw["head_fingerprint"]),
-            source=dict(raw["source"]),
-            left_out={int(number): str(why) for number, why in dict(raw["left_out"]).items()},
-            notes=tuple(str(note) for note in raw["notes"]),
-            quality=_quality(raw["quality"]),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise UserError(f"{path} is damaged ({error!r}); track the video again") from None
-    is_camera = len(intrinsics) == 4 and all(math.isfinite(v) for v in intrinsics) and min(intrinsics[:2]) > 0
-    if not is_camera or not (0 < info.fps < 1e4) or not (1 <= info.width < 2**16 and 1 <= info.height < 2**16):
+        info = parse_object(raw, TrackingInfo)
+        figures = parse_value(info.quality.get("figures", []), tuple[dict[str, Any], ...], "quality.figures")
+        for figure in figures:
+            parse_number(figure.get("value", 0.0), "a figure of the quality")
+    except ValueError as error:
+        raise UserError(f"{path} is damaged ({error}); track the video again") from None
+    is_size = 1 <= info.width < 2**16 and 1 <= info.height < 2**16
+    if not is_size or not 0 < info.fps < 1e4 or min(info.intrinsics[:2]) <= 0:
         raise UserError(f"{path} is damaged: its camera or its rate cannot be; track the video again")
     return info
-
-
-def _quality(raw: Any) -> dict[str, Any]:
-    """Raises TypeError, ValueError or OverflowError where its figures are no objects of finite numbers."""
-    for figure in raw.get("figures", []):
-        if not math.isfinite(float(figure.get("value", 0.0))):
-            raise ValueError(figure)
-    return dict(raw)
 
 
 def write_tracking(folder: Path, info: TrackingInfo, tracks: Mapping[int, FrameTrack]) -> None:

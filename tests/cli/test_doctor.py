@@ -12,12 +12,11 @@ from command_line import avatar
 
 from avatar.commands import doctor
 from avatar.errors import UserError
-from avatar.files.third_party import FACE_LANDMARKER, LPIPS_FILES, TRACKING_FILES, lpips_folder, models_folder
+from avatar.files.third_party import FACE_LANDMARKER, TRACKING_FILES, lpips_folder, models_folder, sha256_of
 
 NAMES = [
     *("PyTorch", "compiled core", "configuration", "video encoder", "GPU", "head model"),
-    *(file.name for file in TRACKING_FILES),
-    *(f"LPIPS {net}" for net in LPIPS_FILES),
+    "models",
     *doctor.EXTRAS,
 ]
 
@@ -33,26 +32,20 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def rows(output: str) -> dict[str, tuple[str, str]]:
     """State and advice by name, read by the columns of the heading."""
-    lines = output.partition("\nAddresses")[0].splitlines()
+    lines = output.splitlines()
     begin = next(i for i, line in enumerate(lines) if line.startswith("name"))
     state, advice = lines[begin].index("state"), lines[begin].index("what to do")
     return {line[:state].strip(): (line[state:advice].strip(), line[advice:].strip()) for line in lines[begin + 1 :]}
 
 
-def test_it_is_a_table_with_whole_names_and_the_addresses_below() -> None:
+def test_it_is_a_table_with_whole_names() -> None:
     output = avatar("doctor")
     found = rows(output)
     assert list(found) == NAMES
     assert found["compiled core"] == ("works", "") and found["configuration"] == ("found", "")
     assert found["video encoder"][0].startswith("ffmpeg ")
-    assert found["face_landmarker.task"] == ("missing", "avatar models --download")
-    assert found["selfie_multiclass_256x256.tflite"] == ("missing", "optional: avatar models --download")
     assert "AVATAR_HEAD" in found["head model"][1] and found["GPU"][0] == "none"
-    table, _, below = output.partition("\nAddresses")
-    assert "http" not in table and max(map(len, table.splitlines())) <= 120
-    for file in (*TRACKING_FILES, *(file for both in LPIPS_FILES.values() for file in both)):
-        assert f"    {file.url}\n" in below
-    assert str(models_folder()) in below and str(lpips_folder()) in below
+    assert max(map(len, output.splitlines())) <= 120
 
 
 def test_it_does_not_wait_for_pytorch() -> None:
@@ -63,19 +56,23 @@ def test_it_does_not_wait_for_pytorch() -> None:
     assert "light" in done.stdout, done.stderr
 
 
-def test_what_is_damaged_is_not_called_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models_are_counted_where_they_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert rows(avatar("doctor"))["models"] == ("0 of 3 there", "avatar models lists them and the optional ones")
     models_folder().mkdir(parents=True)
-    (models_folder() / FACE_LANDMARKER.name).write_bytes(b"another file")
+    for file in TRACKING_FILES:
+        (models_folder() / file.name).write_bytes(b"another file")
+    assert rows(avatar("doctor"))["models"][0] == "0 of 3 there"
+    own = FACE_LANDMARKER._replace(sha256=sha256_of(models_folder() / FACE_LANDMARKER.name))
+    monkeypatch.setattr(doctor, "TRACKING_FILES", (own, *TRACKING_FILES[1:]))
     lpips_folder().mkdir()
-    (lpips_folder() / "lpips_squeeze.safetensors").write_bytes(b"another file")
-    for file in LPIPS_FILES["alex"]:
-        (lpips_folder() / file.name).write_bytes(b"another file")
+    (lpips_folder() / "lpips_squeeze.safetensors").touch()
+    assert rows(avatar("doctor"))["models"][0] == "2 of 3 there"
+
+
+def test_the_head_model_is_sought_where_the_variable_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AVATAR_HEAD", str(tmp_path / "none"))
-    output = avatar("doctor")
-    found = rows(output)
-    for name in (FACE_LANDMARKER.name, "LPIPS squeeze", "LPIPS alex"):
-        assert found[name][0] == "damaged" and FACE_LANDMARKER.url not in output
-    assert found["head model"][0] == "missing" and str(tmp_path / "none") in found["head model"][1]
+    state, advice = rows(avatar("doctor"))["head model"]
+    assert state == "missing" and str(tmp_path / "none") in advice
     (tmp_path / "none" / "FLAME2023").mkdir(parents=True)
     (tmp_path / "none" / "FLAME2023" / "generic_model.pkl").touch()
     assert rows(avatar("doctor"))["head model"][0] == "found"

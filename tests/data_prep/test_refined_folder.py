@@ -186,10 +186,10 @@ def test_a_refined_folder_is_noticed_when_its_origin_changes(written: Path, tmp_
     ("change", "said"),
     [
         (lambda raw: raw.update(version=9), "not of version 3"),
-        (lambda raw: raw["refinement"].pop("tracker"), "names no tracker"),
+        (lambda raw: raw["refinement"].pop("tracker"), "refinement.tracker is missing"),
         (lambda raw: raw["refinement"].update(rounds=[]), "no rounds"),
-        (lambda raw: raw["refinement"]["rounds"][0].update(step="x"), "of the wrong type"),
-        (lambda raw: raw["refinement"]["rounds"][0].update(trained_on=["x"]), "not a list of frame numbers"),
+        (lambda raw: raw["refinement"]["rounds"][0].update(step="x"), "step is not a whole number"),
+        (lambda raw: raw["refinement"]["rounds"][0].update(trained_on=["x"]), r"trained_on\[0\] is not a whole number"),
         (lambda raw: raw.pop("division"), "'division'"),
         (lambda raw: raw.pop("rig"), "'rig'"),
         (lambda raw: raw.update(division={"x": "train"}), "damaged"),

@@ -34,7 +34,6 @@ OPEN_BY_THEMSELVES = {
     "avatar/bench/peak_memory.py",
     "avatar/compute/memory.py",
     "avatar/data/tensor_file.py",
-    "avatar/commands/doctor.py",
     "avatar/evaluation/verify.py",
     "avatar/export/mediapipe_pack.py",
     "avatar/export/web_page.py",

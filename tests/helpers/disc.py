@@ -132,9 +132,6 @@ class BlobRenderer:
     def draw(self, gaussians: Gaussians, camera: Camera, background: torch.Tensor) -> Rendering:
         return splat(gaussians, camera, background)
 
-    def render(self, params: HeadParams, camera: Camera) -> Rendering:
-        return splat(self.avatar(params), camera, self.background)
-
 
 def make_run(path: Path, subject: Subject) -> Any:
     data = SimpleNamespace(size=None, background=(1.0, 1.0, 1.0))

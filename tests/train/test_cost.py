@@ -34,5 +34,5 @@ def test_any_frame_shows_what_training_takes(tracked_folder: Path, time: int | N
     config = small_config()
     _, subject, assets = open_small(tracked_folder, config)
     frame = replace(subject.frame(5), shared_time=time)
-    cost = measure_cost(frame, assets, subject.identity, len(subject), config)
+    cost = measure_cost(frame, assets, subject.identity, config)
     assert cost.step_seconds > 0 and cost.iterations == config.trainer.iterations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -43,16 +42,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "index.html"
 
 
-def test_the_page_holds_pictures_findings_and_cost_and_loads_nothing(page: Path) -> None:
+def test_the_page_holds_pictures_and_findings_and_loads_nothing(page: Path) -> None:
     parsed = Sources()
     parsed.feed(page.read_text(encoding="utf-8"))
     assert len(parsed.sources) == 8 + 6  # overlays, plots
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in parsed.sources)
     assert "Check of so <me> & one" in parsed.text
     assert "The tracking cannot be used in frame 00005 of checkpoint: all zero" in parsed.text
-    assert "one training step on this machine" in parsed.text
-    steps = re.search(r"the recipe's ([0-9,]+) steps", parsed.text)
-    assert steps is not None and steps[1] == "180", "ten passes over 18 frames"
     assert page.stat().st_size < 3e6
 
 

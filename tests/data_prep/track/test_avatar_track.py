@@ -101,10 +101,10 @@ LISTING = {
     "another version": ({"version": 99}, "has version 99, this program reads 1; track the video again"),
     "no rate": ({"fps": None}, "is damaged"),
     "a rate of nothing": ({"fps": 0}, "its camera or its rate cannot be"),
-    "a camera of three": ({"intrinsics": [1, 1, 1]}, "its camera or its rate cannot be"),
-    "a camera at infinity": ({"intrinsics": [float("inf"), 1, 1, 1]}, "its camera or its rate cannot be"),
+    "a camera of three": ({"intrinsics": [1, 1, 1]}, "intrinsics has 3 values, not 4"),
+    "a camera at infinity": ({"intrinsics": [float("inf"), 1, 1, 1]}, "intrinsics[0] is not a finite number"),
     "a size of nothing": ({"width": 0}, "its camera or its rate cannot be"),
-    "left out what": ({"left_out": {"a": "b"}}, "is damaged"),
+    "left out what": ({"left_out": {"a": "b"}}, "is damaged (left_out has the key 'a', not a number)"),
 }
 
 
