@@ -63,6 +63,10 @@ def add_head(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_background(parser: argparse.ArgumentParser, help: str) -> None:
+    parser.add_argument("--background", metavar="COLOUR|IMAGE|transparent", help=help)
+
+
 def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
     parser.add_argument(
         "--device",

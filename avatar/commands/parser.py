@@ -9,6 +9,7 @@ from avatar.bench import PARTS
 from avatar.commands.groups import GROUPS, list_commands
 from avatar.commands.options import (
     add_avatar,
+    add_background,
     add_device,
     add_folder,
     add_head,
@@ -178,11 +179,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     )
     reenact.add_argument("--camera", choices=("driver", "target"), default="driver", help="whose head pose is shown")
     reenact.add_argument("--intrinsics", choices=("driver", "target"), default="driver", help="through whose lens")
-    reenact.add_argument(
-        "--background",
-        metavar="COLOUR|IMAGE|transparent",
-        help="the avatar alone over it; transparent: .webm, .mov or .png (default: beside the driver)",
-    )
+    add_background(reenact, "the avatar alone over it; transparent: .webm, .mov or .png (default: beside the driver)")
     reenact.add_argument(
         "--out",
         type=Path,
