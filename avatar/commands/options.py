@@ -8,7 +8,7 @@ from pathlib import Path
 
 def add_source(parser: argparse.ArgumentParser) -> None:
     """The options that name a tracked folder and what belongs to it."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
+    parser.add_argument("folder", type=Path, metavar="SUBJECT", help="tracked video folder")
     add_head(parser)
     add_reading(parser)
     add_tracking(parser)
@@ -36,7 +36,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
 
 
 def add_tracking(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in FOLDER")
+    parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in SUBJECT")
     parser.add_argument("--frame-offset", type=int, metavar="N", help="image number minus .frame number, if known")
 
 

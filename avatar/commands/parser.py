@@ -92,7 +92,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     train = commands.add_parser("train")
     train.add_argument(
-        "words", nargs="*", metavar="FOLDER | VIDEO", help="what avatar track wrote; with --resume the RUN"
+        "words", nargs="*", metavar="SUBJECT | VIDEO", help="what avatar track wrote; with --resume the RUN"
     )
     add_head(train)
     add_reading(train)
@@ -223,7 +223,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     bench = commands.add_parser("bench")
     bench.add_argument("part", choices=tuple(PARTS))
     wanted = "; ".join(f"{name}: {part.inputs}" for name, part in PARTS.items() if part.inputs)
-    bench.add_argument("words", nargs="*", metavar="FOLDER | RUN", help=f"what is measured ({wanted}) and key=value")
+    bench.add_argument("words", nargs="*", metavar="SUBJECT | RUN", help=f"what is measured ({wanted}) and key=value")
     add_tracking(bench)
     add_head(bench)
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")
