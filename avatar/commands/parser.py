@@ -103,6 +103,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the recipe's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on with RUN from its newest checkpoint")
+    train.add_argument("--view", action="store_true", help="show it in a browser from the first checkpoint on")
     train.add_argument("--dry-run", action="store_true", help="say what it would take, and train nothing")
     train.add_argument("--print-config", action="store_true", help="print the configuration as key=value, and no more")
     train.add_argument(
