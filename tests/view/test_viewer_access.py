@@ -56,11 +56,15 @@ def test_axe_finds_nothing_in_the_viewer(page: Any) -> None:
 
 
 @pytest.mark.chromium
-def test_sliders_and_their_fields_have_names(page: Any, viewer: Viewer) -> None:
+def test_sliders_and_their_fields_have_names_and_keys(page: Any, viewer: Viewer) -> None:
     page.get_by_role("textbox", name="jaw open").fill("50")
     until(lambda: viewer.setting.joints)
     slider = page.get_by_role("slider", name="jaw open")
     assert slider.get_attribute("aria-valuenow") == "50"
-    slider.press("ArrowRight")
+    look = viewer.setting.look
+    slider.press("ArrowRight", delay=500)
     until(lambda: slider.get_attribute("aria-valuenow") == "51")
-    assert viewer.setting.joints.keys() == {"jaw"}
+    assert viewer.setting.joints.keys() == {"jaw"} and viewer.setting.look == look, "the key turns no camera"
+    slider.blur()
+    page.keyboard.press("ArrowRight", delay=500)
+    until(lambda: viewer.setting.look != look)
