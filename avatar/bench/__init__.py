@@ -11,7 +11,7 @@ class Part(NamedTuple):
     """`module` has run(request: Request) -> None, which prints a table and writes files into `request.out`."""
 
     module: str
-    inputs: str = ""  # what stands after the part's name: nothing, FOLDER, [FOLDER], RUN or RUN...
+    inputs: str = ""  # what stands after the part's name: nothing, SUBJECT, [SUBJECT], RUN or RUN...
     on_gpu: bool = False  # whether it measures a GPU too
 
 
@@ -35,9 +35,9 @@ PARTS = {
     "hyper": Part("avatar.bench.hyper_report"),
     "render": Part("avatar.bench.render", "RUN", on_gpu=True),
     "transfer": Part("avatar.bench.transfer"),
-    "train": Part("avatar.bench.train", "FOLDER", on_gpu=True),
+    "train": Part("avatar.bench.train", "SUBJECT", on_gpu=True),
     "quality": Part("avatar.bench.quality", "RUN..."),
     "stability": Part("avatar.bench.stability"),
-    "refine": Part("avatar.bench.refine", "FOLDER"),
-    "track": Part("avatar.bench.track", "[FOLDER]"),
+    "refine": Part("avatar.bench.refine", "SUBJECT"),
+    "track": Part("avatar.bench.track", "[SUBJECT]"),
 }

@@ -1,7 +1,7 @@
 """What a plain video costs against the true tracking: a subject's pictures as a video, tracked, and made into avatars.
 
 A subject's own folder is the truth. Of demo subjects the pictures in a room, with noise and compression, are the video
-that `avatar track` gets, with no choice made; of a FOLDER the pictures as they are.
+that `avatar track` gets, with no choice made; of a SUBJECT the pictures as they are.
 
 Avatars of one recipe: trained on the true folder, on the video's frames and masks with the true tracking, on what `avatar
 track` made, and on that as `avatar train --refine 1` and `--refine 2` refine it. Each is driven by its own tracking and

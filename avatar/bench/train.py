@@ -1,4 +1,4 @@
-"""Time of a training step, whole and by stage, of the paper's recipe and the default one: `avatar bench train FOLDER`."""
+"""Time of a training step, whole and by stage, of the paper's recipe and the default one: `avatar bench train SUBJECT`."""
 
 from __future__ import annotations
 

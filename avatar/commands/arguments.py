@@ -68,13 +68,13 @@ def sort_words(arguments: argparse.Namespace) -> list[Path]:
 
 
 def sort_train(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """FOLDER and, with --resume, RUN. Which of the two a single path is then, the folder itself says."""
+    """SUBJECT and, with --resume, RUN. Which of the two a single path is then, the folder itself says."""
     arguments.paths = sort_words(arguments)
     given = len(arguments.paths)
     if arguments.resume and given > 2:
-        parser.error(f"train --resume takes a RUN, and its FOLDER where that has moved; {given} paths are given")
+        parser.error(f"train --resume takes a RUN, and its SUBJECT where that has moved; {given} paths are given")
     if not arguments.resume and not arguments.print_config and given != 1:
-        parser.error(f"train takes one FOLDER, {given} given")
+        parser.error(f"train takes one SUBJECT, {given} given")
 
 
 def sort_reenact(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

@@ -20,7 +20,9 @@ from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
 from avatar.files.numbered import numbered, remove_longer
+from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
+from avatar.pipeline.backdrop import TRANSPARENT, parse_backdrop
 from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.model_registry import refuse_features
@@ -37,11 +39,13 @@ def run_export(arguments: Namespace) -> int:
     format = chosen_format(arguments.format, arguments.out)
     check_options(arguments, format)
     trained = open_trained(arguments.run, arguments.head)
-    out: Path = arguments.out or Path(f"{trained.name}{SUFFIXES[format]}")
-    check_file(out, [SUFFIXES[format]], f"--format {format}")
-    motion = Path(arguments.motion) if arguments.motion else None
+    is_transparent = arguments.background == TRANSPARENT
+    suffixes = ALPHA_SUFFIXES if is_transparent else SUFFIXES[format]
+    out: Path = arguments.out or Path(f"{trained.name}{suffixes[0]}")
+    check_file(out, suffixes, "a transparent video" if is_transparent else f"--format {format}")
+    motion, behind = (Path(name) if name else None for name in (arguments.motion, arguments.background))
     written = [out, out.with_name(PACK)] if arguments.webcam else [out]
-    check_outputs(written, [arguments.run, trained.source, arguments.head, motion])
+    check_outputs(written, [arguments.run, trained.source, arguments.head, motion, behind])
     WRITERS[format](trained, out, arguments)
     return OK
 
@@ -52,11 +56,10 @@ def chosen_format(format: str | None, out: Path | None) -> str:
         return format
     if out is None:
         return "web"
-    found = next((name for name, suffix in SUFFIXES.items() if out.suffix.lower() == suffix), None)
+    found = next((name for name, suffixes in SUFFIXES.items() if out.suffix.lower() in suffixes), None)
     if found is None:
-        raise UserError(
-            f"{out.name} does not say what to write: end it in {', '.join(SUFFIXES.values())}, or give --format"
-        )
+        known = ", ".join(suffixes[0] for suffixes in SUFFIXES.values())
+        raise UserError(f"{out.name} does not say what to write: end it in {known}, or give --format")
     return found
 
 
@@ -128,7 +131,8 @@ def write_clip(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     clip = chosen_clip(trained, arguments, "test")
     assert clip is not None
     path = arguments.camera or "recorded"
-    write_movie(trained, clip, out, path, arguments.size)
+    backdrop = None if arguments.background is None else parse_backdrop(arguments.background)
+    write_movie(trained, clip, out, path, arguments.size, backdrop)
     print(f"Video    {out}: {len(clip)} frames, camera {path}")
 
 
@@ -172,12 +176,12 @@ def write_avatar_format(trained: TrainedAvatar, out: Path, arguments: Namespace)
 
 
 SUFFIXES = {
-    "web": ".html",
-    "web-avatar": ".avatar",
-    "avatar": ".safetensors",
-    "ply": ".ply",
-    "glb": ".glb",
-    "video": ".mp4",
+    "web": (".html",),
+    "web-avatar": (".avatar",),
+    "avatar": (".safetensors",),
+    "ply": (".ply",),
+    "glb": (".glb",),
+    "video": VIDEO_SUFFIXES,
 }
 WRITERS: dict[str, Callable[[TrainedAvatar, Path, Namespace], None]] = {
     "web": write_web,
@@ -196,4 +200,5 @@ OPTIONS = {
     "texture": ("glb",),
     "camera": ("video",),
     "size": ("video",),
+    "background": ("video",),
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 
 def add_source(parser: argparse.ArgumentParser) -> None:
     """The options that name a tracked folder and what belongs to it."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="tracked video folder")
+    parser.add_argument("folder", type=Path, metavar="SUBJECT", help="tracked video folder")
     add_head(parser)
     add_reading(parser)
     add_tracking(parser)
@@ -36,7 +36,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
 
 
 def add_tracking(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in FOLDER")
+    parser.add_argument("--tracking", type=Path, metavar="DIR", help="folder of the .frame files, if not in SUBJECT")
     parser.add_argument("--frame-offset", type=int, metavar="N", help="image number minus .frame number, if known")
 
 
@@ -61,6 +61,10 @@ def add_head(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="FLAME-format head model, file or folder (default: head_model/ in the subject, then $AVATAR_HEAD)",
     )
+
+
+def add_background(parser: argparse.ArgumentParser, help: str) -> None:
+    parser.add_argument("--background", metavar="COLOUR|IMAGE|transparent", help=help)
 
 
 def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from avatar.commands.options import add_avatar, add_device, add_folder, add_head
+from avatar.commands.options import add_avatar, add_background, add_device, add_folder, add_head
 
 
 def add_create(create: argparse.ArgumentParser) -> None:
@@ -49,6 +49,7 @@ def add_export(export: argparse.ArgumentParser) -> None:
         "--camera", choices=("recorded", "still", "turntable", "orbit"), help="video: its path (default: recorded)"
     )
     export.add_argument("--size", type=int, metavar="N", help="video: its width in pixels (default: as in training)")
+    add_background(export, "video: what is behind; transparent: .webm or .mov (default: as in training)")
 
 
 def add_view(view: argparse.ArgumentParser) -> None:

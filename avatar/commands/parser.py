@@ -9,6 +9,7 @@ from avatar.bench import PARTS
 from avatar.commands.groups import GROUPS, list_commands
 from avatar.commands.options import (
     add_avatar,
+    add_background,
     add_device,
     add_folder,
     add_head,
@@ -91,7 +92,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     train = commands.add_parser("train")
     train.add_argument(
-        "words", nargs="*", metavar="FOLDER | VIDEO", help="what avatar track wrote; with --resume the RUN"
+        "words", nargs="*", metavar="SUBJECT | VIDEO", help="what avatar track wrote; with --resume the RUN"
     )
     add_head(train)
     add_reading(train)
@@ -102,6 +103,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     train.add_argument("--iterations", type=int, help="optimizer steps (default: the recipe's)")
     train.add_argument("--seed", type=int, help="seed of initial weights and frame order (default: 0)")
     train.add_argument("--resume", action="store_true", help="go on with RUN from its newest checkpoint")
+    train.add_argument("--view", action="store_true", help="show it in a browser from the first checkpoint on")
     train.add_argument("--dry-run", action="store_true", help="say what it would take, and train nothing")
     train.add_argument("--print-config", action="store_true", help="print the configuration as key=value, and no more")
     train.add_argument(
@@ -178,11 +180,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     )
     reenact.add_argument("--camera", choices=("driver", "target"), default="driver", help="whose head pose is shown")
     reenact.add_argument("--intrinsics", choices=("driver", "target"), default="driver", help="through whose lens")
-    reenact.add_argument(
-        "--background",
-        metavar="COLOUR|IMAGE|transparent",
-        help="the avatar alone over it; transparent: .webm, .mov or .png (default: beside the driver)",
-    )
+    add_background(reenact, "the avatar alone over it; transparent: .webm, .mov or .png (default: beside the driver)")
     reenact.add_argument(
         "--out",
         type=Path,
@@ -226,7 +224,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
     bench = commands.add_parser("bench")
     bench.add_argument("part", choices=tuple(PARTS))
     wanted = "; ".join(f"{name}: {part.inputs}" for name, part in PARTS.items() if part.inputs)
-    bench.add_argument("words", nargs="*", metavar="FOLDER | RUN", help=f"what is measured ({wanted}) and key=value")
+    bench.add_argument("words", nargs="*", metavar="SUBJECT | RUN", help=f"what is measured ({wanted}) and key=value")
     add_tracking(bench)
     add_head(bench)
     bench.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/bench"), help="default: runs/bench")

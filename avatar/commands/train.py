@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.commands.outputs import check_run_folder
+from avatar.commands.train_view import train_in_view
 from avatar.config import MAX_OVERRIDE, chosen_options, flatten, load_config
 from avatar.config_values import shown
 from avatar.data.source import Source
@@ -40,9 +41,13 @@ def run_train(arguments: Namespace) -> int:
     if arguments.dry_run:
         return dry_run(arguments)
     run = arguments.out or default_run(arguments.folder)
-    status = train_as_asked(run, arguments)
-    print(f"Next         avatar eval {run}" if status == OK else "Add --resume to the same command to go on.")
-    return status
+
+    def train() -> int:
+        status = train_as_asked(run, arguments)
+        print(f"Next         avatar eval {run}" if status == OK else "Add --resume to the same command to go on.")
+        return status
+
+    return train_in_view(run, arguments.head, train) if arguments.view else train()
 
 
 def train_as_asked(run: Path, arguments: Namespace) -> int:

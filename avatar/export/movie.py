@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from avatar.files.video import write_video
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
+from avatar.pipeline.backdrop import Backdrop
 from avatar.runs.motion_clip import Clip
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.tensors import to_8_bit
@@ -53,8 +54,18 @@ def along_path(
         yield replace(params, neck=neck), path_camera(rest, limits, path, number / clip.fps)
 
 
-def write_movie(trained: TrainedAvatar, clip: Clip, out: Path, path: CameraPath, size: int | None = None) -> None:
-    """H.264 in MP4, drawn over the colour that the avatar was trained over."""
-    images = (rendering.image for rendering in trained.stream(along_path(trained, clip, path, size)))
-    pixels = (to_8_bit(image).numpy() for image in images)
+def write_movie(
+    trained: TrainedAvatar,
+    clip: Clip,
+    out: Path,
+    path: CameraPath,
+    size: int | None = None,
+    backdrop: Backdrop | None = None,
+) -> None:
+    """Drawn over the backdrop, else over the colour that the avatar was trained over."""
+    renderings = trained.stream(along_path(trained, clip, path, size))
+    if backdrop is None:
+        pixels = (to_8_bit(each.image).numpy() for each in renderings)
+    else:
+        pixels = (backdrop.pixels(each, trained.background) for each in renderings)
     write_video(out, tqdm(pixels, total=len(clip), desc="video", unit="frame", dynamic_ncols=True), clip.fps)

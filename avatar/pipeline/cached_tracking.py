@@ -40,7 +40,7 @@ def head_for_video(video: Path, given: Path | None) -> Path:
 
 
 def is_video(path: Path) -> bool:
-    """Whether a command's FOLDER is a video, or a folder of pictures, that has to be tracked first."""
+    """Whether a command's SUBJECT is a video, or a folder of pictures, that has to be tracked first."""
     return not recognise(path) and is_footage(path)
 
 

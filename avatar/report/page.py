@@ -33,6 +33,7 @@ BINNINGS = (  # key of results.json, what it is binned by, decimals of the edges
     ("by_expression_distance", "distance from the training expressions", 2, "mm"),
 )
 MAX_POINTS = 1000  # of a curve
+PAGE = "avatar.html"
 SCRIPT = """
 const slider = document.getElementById("frame");
 const panels = [...document.querySelectorAll("#frames figure")];
@@ -65,9 +66,12 @@ def render_report(run: Run) -> str:
         "training frames": len(run.subject.split.train),
         "held-out frames": len(run.subject.split.test),
     }
-    title = f"Run {run.path.resolve().name}"
+    folder, lines = run.path.resolve(), [element("p", str(run.path), class_="soft")]
+    title = f"Run {folder.name}"
+    if folder.name == "run" and is_there(folder.parent / PAGE):  # as avatar create and demo lay them out
+        lines.append(element("p", element("a", "The avatar in its page", href=f"../{PAGE}")))
     parts = [
-        element("header", element("h1", title), element("p", str(run.path), class_="soft")),
+        element("header", element("h1", title), *lines),
         section("Held-out frames", *_main_figures(results), *_frames(run)),
         section("Held-out figures", *_figures(run, results)),
         section("Training", fold("Loss and PSNR", *_curves(run.path))),

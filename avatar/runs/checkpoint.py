@@ -83,7 +83,7 @@ def newest_checkpoint(run: Path) -> Checkpoint:
     """The last checkpoint of a run; UserError when there is none: an untrained model is never used silently."""
     files = list_checkpoints(run / "checkpoints")
     if not files:
-        raise UserError(f"{run} holds no checkpoint; train first (avatar train FOLDER --out {run})")
+        raise UserError(f"{run} holds no checkpoint; train first (avatar train SUBJECT --out {run})")
     return load_checkpoint(files[-1])
 
 

@@ -15,6 +15,7 @@ import socket
 import warnings
 from collections.abc import Awaitable, Callable
 from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any, cast
 
 import viser
@@ -44,10 +45,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address holds the token
     "X-Content-Type-Options": "nosniff",
 }
-# Of viser's page, which is light unless its address says otherwise.
-DARK_MODE = """<script>
-__VISER_EMBED_CONFIG__ = { darkMode: matchMedia("(prefers-color-scheme: dark)").matches };
-</script>"""
+PAGE_HEAD = Path(__file__).with_name("page_head.html").read_text(encoding="utf-8")
 PageServer = Callable[[ServerConnection, Request], Response | None]
 
 
@@ -124,7 +122,7 @@ class WebServer:
     ) -> None:
         self._access, self._messages, self._complaints = access, messages, complaints
         self._listening = listening
-        self._head = f"<title>{html.escape(label)} - avatar</title>{DARK_MODE}".encode(errors="replace")
+        self._head = f"<title>{html.escape(label)} - avatar</title>{PAGE_HEAD}".encode(errors="replace")
         self._library: library.Server | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a client may leave at any time

@@ -1,4 +1,4 @@
-"""`avatar check FOLDER`: read everything, gather all findings."""
+"""`avatar check SUBJECT`: read everything, gather all findings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`avatar reenact --background`, and the driver's sound."""
+"""`--background` of `avatar reenact` and `avatar export`, and the driver's sound."""
 
 from __future__ import annotations
 
@@ -86,6 +86,23 @@ def test_a_transparent_video_has_alpha(
     avatar("reenact", run, drive, "--background", "transparent", "--out", out)
     alpha = decoded(out, "rgba", *options)[:, 3]
     assert alpha.min() < 10 and alpha.max() > 100
+
+
+def test_an_exported_video_has_a_background(run: Path, tmp_path: Path) -> None:
+    words = ("export", run, "--format", "video", "--camera", "still")
+    avatar(*words, "--background", "#0000ff", "--out", tmp_path / "a.mp4")
+    red, _, blue, _ = decoded(tmp_path / "a.mp4", "rgba")[0]
+    assert blue > 200 and red < 60
+    avatar(*words, "--background", "transparent", "--out", tmp_path / "a.mov")
+    alpha = decoded(tmp_path / "a.mov", "rgba")[:, 3]
+    assert alpha.min() < 10 and alpha.max() > 100
+    refused = avatar(*words, "--background", "transparent", "--out", tmp_path / "a.mp4", status=1)
+    assert "a transparent video is written as .mov or .webm" in refused
+    picture = tmp_path / "b.mp4"  # whatever it holds
+    picture.write_bytes(b"")
+    assert "is an input" in avatar(*words, "--background", picture, "--out", picture, status=1)
+    refused = avatar("export", run, "--background", "red", "--out", tmp_path / "a.ply", status=1)
+    assert "--background belongs to --format video" in refused
 
 
 def test_pictures_and_refusals(run: Path, drive: Path, tmp_path: Path) -> None:

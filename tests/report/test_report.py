@@ -34,6 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_tracked_folder(tmp_path_factory.mktemp("report") / "someone", frames=30, size=48)
     train_small(folder, folder.parent / "run", ["model.uv_detail=1"])
     assert main(["eval", str(folder.parent / "run"), "--protocol", "hypergaussians"]) == 0
+    (folder.parent / "avatar.html").touch()
     assert main(["report", str(folder.parent / "run")]) == 0
     return folder.parent / "run"
 
@@ -50,6 +51,13 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)
     assert results["data_hash"] in page and "trainer.learning_rates.scale" in page
     assert len(page) < 8e6
+
+
+def test_the_avatars_page_beside_a_run_is_linked(run: Path, tmp_path: Path) -> None:
+    link = '<a href="../avatar.html">The avatar in its page</a>'
+    assert link in (run / "report.html").read_text(encoding="utf-8")
+    alone = shutil.copytree(run, tmp_path / "run")
+    assert link not in render_report(open_run(alone))
 
 
 def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path) -> None:

@@ -130,4 +130,4 @@ def test_a_folder_must_fit_a_video(tmp_path: Path, capsys: pytest.CaptureFixture
     assert f"{folder} has frames of 64x63 pixels; a video's are even both ways" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["bench", "track", str(folder), str(folder)])
-    assert "bench track takes [FOLDER], 2 given" in capsys.readouterr().err
+    assert "bench track takes [SUBJECT], 2 given" in capsys.readouterr().err
