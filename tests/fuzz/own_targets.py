@@ -10,16 +10,22 @@ from pathlib import Path
 
 import numpy as np
 from as_tracked import write_as_tracked
+from camera_rig_folder import HEIGHT, WIDTH, write_single
 from lively import lively_run
 from target import Target, member, of_copy, on_disk, with_member
 from tracked_folder import write_tracked_folder
 
+from avatar.data.refinement import Refinement, Round
+from avatar.data.source import Source
 from avatar.errors import refuse
 from avatar.head.assets import load_head_assets
 from avatar.runs.avatar_file import AVATAR_FILE, read_avatar_file, write_avatar_file
 from avatar.runs.trained_avatar import load_avatar
 from avatar.sweep.spec import read_spec
 from data_prep.formats import avatar_track
+from data_prep.formats.detect import open_tracked_folder
+from data_prep.formats.refined_folder import REFINEMENT_FILE, write_folder
+from data_prep.prepare.open_subject import open_subject
 from data_prep.track.faces.embedding import OFFICIAL_FILE, official_embedding
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks, load_landmarks, save_landmarks
 
@@ -44,6 +50,15 @@ def make_own_targets(place: Path) -> dict[str, Target]:
 
     def of_tracked(folder: Path) -> object:
         return avatar_track.open_folder(folder).read(head, (24, 24), refuse)
+
+    refined = refined_rig(place / "rig")
+    rig_head = load_head_assets(place / "rig" / "head_model")
+
+    def of_refined(folder: Path) -> None:
+        opened = open_tracked_folder(folder)
+        opened.read(rig_head, (WIDTH, HEIGHT), refuse)
+        if opened.read_given is not None:
+            opened.read_given(refuse)
 
     file = lively_run(original, place / "lively") / AVATAR_FILE
     packed = place / "packed.safetensors"
@@ -79,12 +94,26 @@ def make_own_targets(place: Path) -> dict[str, Target]:
             [member(tracks, "expression.npy")], on_disk(tracked / avatar_track.TRACKS_FILE, lambda _: of_tracked(tracked)),
             1, in_tracks,
         ),
+        "refined folder": Target(
+            [(refined / REFINEMENT_FILE).read_bytes()],
+            of_copy(place, refined / REFINEMENT_FILE, refined, of_refined),
+            2,
+        ),
         "landmarks": Target([landmarks.read_bytes()], on_disk(place / "x-landmarks.npz", load_landmarks)),
         "embedding": Target(
             [embedding.read_bytes()], on_disk(embedding, lambda p: official_embedding(p.parent, head)), 0.5
         ),
         "sweep": Target([SWEEP], on_disk(place / "sweep.yaml", read_spec)),
     }  # fmt: skip
+
+
+def refined_rig(place: Path) -> Path:
+    """A refined folder of several cameras."""
+    source = Source(write_single(place), place / "head_model")
+    subject, _ = open_subject(source, None, lambda _: None)
+    refinement = Refinement("VHAP", (Round("run", 1, "0" * 64, subject.split.train),))
+    write_folder(place / "refined", subject, subject.recording.tracks, refinement, {})
+    return place / "refined"
 
 
 def _text(file: bytes) -> bytes:
