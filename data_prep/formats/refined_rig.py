@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from avatar.data.camera_rig import CameraRig, RigCamera, parse_rig
+from avatar.data.json_values import parse_value
 from avatar.errors import UserError
-from data_prep.formats.avatar_track import TRACKS_FILE
+from data_prep.formats.avatar_track import FRAMES, TRACKS_FILE
 from data_prep.formats.frame_track import FrameTrack, Tracking
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
 from data_prep.formats.train_test_split import chosen_cameras
@@ -24,7 +25,7 @@ class Pictures(NamedTuple):
 
 def parse_pictures(raw: Any) -> Pictures:
     """Raises KeyError, TypeError or ValueError."""
-    numbers = tuple(int(number) for number in raw["numbers"])
+    numbers: tuple[int, ...] = parse_value(raw["numbers"], tuple[int, ...], "numbers")
     if list(numbers) != sorted(set(numbers)):
         raise ValueError("the numbers of the pictures do not increase")
     return Pictures(parse_rig(raw, len(numbers)), numbers)
@@ -42,6 +43,8 @@ def of_several_cameras(tracked: TrackedFolder, pictures: Pictures, cameras: str,
         for number, row, view in zip(pictures.numbers, rig.times, rig.views, strict=True)
         if names[view] in chosen and number in tracked.files.images
     }
+    if not of:
+        raise UserError(f"{folder / FRAMES} holds no picture of its cameras; refine again")
 
     def seen(rows: Tracking) -> Tracking:
         frames = {n: seen_by(camera, rows.frames[time]) for n, (camera, time) in of.items() if time in rows.frames}

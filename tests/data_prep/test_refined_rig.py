@@ -150,6 +150,8 @@ def test_the_check_takes_a_refined_rig_like_any_folder(single: tuple[Subject, Pa
         (lambda raw: raw["rig"]["cameras"][0].update(R=[1] * 9), "not a rotation"),
         (lambda raw: raw.update(rig=3), "damaged"),
         (lambda raw: raw["rig"].update(times=list(range(18))), "fewer than its pictures"),
+        (lambda raw: raw["rig"].update(numbers=list(range(50, 68))), "holds no picture"),
+        (lambda raw: raw["rig"].update(numbers=[*range(17), "x"]), r"numbers\[17\] is not a whole number"),
     ],
 )
 def test_a_damaged_rig_is_a_sentence(

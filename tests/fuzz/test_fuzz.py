@@ -46,7 +46,7 @@ NAMES = (
     "regions", "eyelid", "image", "protocol", "drive .npz", "drive .npz, checksums right",
     "drive .csv", "Live Link Face", "drive .json", "override", "avatar file", "avatar file, its text",
     "avatar file with its head",
-    "tracked folder", "its tracking", "its tracking, checksums right", "landmarks", "embedding", "sweep",
+    "tracked folder", "its tracking", "its tracking, checksums right", "refined folder", "landmarks", "embedding", "sweep",
 )  # fmt: skip
 
 # These read no file by themselves, or go on without the frame.
