@@ -106,13 +106,17 @@ def write_web_file(trained: TrainedAvatar, out: Path, arguments: Namespace) -> N
 def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
     refuse_features(trained.config.model, "--format ply")
     licence = licence_of(NOTHING)
+
+    def encode(params: HeadParams, camera: Camera) -> bytes:
+        return encode_ply(trained.gaussians(params, camera), licence, arguments.up or "-y")
+
     clip = chosen_clip(trained, arguments)
     if clip is None:
-        write_atomically(out, encode_ply(trained.gaussians(*chosen_pose(trained, arguments)), licence))
+        write_atomically(out, encode(*chosen_pose(trained, arguments)))
         print(f"Splats   {out} ({out.stat().st_size / MIB:.1f} MiB)")
     else:
         for number, (params, camera) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
-            write_atomically(numbered(out, number), encode_ply(trained.gaussians(params, camera), licence))
+            write_atomically(numbered(out, number), encode(params, camera))
         remove_longer(out, len(clip), print)
         print(f"Splats   {numbered(out, 0)} to {numbered(out, len(clip) - 1).name}, {clip.fps:g} a second")
     print(f"Licence  {licence}")
@@ -197,6 +201,7 @@ OPTIONS = {
     "with_head": ("avatar",),
     "frame": ("ply", "glb"),
     "motion": ("ply", "video"),
+    "up": ("ply",),
     "texture": ("glb",),
     "camera": ("video",),
     "size": ("video",),

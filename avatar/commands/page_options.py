@@ -44,6 +44,9 @@ def add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument(
         "--motion", metavar="MOTION", help="ply, video: test, train or all frames of its video, or a drive file"
     )
+    export.add_argument(
+        "--up", choices=("y", "z", "-y"), help="ply: the axis that points up (default: -y, also written --up=-y)"
+    )
     export.add_argument("--texture", type=int, metavar="N", help="glb: width of the texture (default: 1024)")
     export.add_argument(
         "--camera", choices=("recorded", "still", "turntable", "orbit"), help="video: its path (default: recorded)"

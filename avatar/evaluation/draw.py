@@ -39,11 +39,13 @@ def draw(renderer: Renderer, frame: Frame, formats: Iterable[ImageFormat]) -> di
     return pairs
 
 
-def panel(pair: Pair, captions: tuple[str, str] = ("truth", "render")) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
-    """Truth, render and error map side by side under captions."""
+def panel(
+    pair: Pair, captions: tuple[str, str] = ("truth", "render"), rows: int = 0
+) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
+    """Truth, render and error map side by side under captions, of at least `rows` pixels' height."""
     render, truth = (image.cpu() / 255.0 if image.dtype == torch.uint8 else image.cpu() for image in pair)
     images = (truth, render, error_map(render, truth, ERROR_SCALE))
-    return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"))
+    return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"), rows)
 
 
 def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:

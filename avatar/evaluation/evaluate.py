@@ -40,7 +40,7 @@ from avatar.evaluation.results import FrameResult, summarise
 from avatar.evaluation.tracking_source import Drive, describe_tracking, drives, parts, renders_of, tracking_notes
 from avatar.evaluation.training_coverage import conditions
 from avatar.files.atomic import write_atomically
-from avatar.files.video import video_writer
+from avatar.files.video import SHARP, video_writer
 from avatar.losses.lpips_network import Lpips, Net
 from avatar.render import Renderer
 from avatar.runs.run import Run, versions
@@ -84,7 +84,8 @@ def evaluate(
     for protocol in chosen:
         clear_pictures(folder / protocol.name)
     is_shown = any(protocol.name == shown for protocol in chosen)
-    with video_writer(video, subject.recording.fps) if is_shown else nullcontext() as add_to_video:
+    film = video_writer(video, subject.recording.fps, "veryfast", crf=20) if is_shown else nullcontext()
+    with film as add_to_video:
         results = measure(run, renderer, chosen, indices, lpips, write_frames, {shown: add_to_video})
 
     entries: dict[str, Any] = {}
@@ -196,7 +197,7 @@ def measure(
                     results[drive][protocol.name].append(row)
                     add_to_film = films.get(protocol.name) if own.view(frame.index) == filmed[protocol.name] else None
                     if drive == first and add_to_film is not None:
-                        add_to_film(panel(pair))
+                        add_to_film(panel(pair, rows=SHARP))
                     if write_frames:
                         regions = {region: masks[region] for region in masks if region in ("head", *protocol.regions)}
                         pictures = encode_pictures(pair, regions, renders_of(drive, subject))

@@ -1,20 +1,31 @@
 """Gaussians in the PLY files of 3D Gaussian splatting, which viewers and editors of splats read.
 
 x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (channel by channel, padded with zeros to degree 3), opacity (logit),
-scale_0..2 (natural logarithm, metres), rot_0..3 (w x y z); float32, little-endian. Viewers take -y as up, as after training
-on COLMAP's cameras, so the axes are x to the person's right, y down, z to the front: head space, turned by 180 degrees
-about z. The head's pose is in the camera and therefore not in the file.
+scale_0..2 (natural logarithm, metres), rot_0..3 (w x y z); float32, little-endian. Most viewers take -y as up, as after
+training on COLMAP's cameras. The head's pose is in the camera and therefore not in the file.
 """
 
 from __future__ import annotations
 
+from math import sqrt
+from typing import Literal
+
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.splat.sh import MAX_DEGREE
+from avatar.gaussians.apply_offsets import quaternion_product
+from avatar.splat.sh import MAX_DEGREE, sh_basis, sh_degree_of
 from avatar.types import Gaussians
+
+Up = Literal["-y", "y", "z"]
+TURNS: dict[Up, tuple[float, ...]] = {  # of head space, where y is up and z to the front
+    "-y": (0.0, 0.0, 0.0, 1.0),  # by 180 degrees about z
+    "y": (1.0, 0.0, 0.0, 0.0),
+    "z": (sqrt(0.5), sqrt(0.5), 0.0, 0.0),  # by 90 degrees about x: the face looks along -y
+}
 
 REST = (MAX_DEGREE + 1) ** 2 - 1
 FIELDS = (
@@ -25,12 +36,12 @@ FIELDS = (
 LEAST_OPACITY = 1e-6  # a logit must be finite
 
 
-def encode_ply(gaussians: Gaussians, comment: str = "") -> bytes:
-    """The file's bytes. `comment` is text for people, kept in the header.
+def encode_ply(gaussians: Gaussians, comment: str = "", up: Up = "-y") -> bytes:
+    """The file's bytes. `comment` is text for people, kept in the header; `up` is the axis that the viewer takes as up.
 
     Raises UserError for values that are not finite: finite parameters can stand for infinite sizes.
     """
-    gaussians = upside_down(gaussians)
+    gaussians = turned(gaussians, torch.tensor(TURNS[up], dtype=torch.float64))
     N, coefficients = gaussians.sh.shape[:2]
     rest = torch.zeros(N, REST, 3)
     rest[:, : coefficients - 1] = gaussians.sh[:, 1:]
@@ -58,14 +69,22 @@ def encode_ply(gaussians: Gaussians, comment: str = "") -> bytes:
     return "\n".join(header).encode() + np.ascontiguousarray(values).tobytes()
 
 
-def upside_down(gaussians: Gaussians) -> Gaussians:
-    """The same, turned by 180 degrees about z: k q for quaternions, and (-1)^m Y_lm for spherical harmonics, where
-    i = l^2 + l + m is odd as m is."""
-    w, x, y, z = gaussians.quats.unbind(dim=1)
-    sh = gaussians.sh.clone()
-    sh[:, 1::2] *= -1
+def turned(gaussians: Gaussians, q: Float[Tensor, 4]) -> Gaussians:
+    """The same, turned by a unit quaternion of double precision."""
+    axes = torch.eye(4, dtype=q.dtype)[1:]  # as quaternions
+    R = quaternion_product(quaternion_product(q.expand(3, 4), axes), (q * q.new_tensor([1, -1, -1, -1])).expand(3, 4))
+    R = R[:, 1:].T
+    sh = gaussians.sh.double()
     return gaussians._replace(
-        means=gaussians.means * gaussians.means.new_tensor([-1, -1, 1]),
-        quats=torch.stack((-z, -y, x, w), dim=1),
-        sh=sh,
+        means=(gaussians.means.double() @ R.T).float(),
+        quats=quaternion_product(q.expand(len(sh), 4), gaussians.quats.double()).float(),
+        sh=torch.einsum("jk,nkc->njc", sh_turn(R, sh_degree_of(sh.shape[1])), sh).float(),
     )
+
+
+def sh_turn(R: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K K"]:
+    """The matrix of coefficients that makes the colour in direction R d what it was in d, solved for many directions."""
+    directions = torch.randn(64, 3, dtype=R.dtype, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    matrix = torch.linalg.lstsq(sh_basis(directions @ R.T, degree), sh_basis(directions, degree)).solution
+    return matrix.round(decimals=12)  # the solver's last digits vary

@@ -22,6 +22,7 @@ from avatar.tensors import to_8_bit
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
 ALPHA_SUFFIXES = (".mov", ".webm")
+SHARP = 720  # rows of a picture that is shown large
 CAPTION_SHARE = 0.08  # of the height of the pictures
 MIN_CAPTION = 16  # pixels
 INK, PAPER = (40, 40, 40), 245
@@ -35,14 +36,15 @@ class Sound(NamedTuple):
 
 @contextmanager
 def video_writer(
-    path: Path, fps: float, preset: str = "medium", sound: Sound | None = None
+    path: Path, fps: float, preset: str = "medium", sound: Sound | None = None, crf: int = 17
 ) -> Iterator[Callable[[UInt8[np.ndarray, "H W C"]], None]]:
     """A function that adds one frame to `path`: RGB (.mp4: H.264, yuv420p, plays everywhere), or RGBA with straight alpha
     (.mov: ProRes 4444, .webm: VP9).
 
     `preset` is the encoder's: "veryfast" takes two fifths of the usual one's time, for pictures that are only looked at.
-    An odd size gets one more row or column, a copy of the last. The file appears under its name when the block ends
-    without an exception. Raises UserError for no frames, another size on the way, or an encoder that fails.
+    `crf` is H.264's: the larger, the smaller the file. An odd size gets one more row or column, a copy of the last. The
+    file appears under its name when the block ends without an exception. Raises UserError for no frames, another size on
+    the way, or an encoder that fails.
     """
     partial = temporary_name(path)
     shape: tuple[int, ...] | None = None
@@ -61,7 +63,7 @@ def video_writer(
         even = np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
         with _failing_as_user_error(path):
             if encoder is None:
-                encoder = _start_encoder(partial, even.shape, fps, preset, sound)
+                encoder = _start_encoder(partial, even.shape, fps, ("-preset", preset, "-crf", f"{crf}"), sound)
             assert encoder.stdin is not None
             try:
                 encoder.stdin.write(even.tobytes())
@@ -88,14 +90,14 @@ def video_writer(
 
 
 def _start_encoder(
-    path: Path, shape: tuple[int, ...], fps: float, preset: str, sound: Sound | None
+    path: Path, shape: tuple[int, ...], fps: float, h264: Sequence[str], sound: Sound | None
 ) -> subprocess.Popen[bytes]:
     """ffmpeg, which takes RGB or RGBA bytes from its standard input. It is run here because imageio does not ask how it
     ended."""
     height, width, channels = shape
     layout = {3: "rgb24", 4: "rgba"}[channels]
     taken = ["-f", "rawvideo", "-pix_fmt", layout, "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
-    made = _codec(path.suffix.lower(), channels == 4, preset)
+    made = _codec(path.suffix.lower(), channels == 4, h264)
     if sound is None:
         heard = ["-an"]
     else:
@@ -113,14 +115,14 @@ def _start_encoder(
     )
 
 
-def _codec(suffix: str, has_alpha: bool, preset: str) -> list[str]:
+def _codec(suffix: str, has_alpha: bool, h264: Sequence[str]) -> list[str]:
     if suffix == ".webm":
         layout = "yuva420p" if has_alpha else "yuv420p"
         vp9 = "-c:v libvpx-vp9 -crf 20 -b:v 0 -cpu-used 4 -auto-alt-ref 0 -pix_fmt"
         return [*vp9.split(), layout]
     if has_alpha:
         return ["-c:v", "prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le", "-alpha_bits", "8"]
-    return ["-c:v", "libx264", "-preset", preset, "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    return ["-c:v", "libx264", *h264, "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 
 
 def _finish(encoder: subprocess.Popen[bytes]) -> None:
@@ -153,17 +155,17 @@ def write_video(
 
 
 def side_by_side(
-    images: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str]
+    images: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str], rows: int = 0
 ) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
-    """Pictures in [0, 1] from left to right, brought to the largest height, each under its caption."""
-    height = max(image.shape[0] for image in images)
+    """Pictures in [0, 1] from left to right, brought to the largest height, at least `rows`, each under its caption."""
+    height = max(rows, *(image.shape[0] for image in images))
     strip = max(round(height * CAPTION_SHARE), MIN_CAPTION)
     columns = []
     for image, caption in zip(images, captions, strict=True):
         picture = to_8_bit(image).cpu().numpy()
         if picture.shape[0] != height:
             width = round(picture.shape[1] * height / picture.shape[0])
-            picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
+            picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LANCZOS4)
         columns.append(np.concatenate((_caption(caption, strip, picture.shape[1]), picture)))
     return np.concatenate(columns, axis=1)
 

@@ -15,7 +15,9 @@ from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tr
 from avatar.files.atomic import write_atomically
 from avatar.files.read import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
+from avatar.html.document import Content
 from avatar.html.parts import SERIES, data_uri
+from avatar.report.grade import Word, describe, word_of
 from avatar.report.pictures import frame_panels
 from avatar.runs.run import Run, versions
 from avatar.runs.training_curves import read_curves
@@ -25,6 +27,7 @@ MAIN = {
     "ssim": ("SSIM", "\N{UPWARDS ARROW} higher"),
     "lpips": ("LPIPS", "\N{DOWNWARDS ARROW} lower"),
 }
+BADGES: dict[Word, str] = {"good": "fine", "fair": "warning", "poor": "error"}
 SHOWN_DECIMALS = {"psnr": 2}  # others: 4
 BINNINGS = (  # key of results.json, what it is binned by, decimals of the edges and their column's name
     ("by_held_out", "what is held out", 0, "held out"),  # of several cameras, as the next
@@ -86,13 +89,25 @@ def _main_figures(results: Mapping[str, Any] | None) -> list[Markup]:
         means = next(iter(parts(entry).values())).figures.get("means", {})
         what = "_head" if "psnr_head" in means else ""
         shown = {column: value for column in MAIN if (value := means.get(f"{column}{what}")) is not None}
-        if shown:
-            labels = {f"{MAIN[c][0]}, {MAIN[c][1]} is better": _figure(c, value) for c, value in shown.items()}
-            return [
-                tiles(labels),
-                element("p", f"Means by the protocol {name}{what and ', of the head'}.", class_="soft"),
-            ]
+        if not shown:
+            continue
+        network = entry["lpips"].get("network")
+        figures = {column: f"{column} {network}" if column == "lpips" else column for column in shown}
+        words: dict[str, Word | None] = {
+            column: word_of(figure, shown[column]) if what else None for column, figure in figures.items()
+        }
+        labels = {
+            f"{MAIN[column][0]}, {MAIN[column][1]} is better": _judged(_figure(column, value), words[column])
+            for column, value in shown.items()
+        }
+        meant = "; ".join(describe(figures[column]) for column, word in words.items() if word)
+        said = f"Means by the protocol {name}{what and ', of the head'}.{meant and f' {meant}.'}"
+        return [tiles(labels), element("p", said, class_="soft")]
     return []
+
+
+def _judged(figure: str, word: Word | None) -> Content:
+    return join((figure, " ", element("span", word, class_=f"badge {BADGES[word]}"))) if word else figure
 
 
 def means_table(protocols: Mapping[str, Any], mark: str = "") -> Markup:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from data_prep.check.plots import course_plots, coverage_plots
 
 PAGE, TABLE = "index.html", "frames.csv"
 _BADGES = ("fine", "warning", "error")  # by exit status
+_MAIN = ("usable frames", "overlap of mesh and head mask (IoU), median", "lips to mouth mask, median, pixels")
 _FIT_COLUMNS = ("overlap", "inside", "overhang", "mouth", "mask_ratio", "size")
 
 
@@ -37,21 +39,26 @@ def write_page(check: Check, out: Path) -> Path:
 
 def render_page(check: Check) -> str:
     badge = _BADGES[check.status]
+    verdict = element("a", check.summary(), href="#findings") if check.findings else check.summary()
     header = element(
         "header",
         element("h1", f"Check of {check.folder.name or check.folder}"),
         element("p", str(check.folder), class_="soft"),
-        element("p", element("span", badge, class_=f"badge {badge}"), f" {check.summary()}", class_="verdict"),
+        element("p", element("span", badge, class_=f"badge {badge}"), " ", verdict, class_="verdict"),
     )
-    parts: list[Markup] = [header, section("Findings", *_findings(check))]
+    parts: list[Markup] = [header]
+    figures = {} if check.clip is None else facts(check.clip, check.coverage)
     if check.clip is not None:
-        parts += [*tracking_sections(check.clip.files.folder), *_pictures(check.clip)]
+        parts += _pictures(check.clip, {name: _shown(figures[name]) for name in _MAIN if name in figures})
+    parts.append(element("section", element("h2", "Findings"), *_findings(check), id="findings"))
+    if check.clip is not None:
+        parts += tracking_sections(check.clip.files.folder)
         if check.coverage is not None:
             plots = [*coverage_plots(check.coverage), *course_plots(check.clip)]
             parts.append(section("Coverage and course", element("div", *plots, class_="plots")))
-        figures = {name: _shown(value) for name, value in facts(check.clip, check.coverage).items()}
-        evidence = figures.pop("offset found")
-        parts.append(section("Figures", element("p", f"Offset: {evidence}.", class_="soft"), tiles(figures)))
+        evidence = _shown(figures.pop("offset found"))
+        shown = tiles({name: _shown(value) for name, value in figures.items()})
+        parts.append(section("Figures", element("p", f"Offset: {evidence}.", class_="soft"), shown))
     parts.append(element("p", f"avatar {__version__} check", class_="soft"))
     return document(f"Check of {check.folder.name}", parts)
 
@@ -89,7 +96,8 @@ def _finding(finding: Finding) -> Markup:
     )
 
 
-def _pictures(clip: Clip) -> list[Markup]:
+def _pictures(clip: Clip, main_figures: Mapping[str, str]) -> list[Markup]:
+    """The frames under the main figures; empty where nothing can be drawn."""
     overlays = draw_overlays(clip)
     if not overlays:
         return []
@@ -104,13 +112,9 @@ def _pictures(clip: Clip) -> list[Markup]:
     )
     images = [picture(overlay.image, overlay.caption) for overlay in overlays]
     text = "Half of the frames are spread over the clip, half are those that fit worst."
-    return [
-        section("The tracked head on the frames", element("p", text, key, class_="soft"), _gallery(images)),
-    ]
-
-
-def _gallery(images: list[Markup]) -> Markup:
-    return element("div", *images, class_="gallery")
+    gallery = element("div", *images, class_="gallery")
+    words = element("p", text, key, class_="soft")
+    return [section("The tracked head on the frames", tiles(main_figures), words, gallery)]
 
 
 def _shown(value: object) -> str:

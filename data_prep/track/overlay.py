@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from avatar.files.video import video_writer
+from avatar.files.video import SHARP, video_writer
 from avatar.head.model import HeadModel
 from data_prep.check.overlay import MASK, MOUTH, draw_mesh, outline
 from data_prep.formats.frame_track import FrameTrack
@@ -18,7 +18,6 @@ from data_prep.progress import Progress
 from data_prep.track.frames import JPEG, ahead, write_image
 
 OVERLAY_VIDEO, OVERLAY_SHEET = "overlay.mp4", "overlay.jpg"
-_WIDEST = 512  # pixels of a picture
 _SHOWN, _COLUMNS = 12, 4  # pictures in the sheet
 
 
@@ -39,21 +38,21 @@ def write_overlay(
     """FOLDER/overlay.mp4 of all frames, and FOLDER/overlay.jpg of some that are spread over the clip."""
     first = next(iter(tracks.values()))
     project = MeshProjector(head)
-    scale = min(1.0, _WIDEST / max(first.size))
-    width, height = round(first.size[0] * scale), round(first.size[1] * scale)
+    width, height = round(first.size[0] * SHARP / first.size[1]), SHARP
+    resampling = cv2.INTER_AREA if first.size[1] > height else cv2.INTER_CUBIC
     numbers = list(tracks)
     shown = {numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, min(_SHOWN, len(numbers)))}
     pictures: list[np.ndarray] = []
 
     def draw(number: int) -> np.ndarray:
         parts = read(number)
-        canvas = cv2.resize(parts.image, (width, height), interpolation=cv2.INTER_AREA)
+        canvas = cv2.resize(parts.image, (width, height), interpolation=resampling)
         canvas = draw_mesh(canvas, project(tracks[number], width, height))
         for colour, mask in ((MASK, parts.head), (MOUTH, parts.mouth)):
             outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
         return canvas
 
-    with video_writer(folder / OVERLAY_VIDEO, fps, preset="veryfast") as add:
+    with video_writer(folder / OVERLAY_VIDEO, fps, preset="veryfast", crf=20) as add:
         for number, canvas in ahead(numbers, draw, progress, "drawing the overlay"):
             add(canvas)
             if number in shown:

@@ -18,6 +18,7 @@ import torch
 import trimesh
 from command_line import avatar
 from lively import lively_avatar, lively_run, psnr
+from splat_file import read_splats
 
 from avatar.export.bake_texture import bake_texture
 from avatar.export.glb import encode_glb, offsets
@@ -25,7 +26,7 @@ from avatar.export.movie import limits_of, path_camera
 from avatar.export.ply import FIELDS, encode_ply
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
-from avatar.types import Camera, Gaussians
+from avatar.types import Camera
 
 
 @pytest.fixture(scope="module")
@@ -44,25 +45,6 @@ def trained(
     if request.param == "teeth":
         return lively_avatar(open_mouth_folder, run, "model.teeth=true")
     return lively_avatar(tracked_folder, run)
-
-
-def read_splats(data: bytes) -> Gaussians:
-    """As viewers of 3D Gaussian splatting read it, through trimesh's reader of PLY."""
-    loaded = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
-    raw = loaded.metadata["_ply_raw"]["vertex"]["data"]  # type: ignore[union-attr]
-    assert all(raw.dtype[name] == "<f4" for name in raw.dtype.names)
-
-    def columns(*names: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([raw[name] for name in names], axis=1).astype(np.float32))
-
-    rest = columns(*(f"f_rest_{i}" for i in range(45))).reshape(-1, 3, 15).permute(0, 2, 1)
-    return Gaussians(
-        columns("x", "y", "z"),
-        columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        columns("scale_0", "scale_1", "scale_2").exp(),
-        torch.sigmoid(columns("opacity"))[:, 0],
-        torch.cat((columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest), dim=1),
-    )
 
 
 def from_below(camera: Camera) -> Camera:
@@ -131,6 +113,11 @@ def test_the_command_writes_a_frame_and_a_sequence(run: Path, tmp_path: Path) ->
     avatar("export", run, "--out", out, "--frame", 3)
     one = out.read_bytes()
     assert b"comment Nothing of the head model is in it" in one[:300]
+    means = read_splats(one).means
+    avatar("export", run, "--out", out, "--frame", 3, "--up=-y")
+    assert out.read_bytes() == one
+    avatar("export", run, "--out", out, "--frame", 3, "--up", "z")
+    torch.testing.assert_close(read_splats(out.read_bytes()).means, means[:, [0, 2, 1]] * torch.tensor([-1, -1, -1]))
     said = avatar("export", run, "--out", out, "--motion", "all")
     sequence = sorted(tmp_path.glob("x-*.ply"))
     assert len(sequence) == 30 and sequence[3].read_bytes() == one != sequence[4].read_bytes()
@@ -141,6 +128,7 @@ def test_the_command_writes_a_frame_and_a_sequence(run: Path, tmp_path: Path) ->
     assert "--frame must be from 0 to 29" in avatar("export", run, "--out", out, "--frame", 30, status=1)
     assert "give one of the two" in avatar("export", run, "--out", out, "--frame", 1, "--motion", "test", status=1)
     assert "or a drive file" in avatar("export", run, "--out", out, "--motion", "tset", status=1)
+    assert "--up belongs to --format ply" in avatar("export", run, "--out", tmp_path / "x.glb", "--up", "y", status=1)
     assert "--camera belongs to --format video" in avatar("export", run, "--out", out, "--camera", "orbit", status=1)
 
 

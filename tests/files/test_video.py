@@ -115,6 +115,16 @@ def test_pictures_stand_side_by_side_under_captions() -> None:
         assert ink.any() and not ink[0] and not ink[-1]  # every caption is there and inside its column
 
 
+def test_small_pictures_stand_side_by_side_enlarged() -> None:
+    image = torch.zeros(50, 40, 3)
+    image[:, 20:] = 1.0
+    panel = side_by_side((image, image), ("truth", "render"), 150)
+    strip = panel.shape[0] - 150
+    assert panel.shape[1] == 2 * 120 and strip >= 16
+    assert panel[strip:, :50].max() < 30 and panel[strip:, 70:110].min() > 225
+    assert side_by_side((image,), ("truth",), 50).shape == side_by_side((image,), ("truth",)).shape == (66, 40, 3)
+
+
 def test_error_map_grows_with_the_error() -> None:
     target = torch.full((4, 5, 3), 0.5)
     image = target.clone()

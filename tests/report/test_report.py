@@ -45,7 +45,8 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     means = results["protocols"]["hypergaussians"]["means"]
     assert f"{means['psnr']:.2f}" in page and f"{means['ssim']:.4f}" in page
     first = page[page.index("<section>") : page.index("</section>")]
-    assert "Held-out frames" in first and f"<dd>{means['ssim_head']:.4f}</dd>" in first, "the main figures are on top"
+    assert "Held-out frames" in first and f"<dd>{means['ssim_head']:.4f} <span" in first, "the main figures are on top"
+    assert 'class="badge error">poor</span></dd>' in first and "PSNR at least 27 good, 23 fair; SSIM at" in first
     sources = re.findall(r'src="([^"]{0,30})', page)
     assert len(sources) == 6 + 2 + 2  # held-out frames; curves and worst of the evaluation; training
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)

@@ -25,7 +25,8 @@ class Sources(HTMLParser):
         self.text = ""
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "poster", "data")]
+        named = [value or "" for name, value in attrs if name in ("src", "href", "srcset", "poster", "data")]
+        self.sources += [value for value in named if not value.startswith("#")]
 
     def handle_data(self, data: str) -> None:
         self.text += data
@@ -52,6 +53,20 @@ def test_the_page_holds_pictures_and_findings_and_loads_nothing(page: Path) -> N
     assert page.stat().st_size < 3e6
 
 
+def test_pictures_and_main_figures_come_before_the_findings(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    link, tiles, picture, findings, quoted = map(
+        text.index, ('href="#findings"', "<dt>usable frames</dt>", "<img", 'id="findings"', "all zero")
+    )
+    assert link < tiles < picture < findings < quoted
+
+
+def test_a_folder_that_cannot_be_read_shows_its_findings(tmp_path: Path) -> None:
+    assert main(["check", str(tmp_path / "nothing"), "--out", str(tmp_path / "out")]) == 2
+    text = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "<img" not in text and 'class="finding error"' in text
+
+
 def test_the_table_has_a_line_for_every_image(page: Path) -> None:
     rows = list(csv.DictReader((page.parent / "frames.csv").open()))
     assert [row["image"] for row in rows] == [f"{n:05d}.jpg" for n in range(1, 25)]
@@ -65,5 +80,6 @@ def test_a_browser_shows_it_without_complaint_and_axe_finds_nothing(page: Path) 
         opened.on("console", lambda said: wrong.append(said.text))
         opened.goto(page.as_uri())
         assert opened.evaluate("[...document.images].filter((one) => one.naturalWidth > 0).length") == 14
+        assert opened.evaluate("document.images[0].getBoundingClientRect().bottom") < 800
         assert audited(opened) == []
     assert not wrong
