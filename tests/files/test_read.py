@@ -41,6 +41,7 @@ OPEN_BY_THEMSELVES = {
     "avatar/html/document.py",
     "avatar/losses/lpips.py",
     "avatar/view/viewer.py",
+    "avatar/view/viser_server.py",
 }
 # Readers beside those of tests/fuzz, by the file that they read.
 READERS: dict[str, Callable[[Path], object]] = {

@@ -85,7 +85,7 @@ def test_a_value_that_is_not_finite_is_refused_with_the_tensors_name(
 @pytest.mark.parametrize(
     "words",
     [
-        *(f"export {{file}} --head {{head}} --out {{tmp}}/a{suffix}" for suffix in export.SUFFIXES.values()),
+        *(f"export {{file}} --head {{head}} --out {{tmp}}/a{suffixes[0]}" for suffixes in export.SUFFIXES.values()),
         "view {file} --head {head} --port 0",
         "reenact {file} --head {head} --driver {tmp}/x.csv --out {tmp}/a.mp4",
     ],
