@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -126,31 +127,27 @@ def test_rig_refinement_finds_the_depth(avatar: Avatar, clip: Clip, tmp_path: Pa
     assert float(errors.max()) < 0.001
 
 
+def with_noise(clip: Clip, where: Callable[[int], bool]) -> Clip:
+    """In place of the pictures of these indices."""
+    noise = torch.Generator().manual_seed(0)
+    pictures = (
+        replace(frame, image=torch.rand(frame.image.shape, generator=noise)) if where(index) else frame
+        for index, frame in enumerate(clip.pictures)
+    )
+    return replace(clip, pictures=tuple(pictures))
+
+
 def test_noise_in_pictures_of_a_held_out_camera_changes_no_bit(
     avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path
 ) -> None:
-    noise = torch.Generator().manual_seed(0)
-    pictures = [
-        replace(frame, image=torch.rand(frame.image.shape, generator=noise))
-        if wrong.recording.view(index) == HELD_OUT
-        else frame
-        for index, frame in enumerate(wrong.pictures)
-    ]
-    other = refined(avatar, replace(wrong, pictures=tuple(pictures)), tmp_path)
+    other = refined(avatar, with_noise(wrong, lambda index: wrong.recording.view(index) == HELD_OUT), tmp_path)
     assert all(torch.equal(other.tracks[name], value) for name, value in result.tracks.items())
 
 
 def test_noise_at_held_out_times_changes_no_bit_of_trained_ones(
     avatar: Avatar, wrong: Clip, result: Refined, tmp_path: Path
 ) -> None:
-    noise = torch.Generator().manual_seed(0)
-    pictures = [
-        replace(frame, image=torch.rand(frame.image.shape, generator=noise))
-        if wrong.recording.time(index) > 3
-        else frame
-        for index, frame in enumerate(wrong.pictures)
-    ]
-    other = refined(avatar, replace(wrong, pictures=tuple(pictures)), tmp_path)
+    other = refined(avatar, with_noise(wrong, lambda index: wrong.recording.time(index) > 3), tmp_path)
     for name, value in result.tracks.items():
         assert torch.equal(other.tracks[name][:4], value[:4])
     assert not torch.equal(other.tracks["t"], result.tracks["t"])
