@@ -15,6 +15,7 @@ from avatar.head.assets import HeadAssets
 from data_prep.check.check_cameras import check_cameras
 from data_prep.check.check_files import check_files, lost_frames
 from data_prep.check.check_fit import check_fit
+from data_prep.check.check_head import check_head
 from data_prep.check.check_images import check_images
 from data_prep.check.check_motion import check_motion
 from data_prep.check.check_tracking import check_tracking
@@ -81,8 +82,7 @@ def check_tracked_folder(
         clip = read_clip(Source(folder.resolve(), folder, **options), assets, progress)
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
-    if assets is not None:
-        findings += [Finding("note", "head-model", note, "nothing, if that is meant") for note in assets.notes]
+    findings += [] if assets is None else check_head(assets)
     findings += check_files(clip) + check_tracking(clip) + check_motion(clip) + check_fit(clip)
     findings += check_images(clip)
     if assets is not None and (size := clip.size()) is not None:
