@@ -173,8 +173,8 @@ def _link(source: Path, target: Path) -> None:
 
 def _info(subject: Subject, head_path: str) -> TrackingInfo:
     manifest = subject.manifest
-    numbered = {re.search(r"\d+$", name): why for name, why in manifest.left_out.items()}
-    left_out = {int(match[0]): why for match, why in numbered.items() if match and manifest.rig is None}
+    gone = manifest.left_out if manifest.rig is None else {}  # pictures of a rig have other numbers
+    left_out = {int(match[0]): why for name, why in gone.items() if (match := re.search(r"\d+$", name))}
     focal, is_assumed = "that of the tracking before", False
     if manifest.format == avatar_track.NAME:
         before = avatar_track.read_info(Path(manifest.source))
