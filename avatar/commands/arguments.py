@@ -73,7 +73,7 @@ def sort_train(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
     given = len(arguments.paths)
     if arguments.resume and given > 2:
         parser.error(f"train --resume takes a RUN, and its SUBJECT where that has moved; {given} paths are given")
-    if not arguments.resume and not arguments.print_config and given != 1:
+    if not arguments.resume and (given > 1 or not (given or arguments.print_config)):
         parser.error(f"train takes one SUBJECT, {given} given")
 
 

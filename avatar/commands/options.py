@@ -17,7 +17,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 def add_reading(parser: argparse.ArgumentParser) -> None:
     """How a tracked folder is read."""
     parser.add_argument(
-        "--format",
+        "--data-format",
         metavar="NAME",
         help="metrical-tracker, VHAP, INSTA, IMavatar, GaussianBlendshapes, NeRSemble or NHA (default: by the files)",
     )

@@ -21,7 +21,7 @@ from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained_avatar import TrainedAvatar
 from data_prep.formats.avatar_track import read_info
 
-READING_OPTIONS = ("driver_tracking", "frame_offset", "format", "cameras", "fps", "max_left_out")
+READING_OPTIONS = ("driver_tracking", "frame_offset", "data_format", "cameras", "fps", "max_left_out")
 
 
 def run_reenact(arguments: Namespace) -> int:

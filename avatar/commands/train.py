@@ -228,7 +228,7 @@ def refuse_changed_keys(run: Path, recorded: Mapping[str, Any], overrides: list[
 
 def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None:
     """Of the options that say how the folder is read, none may change."""
-    for field in ("tracking", "frame_offset", "format", "fps", "max_left_out", "ignore_misfit", "cameras"):
+    for field in ("tracking", "frame_offset", "data_format", "fps", "max_left_out", "ignore_misfit", "cameras"):
         was, now, option = getattr(source, field), getattr(arguments, field), f"--{field.replace('_', '-')}"
         now = now.resolve() if isinstance(now, Path) else now
         if now is None or now is False or now == "" or now == was:

@@ -20,7 +20,7 @@ class Source:
     head: Path
     tracking: Path | None = None  # folder of the .frame files, where it is another one
     frame_offset: int | None = None  # image number minus tracking number
-    format: str | None = None  # one of data_prep.formats.detect.FORMATS
+    data_format: str | None = None  # one of data_prep.formats.detect.FORMATS
     fps: float | None = None  # of the video
     max_left_out: float = DEFAULT_LEFT_OUT  # share of the frames that may be unusable
     ignore_misfit: bool = False  # go on where the projected head does not lie on the masks

@@ -54,8 +54,8 @@ FORM = {
 }
 # Those of its keys that are there in every evaluation, beside `NEEDED`.
 _ALWAYS = {
-    *("choices", "lpips", "weights_sha256", "bootstrap", "block_frames", "means", "frames_sha256", "driven_by"),
-    *("tracker", "rounds", "measured_frames_trained_on"),
+    *("block_frames", "bootstrap", "choices", "driven_by", "frames_sha256", "lpips", "means"),
+    *("measured_frames_trained_on", "rounds", "tracker", "weights_sha256"),
 }
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
 
@@ -81,10 +81,13 @@ class Evaluation:
             raise UserError(f"{error}; evaluate the run again") from None
         if hashlib.sha256(data).hexdigest() != part.figures["frames_sha256"]:
             raise UserError(f"{path} is not the file that results.json was written with; evaluate the run again")
-        return {
-            row["name"]: {name: float(row[name]) for name in part.figures["means"]}
-            for row in csv.DictReader(io.StringIO(data.decode()))
-        }
+        try:
+            return {
+                row["name"]: {name: float(row[name]) for name in part.figures["means"]}
+                for row in csv.DictReader(io.StringIO(data.decode()))
+            }
+        except KeyError as error:
+            raise UserError(f"{path} has no column {error}; evaluate the run again") from None
 
 
 class Cell(NamedTuple):
@@ -131,7 +134,10 @@ def compare_runs(runs: Sequence[Path], protocols: Sequence[str] | None = None) -
     if len(runs) < 2:
         raise UserError("there is nothing to compare: give at least two runs")
     names = [path.resolve().name for path in runs]
-    labels = [name if names.count(name) == 1 else str(path) for name, path in zip(names, runs, strict=True)]
+    labels = [
+        " ".join((name if names.count(name) == 1 else str(path)).split())  # a line break would end LaTeX's comment
+        for name, path in zip(names, runs, strict=True)
+    ]
     evaluations = [read_evaluation(label, path) for label, path in zip(labels, runs, strict=True)]
     for other in evaluations[1:]:
         check_same(evaluations[0], other)
@@ -253,6 +259,11 @@ def compare_protocol(
     empty = []
     for figure in evaluations[0].parts(name)[drive].figures["means"]:
         if figure.startswith("lpips") and len(networks) > 1:
+            continue
+        if lacking := [
+            each.label for each, table in zip(evaluations, tables, strict=True) if figure not in table[frames[0]]
+        ]:
+            notes.append(f"{name}: {figure} was not measured for {', '.join(lacking)}")
             continue
         values = np.array([[table[frame][figure] for frame in frames] for table in tables])
         values[:, ~np.isfinite(values).all(axis=0)] = np.nan

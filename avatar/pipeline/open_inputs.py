@@ -32,7 +32,7 @@ def source_of(arguments: Namespace) -> Source:
 
 def source_options(arguments: Namespace, tracking: Path | None) -> dict[str, Any]:
     """What the options say of a tracked folder, as fields of a Source."""
-    names = ("frame_offset", "format", "fps", "ignore_misfit", "cameras", "max_left_out")
+    names = ("frame_offset", "data_format", "fps", "ignore_misfit", "cameras", "max_left_out")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     return {"tracking": tracking, **given}
 

@@ -25,7 +25,7 @@ from avatar.train.loss import choose_perceptual
 from data_prep.prepare.open_subject import open_subject
 
 ROUNDS_FOLDER = "rounds"
-PLAN_FORMAT = 1
+PLAN_FORMAT = 2
 LEAST_STEPS = 500  # fewer make no avatar
 # A round trains for a few passes over the training frames: with more, the avatar overfits the errors of each frame's
 # tracking. Steps are as many passes as this, and no larger share of the run's own; but no fewer than these, where the run

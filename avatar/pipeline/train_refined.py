@@ -49,7 +49,7 @@ def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
             if status != OK:
                 return status
         # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
-        source = replace(source, folder=stage / name, tracking=None, frame_offset=None, format=None, fps=None)
+        source = replace(source, folder=stage / name, tracking=None, frame_offset=None, data_format=None, fps=None)
     status = continue_or_begin(source, plan.final_overrides(), run)
     plan = replace(plan, spent=time.monotonic() - begin)
     plan.save(run)

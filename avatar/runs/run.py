@@ -32,7 +32,7 @@ from avatar.runs.trained_avatar import TrainedAvatar, load_avatar, runs_in
 from avatar.version import __version__
 
 RUN_FILE = "run.json"
-RUN_FORMAT = 3
+RUN_FORMAT = 4
 # The names under which a library may be installed; the first is what it is called here.
 _OPENCV = tuple(f"opencv-{part}python{end}" for end in ("-headless", "") for part in ("contrib-", ""))
 VERSIONED = (("torch",), ("numpy",), _OPENCV, ("kornia",))

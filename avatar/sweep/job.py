@@ -22,7 +22,7 @@ from avatar.sweep.output import BoundedLog, end_of, old_of
 from avatar.sweep.spec import Job
 from avatar.sweep.state import HEARTBEAT_SECONDS, State, read_job, read_state, worker_name, write_heartbeat, write_state
 
-OPTIONS = ("head", "tracking", "frame_offset", "format", "fps")  # of a source, as `avatar train` calls them
+OPTIONS = ("head", "tracking", "frame_offset", "data_format", "fps")  # of a source, as `avatar train` calls them
 OK, EXIT_ERROR, EXIT_INTERRUPTED = 0, 1, 130
 Command = Callable[[list[str]], int]  # `avatar WORDS`, its exit status
 

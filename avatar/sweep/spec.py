@@ -33,7 +33,7 @@ KEYS = {
     "gpus",
     "retries",
 }
-SUBJECT_KEYS = {"folder", "head", "name", "tracking", "frame_offset", "format", "fps"}
+SUBJECT_KEYS = {"folder", "head", "name", "tracking", "frame_offset", "data_format", "fps"}
 SEED_KEY = "trainer.seed"
 
 
@@ -169,7 +169,7 @@ def _subject(path: Path, entry: Any, head: Any) -> dict[str, Any]:
             if not isinstance(value, str) or "\0" in value:
                 raise UserError(f"{path}: {key} is {value!r}, not a path")
             found[key] = str((path.resolve().parent / expanded(value, f"{path}: {key} {value}")).resolve())
-    for key in ("frame_offset", "format", "fps"):
+    for key in ("frame_offset", "data_format", "fps"):
         if (value := found.get(key)) is not None and not _is_word(value):
             raise UserError(f"{path}: {key} is {value!r}, not a word or a number")
     name = found.get("name", Path(found["folder"]).name)

@@ -27,7 +27,7 @@ def check_cameras(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list
     size  of the images, where the listing does not say it
     """
     given = clip.given
-    source = open_tracked_folder(given.folder, given.tracking, given.format, lambda _: None, given.cameras)
+    source = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
     if not source.shots:
         return []
     findings: list[Finding] = []

@@ -140,7 +140,11 @@ def read_clip(
     complaints: list[tuple[str, str]] = []
     one_camera = given.cameras.split(",")[0] if given.cameras not in (None, ALL) else FRONT
     source = open_tracked_folder(
-        given.folder, given.tracking, given.format, lambda message: complaints.append(("layout", message)), one_camera
+        given.folder,
+        given.tracking,
+        given.data_format,
+        lambda message: complaints.append(("layout", message)),
+        one_camera,
     )
     files, label_notes = with_labels(source.files)
     source = replace(source, files=files)

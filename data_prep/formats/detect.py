@@ -34,7 +34,7 @@ def open_tracked_folder(
     What is wrong with the files of a metrical-tracker folder goes to `complain`, as in `find_frame_files`.
     """
     if format not in (None, *FORMATS):
-        raise UserError(f"--format must be one of {', '.join(FORMATS)}, not {format!r}")
+        raise UserError(f"--data-format must be one of {', '.join(FORMATS)}, not {format!r}")
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
@@ -76,7 +76,7 @@ def detect_format(folder: Path, frames: list[ListedFrame]) -> str:
     found += [name for name, module in _LISTED.items() if module.recognise(frames)]
     found += [name for name, module in _BY_FILES.items() if not frames and module.recognise(folder)]
     if len(found) > 1:
-        raise UserError(f"{folder} could be a folder of {' or '.join(found)}; say which with --format")
+        raise UserError(f"{folder} could be a folder of {' or '.join(found)}; say which with --data-format")
     if not found and frames:
         first = frames[0]
         hint = (

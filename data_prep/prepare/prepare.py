@@ -60,7 +60,7 @@ def prepare(
     if not 0 <= source.max_left_out <= 1:
         raise UserError(f"--max-left-out must be from 0 to 1, not {source.max_left_out:g}")
     tracking = None if source.tracking is None else Path(source.tracking).resolve()
-    tracked = open_tracked_folder(folder, tracking, source.format, cameras=source.cameras)
+    tracked = open_tracked_folder(folder, tracking, source.data_format, cameras=source.cameras)
     files = tracked.files
     options = {
         "offset": source.frame_offset,

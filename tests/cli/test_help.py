@@ -82,6 +82,7 @@ def test_the_printed_configuration_is_one_to_type() -> None:
     asked = ["experiment=paper", "trainer.seed=3", "data.background=#123456", f"data.test_cameras={cameras}"]
     lines = avatar("train", "--print-config", *asked).splitlines()
     assert "trainer.seed=3" in lines and load_config(lines) == load_config(asked)
+    assert "takes one SUBJECT, 2 given" in avatar("train", "anna", "carla", "--print-config", status=2)
 
 
 @pytest.mark.parametrize("option", ["--print-config", "--dry-run"])

@@ -294,6 +294,6 @@ def test_a_plain_run_and_a_damaged_plan(run: Path, folder: Path, tmp_path: Path)
         assert "from 1 to 10" in output and not (tmp_path / "x").exists()
     plan = tmp_path / "y" / "rounds" / "plan.json"
     plan.parent.mkdir(parents=True)
-    for text, said in (("{", "cannot be read"), ('{"format": 9}', "another version"), ('{"format": 1}', "damaged")):
+    for text, said in (("{", "cannot be read"), ('{"format": 9}', "another version"), ('{"format": 2}', "damaged")):
         plan.write_text(text)
         assert said in avatar("train", "--resume", "--out", tmp_path / "y", status=1)

@@ -90,7 +90,7 @@ CHANGES = {
     "another size": (["--size", "40"], "began with data.size=None, not 40"),
     "another offset": (["--frame-offset", "2"], "began with --frame-offset 1, not with --frame-offset 2"),
     "a tracking folder": (["--tracking", "elsewhere"], "began without --tracking, not with --tracking"),
-    "a format": (["--format", "VHAP"], "began without --format, not with --format VHAP"),
+    "a format": (["--data-format", "VHAP"], "began without --data-format, not with --data-format VHAP"),
     "a frame rate": (["--fps", "30"], "began without --fps, not with --fps 30"),
     "more left out": (["--max-left-out", "0.5"], "began with --max-left-out 0.05, not with --max-left-out 0.5"),
     "a wrong head": (["--ignore-misfit"], "began without --ignore-misfit, not with --ignore-misfit: leave"),

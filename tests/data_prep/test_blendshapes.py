@@ -103,15 +103,15 @@ def test_files_decide_the_format(copy: Path, tmp_path: Path) -> None:
     for path in (copy / "images").iterdir():
         picture = cv2.imread(str(path))
         assert picture is not None and cv2.imwrite(str(copy / "imgs" / path.name), picture)
-    with pytest.raises(UserError, match="metrical-tracker or GaussianBlendshapes; say which with --format"):
+    with pytest.raises(UserError, match="metrical-tracker or GaussianBlendshapes; say which with --data-format"):
         prepare_folder(copy, tmp_path / "out")
-    _, said = prepare_folder(copy, tmp_path / "out", format="metrical-tracker")
+    _, said = prepare_folder(copy, tmp_path / "out", data_format="metrical-tracker")
     assert said[0] == "format: metrical-tracker"
-    _, said = prepare_folder(copy, tmp_path / "out2", format="GaussianBlendshapes")
+    _, said = prepare_folder(copy, tmp_path / "out2", data_format="GaussianBlendshapes")
     assert said[0] == "format: GaussianBlendshapes"
     shutil.rmtree(copy / "checkpoint")
     with pytest.raises(UserError, match="not a folder of GaussianBlendshapes's"):
-        prepare_folder(copy, tmp_path / "out3", format="GaussianBlendshapes")
+        prepare_folder(copy, tmp_path / "out3", data_format="GaussianBlendshapes")
 
 
 def test_check_finds_nothing_wrong(folder: Path) -> None:

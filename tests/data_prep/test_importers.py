@@ -122,18 +122,18 @@ def test_sizes_that_are_asked_for_override_the_division(tracked: Path, tmp_path:
 def test_a_format_can_be_asked_for(tracked: Path, tmp_path: Path) -> None:
     folder = write_insta(tracked, tmp_path / "both")
     shutil.copytree(tracked / "imgs", folder / "imgs")
-    with pytest.raises(UserError, match="could be a folder of metrical-tracker or INSTA; say which with --format"):
+    with pytest.raises(UserError, match="could be a folder of metrical-tracker or INSTA; say which with --data-format"):
         import_folder(folder, tracked, tmp_path / "out")
     for name in ("INSTA", "metrical-tracker"):
-        subject, said = import_folder(folder, tracked, tmp_path / name, format=name)
+        subject, said = import_folder(folder, tracked, tmp_path / name, data_format=name)
         assert said[0] == f"format: {name}" and len(subject) == FRAMES
     with pytest.raises(UserError, match="is not a folder of VHAP's"):
-        import_folder(folder, tracked, tmp_path / "out", format="VHAP")
+        import_folder(folder, tracked, tmp_path / "out", data_format="VHAP")
     with pytest.raises(
         UserError,
-        match="--format must be one of metrical-tracker, VHAP, INSTA, IMavatar, .*avatar-track, not 'NeRFace'",
+        match="--data-format must be one of metrical-tracker, VHAP, INSTA, IMavatar, .*avatar-track, not 'NeRFace'",
     ):
-        import_folder(folder, tracked, tmp_path / "out", format="NeRFace")
+        import_folder(folder, tracked, tmp_path / "out", data_format="NeRFace")
 
 
 def test_prepared_again_when_a_listing_or_a_late_mask_changes_it(tracked: Path, tmp_path: Path) -> None:

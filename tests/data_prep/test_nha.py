@@ -178,9 +178,9 @@ def test_a_folder_is_told_by_its_files(person: Path, copy: Path, tmp_path: Path)
     with pytest.raises(UserError, match="it holds person_0000/; give it"):
         check_folder(person.parent)
     (copy / "imgs").mkdir()
-    with pytest.raises(UserError, match="metrical-tracker or NHA; say which with --format"):
+    with pytest.raises(UserError, match="metrical-tracker or NHA; say which with --data-format"):
         prepare_folder(copy, tmp_path / "out")
-    assert len(prepare_folder(copy, tmp_path / "out", format="NHA")[0]) == FRAMES
+    assert len(prepare_folder(copy, tmp_path / "out", data_format="NHA")[0]) == FRAMES
 
 
 def test_check_finds_nothing_wrong(person: Path) -> None:

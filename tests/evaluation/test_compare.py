@@ -158,6 +158,18 @@ def test_damaged_and_missing_results_are_named(tmp_path: Path) -> None:
         compare_runs([a, b])
 
 
+def test_figures_that_a_run_lacks_are_left_out_with_a_note(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {"psnr": smooth(1), "ssim": smooth(2)})
+    comparison = compare_runs([a, write_run(tmp_path / "b", {"psnr": smooth(3)})])
+    assert list(comparison.protocols[0].rows) == ["psnr"]
+    assert comparison.notes == ["strict: ssim was not measured for b"]
+    results = json.loads((a / "eval" / "results.json").read_text())
+    results["protocols"]["strict"]["means"]["lpips"] = 0.1
+    (a / "eval" / "results.json").write_text(json.dumps(results))
+    with pytest.raises(UserError, match=r"a/eval/strict/frames\.csv has no column 'lpips'; evaluate the run again"):
+        compare_runs([a, a])
+
+
 def test_lpips_of_different_networks_is_not_compared(tmp_path: Path) -> None:
     figures = {"psnr": smooth(1), "lpips": smooth(2), "lpips_head": smooth(3)}
     a = write_run(tmp_path / "a", figures, network="11")

@@ -88,13 +88,13 @@ def test_the_targets_lens_keeps_the_heads_place_and_size_and_changes_its_perspec
 def test_the_strip_marks_the_frame_and_says_when_it_is_far() -> None:
     strip = DistanceStrip([0.2, 0.5, 3.0, 0.1], width=300, picture_height=200)
     near, far = strip.frame(0), strip.frame(2)
-    assert near.shape == far.shape == (32, 300, 3)
+    assert near.shape == far.shape == (46, 300, 3)
     marks = [(picture == torch.tensor(FAR).numpy()).all(axis=2).sum() for picture in (near, far)]
     assert marks[1] > marks[0], "the mark of a far frame has the colour of far ones"
     assert (near[:, :80] != far[:, :80]).any() and (near[:, 150:260] != far[:, 150:260]).any()
 
 
 def test_one_frame_has_a_strip_and_the_csv_has_one_line_per_frame() -> None:
-    assert DistanceStrip([0.0], width=64, picture_height=64).frame(0).shape == (24, 64, 3)
+    assert DistanceStrip([0.0], width=64, picture_height=64).frame(0).shape == (38, 64, 3)
     text = distances_csv(("00007", "00009"), (0.5, 1.25))
     assert text.splitlines() == ["frame,name,distance", "0,00007,0.5000", "1,00009,1.2500"]

@@ -68,7 +68,7 @@ def test_the_protocols_of_the_program_are_plain() -> None:
     assert all(read_protocol(path) for path in builtin_protocols().values())
 
 
-@pytest.mark.parametrize("key", ["format", "fps", "frame_offset"])
+@pytest.mark.parametrize("key", ["data_format", "fps", "frame_offset"])
 def test_a_value_of_a_subject_cannot_be_an_option(key: str, tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_text(json.dumps({"subjects": [{"folder": "a", key: "--out=/elsewhere"}]}))

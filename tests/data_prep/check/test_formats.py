@@ -127,10 +127,12 @@ def test_the_command_takes_the_format(
     exported: dict[str, Path], tracked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--head", str(tracked / "head_model"), "--json"]
-    assert main(["check", str(exported["IMavatar"]), "--format", "IMavatar", "--out", str(tmp_path), *options]) == 0
+    assert (
+        main(["check", str(exported["IMavatar"]), "--data-format", "IMavatar", "--out", str(tmp_path), *options]) == 0
+    )
     report = json.loads(capsys.readouterr().out)
     assert {finding["check"] for finding in report["findings"]} <= ALWAYS | NO_LIDS["IMavatar"]
     assert (tmp_path / "index.html").is_file()
-    assert main(["check", str(exported["IMavatar"]), "--format", "INSTA", *options]) == 2
+    assert main(["check", str(exported["IMavatar"]), "--data-format", "INSTA", *options]) == 2
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert finding["check"] == "layout" and "is not a folder of INSTA's" in finding["problem"]
