@@ -23,7 +23,7 @@ def test_what_is_no_run_is_said_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not a run folder: it has no run.json"):
         read_run_info(tmp_path / "other")
     (tmp_path / "run.json").write_text(json.dumps({"format": 1, "folder": "x"}))
-    with pytest.raises(UserError, match="is of format 1, and this program reads 3; train again with this version"):
+    with pytest.raises(UserError, match="is of format 1, and this program reads 4; train again with this version"):
         read_run_info(tmp_path)
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(UserError, match="cannot be read as JSON"):
