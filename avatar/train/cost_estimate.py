@@ -22,6 +22,7 @@ from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
+LONGEST = 10.0  # seconds of one kind after which no more are made; where the first takes as long, it is counted
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,12 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     steps = StepRunner(TrainState(avatar, optimizer, objective, corrections))
 
     def seconds(step: int) -> float:
-        taken = []
-        for _ in range(1 + MEASURED_STEPS):
+        taken: list[float] = []
+        while len(taken) <= MEASURED_STEPS and sum(taken) < LONGEST:
             begin = time.perf_counter()
             steps.make(step, frame, None)
             taken.append(time.perf_counter() - begin)
-        return float(np.median(taken[1:]))
+        return float(np.median(taken[1:] or taken))
 
     kinds = kinds_of_steps(config.trainer, term.every)
     total = sum(count * seconds(step) for count, step in kinds)

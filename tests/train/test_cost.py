@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from small_runs import open_small, small_config
 
 from avatar.losses.photometric import dssim
+from avatar.train import cost_estimate
 from avatar.train.cost_estimate import kinds_of_steps, measure_cost
 from avatar.train.loss import PerceptualTerm, Weighted
 
@@ -36,3 +38,20 @@ def test_any_frame_shows_what_training_takes(tracked_folder: Path, time: int | N
     frame = replace(subject.frame(5), shared_time=time)
     cost = measure_cost(frame, assets, subject.identity, config)
     assert cost.step_seconds > 0 and cost.iterations == config.trainer.iterations
+
+
+@pytest.mark.parametrize(("durations", "mean"), [((30.0,), 30.0), ((7.0, 4.0), 4.0), ((1.0, 0.2, 0.3, 0.4), 0.3)])
+def test_slow_steps_are_measured_few_times(
+    durations: tuple[float, ...], mean: float, tracked_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = small_config("trainer.perceptual=dssim", "trainer.iterations=1")
+    _, subject, assets = open_small(tracked_folder, config)
+    frame, clock, steps = subject.frame(5), [0.0], iter(durations)
+    monkeypatch.setattr(cost_estimate, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+
+    def make(*_: object) -> None:
+        clock[0] += next(steps)
+
+    monkeypatch.setattr(cost_estimate.StepRunner, "make", make)
+    assert measure_cost(frame, assets, subject.identity, config).step_seconds == pytest.approx(mean)
+    assert next(steps, None) is None, "not all of them were made"
