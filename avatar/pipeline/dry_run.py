@@ -48,11 +48,19 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
         avatar = new_avatar(assets, subject, config, perceptual.name, CPU)
         background = torch.tensor(config.data.background)
         seconds += rounds * estimated_seconds(avatar, subject, config.data.size, background)
-    minutes = f"about {seconds / 60:.1f} minutes: " if chosen.type == "cpu" else "not estimated on a GPU: "
+    estimate = f"about {as_duration(seconds)}: " if chosen.type == "cpu" else "not estimated on a GPU: "
     step = f" of {cost.step_seconds:.3f} s, measured on a few" if chosen.type == "cpu" else ""
     print(f"Subject      {subject.name}: {frames:,} frames to train on, {len(subject.split.test):,} held out")
     print(f"Avatar       {cost.gaussians:,} Gaussians ({config.model.name}), {size[0]}x{size[1]} pixels")
-    print(f"Time         {minutes}{cost.iterations:,} steps{step}")
+    print(f"Time         {estimate}{cost.iterations:,} steps{step}")
     print(f"Memory       about {in_words(sum(need.size for need in needs))} of {in_words(free or available_bytes())}")
     print(f"Disk         about {in_words(4.0 * DISK_COPIES * cost.parameters * (1 + rounds))}")
     return OK
+
+
+def as_duration(seconds: float) -> str:
+    """In minutes; from two hours on in hours, from two days on in days."""
+    hours = seconds / 3600
+    return (
+        f"{60 * hours:.1f} minutes" if hours < 2 else f"{hours:.1f} hours" if hours < 48 else f"{hours / 24:,.0f} days"
+    )

@@ -14,6 +14,7 @@ from avatar.commands.groups import GROUPS
 from avatar.commands.outputs import check_outputs
 from avatar.commands.parser import build_parser
 from avatar.config import load_config
+from avatar.pipeline.dry_run import as_duration
 
 
 def test_every_command_is_in_one_group_with_an_example() -> None:
@@ -75,6 +76,13 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(
         assert fact in said
     assert list(tmp_path.iterdir()) == []
     assert "is a video" in avatar("train", (film := tmp_path / "a.mp4").touch() or film, "--dry-run", status=1)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(90.0, "1.5 minutes"), (7190.0, "119.8 minutes"), (7200.0, "2.0 hours"), (1e8, "1,157 days")]
+)
+def test_a_dry_run_names_the_time_in_a_fitting_unit(seconds: float, words: str) -> None:
+    assert as_duration(seconds) == words
 
 
 def test_the_printed_configuration_is_one_to_type() -> None:
