@@ -50,6 +50,11 @@ STEP = {"cpu": 99 / 4000, "cuda": 16 / 4000}  # docs/gpu.md
 FRAME_SIDE = 512  # pixels, at most, of what is tracked
 
 
+def default_folder(video: Path) -> Path:
+    """The video's name; of a folder of pictures, which has that name already, with `-avatar`."""
+    return Path(f"{video.resolve().name}-avatar" if video.is_dir() else video.stem)
+
+
 class OutputPaths(NamedTuple):
     subject: Path
     run: Path
@@ -58,7 +63,7 @@ class OutputPaths(NamedTuple):
 
 def run_create(arguments: Namespace) -> int:
     begin, video = time.monotonic(), arguments.video
-    out: Path = arguments.out or Path(video.stem)
+    out: Path = arguments.out or default_folder(video)
     check_folder_output(out)
     check_outputs([out], [video, arguments.head])
     refuse_what_is_missing(arguments)

@@ -30,12 +30,12 @@ def discard(_: str) -> None:
 
 
 def figures_line(results: Path) -> str:
-    """Of the protocol that masks nothing away; after a refinement by each tracking, the tracker's first."""
+    """Of the head, as the README's table; after a refinement by each tracking, the tracker's first."""
     strict = read_json(results)["protocols"]["strict"]
     own = parts(strict)
     means = [
-        f"PSNR {part.figures['means']['psnr']:.2f}, SSIM {part.figures['means']['ssim']:.4f}"
+        f"PSNR {part.figures['means']['psnr_head']:.2f}, SSIM {part.figures['means']['ssim_head']:.4f}"
         + (f" ({LABELS[drive]})" if len(own) > 1 else "")
         for drive, part in own.items()
     ]
-    return f"{'; '.join(means)} over {len(strict['frames'])} of them"
+    return f"{'; '.join(means)} over {len(strict['frames'])} of them, head only"

@@ -11,7 +11,9 @@ from avatar.commands.options import add_avatar, add_background, add_device, add_
 def add_create(create: argparse.ArgumentParser) -> None:
     create.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of numbered pictures")
     add_head(create)
-    create.add_argument("--out", type=Path, metavar="OUT", help="where everything goes (default: the video's name)")
+    create.add_argument(
+        "--out", type=Path, metavar="OUT", help="where everything goes (default: the video's name, or FOLDER-avatar)"
+    )
     create.add_argument(
         "--refine", type=int, metavar="N", help="improve the tracking N times through an avatar (default: 1; 0: do not)"
     )

@@ -103,7 +103,7 @@ def posed(
     for control, value in (expressions or {}).items():
         expression = expression + value * control.direction
     gaze = turned(joints.get("look_down", 0.0), joints.get("look_left", 0.0))
-    lids = torch.tensor([joints.get("left_lid", 0.0), joints.get("right_lid", 0.0)])
+    lids = torch.tensor([joints.get("left_lid", 0.0), joints.get("right_lid", 0.0)], dtype=torch.float32)
     jaw = turned(joints["jaw"], 0.0) if "jaw" in joints else rest.jaw
     return replace(
         rest,

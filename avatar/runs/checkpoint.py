@@ -72,7 +72,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         meta = json.loads(read_metadata(path, _MAX_BYTES).get("avatar", "null"))
         tensors = read_tensors(path, _MAX_BYTES)
     except (UserError, ValueError, RecursionError) as error:
-        raise UserError(f"the checkpoint {path} is damaged ({error}); delete it to use the one before") from None
+        raise UserError(
+            f"the checkpoint {path} is damaged ({error}); delete it to use the one before, or train anew"
+        ) from None
     if not isinstance(meta, dict) or meta.get("format") != CHECKPOINT_FORMAT or not isinstance(meta.get("step"), int):
         found = meta.get("format") if isinstance(meta, dict) else "none"
         raise UserError(f"{path} is not a checkpoint of this program (format {found}, expected {CHECKPOINT_FORMAT})")

@@ -87,6 +87,14 @@ def test_a_file_that_is_no_video_is_among_what_is_missing(tmp_path: Path) -> Non
     assert str(text) in said and "flame" in said and "nothing was begun" in said
 
 
+def test_a_folder_of_pictures_does_not_stand_in_its_own_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "me").mkdir()
+    for folder in ("me", "me/", tmp_path / "me"):
+        said = avatar("create", folder, "--head", "flame", status=1)
+        assert "me" in said and "nothing was begun" in said and "overwritten" not in said
+
+
 def test_one_command_makes_the_page_and_again_does_nothing_twice(
     small: Callable[..., None], video: Path, tracked_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,7 +64,9 @@ def test_what_create_says_of_a_run_is_by_all_protocols(run: Path) -> None:
     shutil.rmtree(run / "eval")
     avatar("eval", run, "--protocol", "rgbavatar")
     results = evaluate_or_read(run)
-    assert figures_line(results).startswith("PSNR") and tables(run) == builtin_protocols().keys()
+    line, means = figures_line(results), json.loads(results.read_text())["protocols"]["strict"]["means"]
+    assert line.startswith(f"PSNR {means['psnr_head']:.2f}, ") and line.endswith("of them, head only")
+    assert tables(run) == builtin_protocols().keys()
 
 
 @pytest.mark.slow

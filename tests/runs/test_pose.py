@@ -40,6 +40,8 @@ def test_a_pose_is_named(trained: TrainedAvatar) -> None:
     assert torch.equal(trained.pose(lean=0.2, turn=-0.3).image, turned.image)
     assert not torch.equal(turned.image, trained.render(rest).image)
     assert torch.equal(trained.pose().image, trained.render(rest).image)
+    closed = trained.render(posed(rest, None, {"left_lid": 1.0, "right_lid": 1.0}))
+    assert torch.equal(trained.pose(left_lid=1, right_lid=1).image, closed.image)
     with pytest.raises(UserError, match=f"this avatar has no ears; it has jaw, look_down.*{name}"):
         trained.pose(ears=1)
 

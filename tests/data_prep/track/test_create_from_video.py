@@ -26,10 +26,10 @@ def test_a_video_becomes_a_page(tracking_models: None, tmp_path: Path, monkeypat
     for part in (f"about {FRAMES} frames", "quality of the tracking", "Stage 2 of 4", "Round 1 of 1", "Done in"):
         assert part in output
     strict = json.loads(Path("me/run/eval/results.json").read_text())["protocols"]["strict"]
-    tracked, fitted = (f"PSNR {one['means']['psnr']:.2f}" for one in (strict["tracked"], strict))
+    tracked, fitted = (f"PSNR {one['means']['psnr_head']:.2f}" for one in (strict["tracked"], strict))
     line = next(line for line in output.splitlines() if line.startswith("Held-out frames: "))
     assert line.startswith(f"Held-out frames: {tracked}, ") and f"(tracked); {fitted}, " in line
-    assert line.endswith("(refined, fitted) over 6 of them")
+    assert line.endswith("(refined, fitted) over 6 of them, head only")
     assert len(list(Path("me/subject/frames").iterdir())) == FRAMES
     page = Path("me/avatar.html").read_bytes()
     again = avatar(*words)
