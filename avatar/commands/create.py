@@ -25,7 +25,7 @@ from avatar.config import Config, load_config
 from avatar.data.split import split_frames
 from avatar.errors import UserError
 from avatar.export.web_page import write_page
-from avatar.files.names import safe_name
+from avatar.files.names import RUN_FOLDER, SUBJECT_FOLDER, safe_name
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import head_for_video, progress_bar, tracking_lacks
@@ -67,7 +67,7 @@ def run_create(arguments: Namespace) -> int:
     check_folder_output(out)
     check_outputs([out], [video, arguments.head])
     refuse_what_is_missing(arguments)
-    paths = OutputPaths(out / "subject", out / "run", out / "avatar.html")
+    paths = OutputPaths(out / SUBJECT_FOLDER, out / RUN_FOLDER, out / "avatar.html")
     if paths.run.exists() and not paths.subject.exists():
         raise UserError(f"{paths.subject}, on which {paths.run} began, is gone: choose another --out, or remove {out}")
     training, head = training_arguments(arguments, paths), head_for_video(video, arguments.head)

@@ -12,6 +12,7 @@ from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.export.web_page import write_page
+from avatar.files.names import RUN_FOLDER
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import can_track, progress_bar
@@ -37,7 +38,7 @@ ACTOR, DRIVER = Person("actor", 500, 1), Person("driver", 100, 2)
 def run_demo(arguments: Namespace) -> int:
     """The whole program; what an interrupted one has done is not done again."""
     out: Path = arguments.out
-    actor, driver, run = out / ACTOR.name, out / DRIVER.name, out / "run"
+    actor, driver, run = out / ACTOR.name, out / DRIVER.name, out / RUN_FOLDER
     check_folder_output(out)
     check_outputs([out, run], [])
     if is_begun(run) and read_run_info(run).source.folder.resolve() != actor.resolve():

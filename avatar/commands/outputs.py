@@ -7,12 +7,13 @@ from pathlib import Path
 
 from avatar.errors import UserError
 from avatar.files.lock import LOCK_FILE
+from avatar.files.names import ROUNDS_FOLDER
 from avatar.runs.avatar_file import AVATAR_FILE
 from avatar.runs.run import RUN_FILE
 from avatar.runs.training_curves import CURVES_FILE
 
 RUN_FILES = (RUN_FILE, AVATAR_FILE, CURVES_FILE, LOCK_FILE)
-RUN_FOLDERS = ("checkpoints", "previews", "eval", "rounds")
+RUN_FOLDERS = ("checkpoints", "previews", "eval", ROUNDS_FOLDER)
 
 
 def check_file(output: Path, suffixes: Sequence[str], what: str) -> None:

@@ -16,12 +16,12 @@ from avatar.config_values import shown
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.lock import locked
-from avatar.files.names import safe_name
+from avatar.files.names import ROUNDS_FOLDER, safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import cached_tracking, head_for_video, is_video
 from avatar.pipeline.dry_run import estimate_training
 from avatar.pipeline.open_inputs import at_new_place, source_of
-from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, plan_file
+from avatar.pipeline.refine_plan import Plan, plan_file
 from avatar.pipeline.train import resume_run, train_new
 from avatar.pipeline.train_refined import begin_rounds, train_refined
 from avatar.runs.run import RUN_FILE, RunInfo, read_run_info, refuse_trained

@@ -1,12 +1,14 @@
-"""Names that come out of files, fit to be names of files: what a file says must not choose where something is written."""
+"""Names of files and folders: those that come out of files must not choose where something is written."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import re
+from pathlib import Path
 from typing import Any
 
+SUBJECT_FOLDER, RUN_FOLDER, ROUNDS_FOLDER = "subject", "run", "rounds"  # names that the program gives
 MAX_NAME_BYTES = 100  # in UTF-8; file systems take 255, and suffixes follow
 _FORBIDDEN = frozenset('/\\:*?"<>|')  # separators, and what Windows refuses
 _NOT_AT_THE_ENDS = " .-~"  # hidden files, options, home folders
@@ -25,6 +27,19 @@ def shortened(name: str) -> str:
     if len(data) <= MAX_NAME_BYTES:
         return name
     return f"{data[: MAX_NAME_BYTES - 9].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
+
+
+def telling_path(folder: Path) -> Path:
+    """The end of an absolute path that begins with a name a person gave: `me/run` of what `avatar create` made in `me`."""
+    parts = folder.parts
+    first = len(parts) - 1
+    while first > 1 and parts[first] in (SUBJECT_FOLDER, RUN_FOLDER):
+        first -= 3 if parts[first - 2] == ROUNDS_FOLDER else 1
+    return Path(*parts[first:])
+
+
+def telling_name(folder: Path) -> str:
+    return next(iter(telling_path(folder).parts), "")
 
 
 def natural_order(name: str) -> tuple[Any, ...]:

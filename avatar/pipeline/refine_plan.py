@@ -16,6 +16,7 @@ from avatar.data.json_values import parse_object
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.names import ROUNDS_FOLDER
 from avatar.files.read import read_json
 from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine_subject import estimated_seconds
@@ -24,7 +25,6 @@ from avatar.train.frame_order import within_epochs
 from avatar.train.loss import choose_perceptual
 from data_prep.prepare.open_subject import open_subject
 
-ROUNDS_FOLDER = "rounds"
 PLAN_FORMAT = 2
 LEAST_STEPS = 500  # fewer make no avatar
 # A round trains for a few passes over the training frames: with more, the avatar overfits the errors of each frame's

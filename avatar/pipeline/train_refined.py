@@ -14,10 +14,10 @@ from pathlib import Path
 from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.files.lock import locked
-from avatar.files.names import safe_name
+from avatar.files.names import ROUNDS_FOLDER, RUN_FOLDER, safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.open_inputs import open_run
-from avatar.pipeline.refine_plan import ROUNDS_FOLDER, Plan, RoundTimes, steps_in_time
+from avatar.pipeline.refine_plan import Plan, RoundTimes, steps_in_time
 from avatar.pipeline.refine_run import refine_run
 from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
@@ -61,12 +61,12 @@ def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
 def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: int) -> tuple[int, Plan]:
     """The round in the folder `stage`, with `to_come` after it; and the plan, with the time that is gone. A round that was
     made in one sitting shows what steps take, and so how many there is time for."""
-    at_once, started = not is_begun(stage / "run"), time.monotonic()
-    status = continue_or_begin(source, plan.round_overrides(), stage / "run")
+    at_once, started = not is_begun(stage / RUN_FOLDER), time.monotonic()
+    status = continue_or_begin(source, plan.round_overrides(), stage / RUN_FOLDER)
     trained = time.monotonic()
     if status != OK:
         return status, replace(plan, spent=trained - begin)
-    run = open_run(stage / "run", source.head, source.folder)
+    run = open_run(stage / RUN_FOLDER, source.head, source.folder)
     status = refine_run(run, stage / safe_name(plan.source.folder.resolve().name))
     refined = time.monotonic()
     plan = replace(plan, spent=refined - begin)

@@ -1,0 +1,29 @@
+"""Names of folders that tell people what is inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from avatar.files.names import telling_name, telling_path
+
+
+@pytest.mark.parametrize(
+    ("folder", "told"),
+    [
+        ("/films/me/subject", "me/subject"),
+        ("/films/me/run", "me/run"),
+        ("/films/me/run/rounds/1/run", "me/run/rounds/1/run"),
+        ("/films/me/run/rounds/2/subject", "me/run/rounds/2/subject"),
+        ("/runs/anna/rounds/1/anna", "anna"),
+        ("/nersemble/017/subject/", "017/subject"),
+        ("/runs/anna", "anna"),
+        ("/run", "run"),
+        ("/", "/"),
+    ],
+)
+def test_the_end_of_a_path_begins_with_a_name_that_a_person_gave(folder: str, told: str) -> None:
+    assert telling_path(Path(folder)) == Path(told)
+    assert telling_name(Path(folder)) == Path(told).parts[0]
+    assert telling_name(Path()) == ""
