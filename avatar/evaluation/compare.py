@@ -44,7 +44,7 @@ _ENTRY = {
     "choices": {"summary": str},
     "bootstrap": {"block_frames": int},
 }
-_ROUND = {"frames_trained_on": int, "measured_frames_trained_on": int}
+_ROUND = {"run": str, "frames_trained_on": int, "measured_frames_trained_on": int}
 FORM = {
     **dict.fromkeys(("data_hash", "head_fingerprint", "perceptual"), str),
     "image_size": [int],

@@ -17,15 +17,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+NOTHING = "-"  # in a table: there is no such figure
 INK, GRID = "#1d2733", "#d9dee5"  # of style.css
 SERIES = ("#2563a8", "#c4572b", "#3d8a5c", "#7a4fa3")  # colours of lines and points, readable by the colour-blind
 
 
 def data_table(head: Sequence[Content], rows: Iterable[Sequence[Content]]) -> Markup:
-    """A table whose cells that are numbers stand to the right; where it is too wide, the arrow keys scroll it."""
-    lines = [element("tr", *(element("td", cell, class_=_kind(cell)) for cell in row)) for row in rows]
-    heading = element("thead", element("tr", *(element("th", cell) for cell in head))) if head else ""
-    table = element("table", heading, element("tbody", *lines))
+    """A table whose cells that are numbers stand to the right; where it is too wide, the arrow keys scroll it.
+
+    Columns in which no row has anything are left out.
+    """
+    rows = list(rows)
+    empty = {at for at, cells in enumerate(zip(*rows, strict=True)) if all(cell in (None, NOTHING) for cell in cells)}
+
+    def line(tag: str, cells: Sequence[Content]) -> Markup:
+        kept = (cell for at, cell in enumerate(cells) if at not in empty)
+        return element("tr", *(element(tag, cell, class_=_kind(cell)) for cell in kept))
+
+    heading = element("thead", line("th", head)) if head else ""
+    table = element("table", heading, element("tbody", *(line("td", row) for row in rows)))
     return element("div", table, class_="scroll", tabindex=0, role="group", aria_label="table")
 
 

@@ -13,10 +13,11 @@ from avatar.errors import check_installed
 from avatar.evaluation.compare import read_evaluation
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
+from avatar.files.names import RUN_FOLDER, telling_name, telling_path
 from avatar.files.read import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.document import Content
-from avatar.html.parts import SERIES, data_uri
+from avatar.html.parts import NOTHING, SERIES, data_uri
 from avatar.report.grade import Word, describe, word_of
 from avatar.report.pictures import frame_panels
 from avatar.runs.run import Run, versions
@@ -61,7 +62,7 @@ def render_report(run: Run) -> str:
     is_measured = is_there(run.path / "eval" / "results.json")
     results = read_evaluation(run.path.name, run.path).results if is_measured else None
     facts = {
-        "subject": run.subject.name,
+        "subject": telling_name(Path(run.subject.manifest.source)),
         "method": run.config.model.name,
         "perceptual term": run.trained.perceptual,
         "Gaussians": f"{len(run.avatar):,}",
@@ -69,12 +70,12 @@ def render_report(run: Run) -> str:
         "training frames": len(run.subject.split.train),
         "held-out frames": len(run.subject.split.test),
     }
-    folder, lines = run.path.resolve(), [element("p", str(run.path), class_="soft")]
-    title = f"Run {folder.name}"
-    if folder.name == "run" and is_there(folder.parent / PAGE):  # as avatar create and demo lay them out
-        lines.append(element("p", element("a", "The avatar in its page", href=f"../{PAGE}")))
+    folder, link = run.path.resolve(), ""
+    title = f"Run {telling_name(folder)}"
+    if folder.name == RUN_FOLDER and is_there(folder.parent / PAGE):  # as avatar create and demo lay them out
+        link = element("p", element("a", "The avatar in its page", href=f"../{PAGE}"))
     parts = [
-        element("header", element("h1", title), *lines),
+        element("header", element("h1", title), link),
         section("Held-out frames", *_main_figures(results), *_frames(run)),
         section("Held-out figures", *_figures(run, results)),
         section("Training", fold("Loss and PSNR", *_curves(run.path))),
@@ -111,9 +112,9 @@ def _judged(figure: str, word: Word | None) -> Content:
 
 
 def means_table(protocols: Mapping[str, Any], mark: str = "") -> Markup:
-    """One line per protocol and tracking, the tracker's first; one column per figure that any of them has."""
+    """One line per protocol and tracking, the tracker's first; one column per figure."""
     lines = _by_drive(protocols, mark)
-    columns = list(dict.fromkeys(c for _, _, means, _ in lines for c, mean in means.items() if mean is not None))
+    columns = list(dict.fromkeys(c for _, _, means, _ in lines for c in means))
     rows = [[name, frames, *(_figure(c, means.get(c)) for c in columns)] for name, frames, means, _ in lines]
     return data_table(["protocol", "frames", *(column.replace("_", " ") for column in columns)], rows)
 
@@ -122,16 +123,15 @@ def bins_tables(protocols: Mapping[str, Any], mark: str = "") -> list[Markup]:
     """Means over the frames in each bin of the conditions that a protocol was binned by, one table for each pair."""
     tables = []
     for name, _, means, figures in _by_drive(protocols, mark):
-        columns = [column for column, value in means.items() if value is not None]
         for key, title, decimals, column_name in BINNINGS:
             bins = figures.get(key, ())
             if not bins:
                 continue
             rows = [
-                [_interval(one, decimals), one["frames"], *(_figure(c, one["means"].get(c)) for c in columns)]
+                [_interval(one, decimals), one["frames"], *(_figure(c, one["means"].get(c)) for c in means)]
                 for one in bins
             ]
-            heading = [column_name, "frames", *(column.replace("_", " ") for column in columns)]
+            heading = [column_name, "frames", *(column.replace("_", " ") for column in means)]
             tables.append(element("div", element("p", f"{name}, by {title}", class_="soft"), data_table(heading, rows)))
     return tables
 
@@ -157,7 +157,7 @@ def _interval(one: Mapping[str, Any], decimals: int) -> str:
 
 
 def _figure(column: str, value: float | None) -> str:
-    return "-" if value is None else f"{value:.{SHOWN_DECIMALS.get(column.partition('_')[0], 4)}f}"
+    return NOTHING if value is None else f"{value:.{SHOWN_DECIMALS.get(column.partition('_')[0], 4)}f}"
 
 
 def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
@@ -171,7 +171,8 @@ def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
     mark = f" {MARK}" if is_marked(tracking) else ""
     shown.append(means_table(protocols, mark))
     kind = "finding warning" if tracking["rounds"] else "soft"
-    shown += [element("p", line, class_=kind) for line in tracking_lines(tracking)]
+    rounds = [{**one, "run": telling_path(Path(one["run"]))} for one in tracking["rounds"]]
+    shown += [element("p", line, class_=kind) for line in tracking_lines({**tracking, "rounds": rounds})]
     networks = dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())
     shown += [element("p", f"LPIPS: {note}", class_="soft") for note in networks]
     shown.append(fold("By head pose and by distance from the training expressions", *bins_tables(protocols, mark)))
@@ -184,8 +185,9 @@ def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
         file = run.path / "eval" / name
         if is_there(file):
             source = f"data:image/png;base64,{base64.b64encode(read_bytes(file, MAX_BYTES)).decode()}"
-            image = element("figure", element("img", src=source, alt=caption), element("figcaption", caption))
-            shown.append(fold(caption, image))
+            kind = "plot" if name == "curves.png" else None
+            image = element("img", src=source, alt=caption)
+            shown.append(fold(caption, element("figure", image, element("figcaption", caption), class_=kind)))
     choices = {n: e.get("choices", {}).get("summary") for n, e in protocols.items()}
     rows = [[name, summary] for name, summary in choices.items()]
     return [*shown, fold("What each protocol measures", data_table([], rows))]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.names import telling_name
 from avatar.html import Markup, document, element, fold, join, picture, section, tiles
 from avatar.version import __version__
 from data_prep.check.clip import Clip
@@ -38,12 +39,11 @@ def write_page(check: Check, out: Path) -> Path:
 
 
 def render_page(check: Check) -> str:
-    badge = _BADGES[check.status]
+    title, badge = f"Check of {telling_name(check.folder.resolve())}", _BADGES[check.status]
     verdict = element("a", check.summary(), href="#findings") if check.findings else check.summary()
     header = element(
         "header",
-        element("h1", f"Check of {check.folder.name or check.folder}"),
-        element("p", str(check.folder), class_="soft"),
+        element("h1", title),
         element("p", element("span", badge, class_=f"badge {badge}"), " ", verdict, class_="verdict"),
     )
     parts: list[Markup] = [header]
@@ -60,7 +60,7 @@ def render_page(check: Check) -> str:
         shown = tiles({name: _shown(value) for name, value in figures.items()})
         parts.append(section("Figures", element("p", f"Offset: {evidence}.", class_="soft"), shown))
     parts.append(element("p", f"avatar {__version__} check", class_="soft"))
-    return document(f"Check of {check.folder.name}", parts)
+    return document(title, parts)
 
 
 def write_frames(clip: Clip, path: Path) -> None:

@@ -34,6 +34,12 @@ def test_numbers_stand_to_the_right() -> None:
     assert '<td class="number">1.5</td><td>a</td>' in data_table(["x", "y"], [[1.5, "a"]])
 
 
+def test_columns_without_anything_are_left_out() -> None:
+    table = data_table(["x", "y", "z"], [["a", "-", 0.0], ["-", None, None]])
+    assert "<th>x</th><th>z</th>" in table and '<td>a</td><td class="number">0.0</td>' in table
+    assert "<th>y</th>" in data_table(["x", "y"], []), "without rows nothing is known"
+
+
 def test_an_image_comes_back_from_its_url() -> None:
     image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
     head, _, data = data_uri(image, "png").partition(",")

@@ -21,7 +21,7 @@ from tracked_folder import write_tracked_folder
 from avatar.cli import main
 from avatar.errors import UserError
 from avatar.pipeline.open_inputs import open_run
-from avatar.report.page import bins_tables, means_table, render_report
+from avatar.report.page import _figures, bins_tables, means_table, render_report
 from avatar.runs.training_curves import read_curves
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Resources, Spec
@@ -50,6 +50,8 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     sources = re.findall(r'src="([^"]{0,30})', page)
     assert len(sources) == 6 + 2 + 2  # held-out frames; curves and worst of the evaluation; training
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)
+    assert f"<h1>Run {run.parent.name}</h1>" in page and "<dd>someone</dd>" in page
+    assert str(run.parent.parent) not in page, "where this machine keeps its files concerns nobody else"
     assert results["data_hash"] in page and "trainer.learning_rates.scale" in page
     assert len(page) < 8e6
 
@@ -78,6 +80,15 @@ def test_protocols_without_a_figure_have_a_dash() -> None:
     assert "<th>ssim head</th>" in table and "lpips" not in table, "nobody measured it"
 
 
+def test_a_round_of_refinement_is_named_without_the_machines_folders(run: Path) -> None:
+    opened = open_run(run)
+    results = json.loads((run / "eval" / "results.json").read_text())
+    one = {"run": "/home/me/films/me/run/rounds/1/run", "step": 9}
+    one |= {"frames_trained_on": 3, "measured_frames_trained_on": 0}
+    results["tracking"] |= {"refined": "through the avatar of another run", "rounds": [one]}
+    assert "through the avatar of me/run/rounds/1/run (step 9)" in "".join(_figures(opened, results))
+
+
 def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
     bins = [
         {"from": None, "to": -10.0, "frames": 3, "means": {"psnr": 28.004}},
@@ -101,7 +112,7 @@ def test_bins_name_their_edges_and_their_frames(run: Path) -> None:
         ["|-10 to 10", "5", "-|"],
         ["|10 or more", "1", "27.50|"],
     ]
-    assert "below -10.00" in by_distance
+    assert "below -10.00" in by_distance and "lpips" not in by_distance
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "hypergaussians, by yaw" in page and "hypergaussians, by distance from the training expressions" in page
 

@@ -14,6 +14,8 @@ from folder_damage import all_zero
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
+from data_prep.check.folder import Check
+from data_prep.check.page import render_page
 
 
 class Sources(HTMLParser):
@@ -50,6 +52,7 @@ def test_the_page_holds_pictures_and_findings_and_loads_nothing(page: Path) -> N
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in parsed.sources)
     assert "Check of so <me> & one" in parsed.text
     assert "The tracking cannot be used in frame 00005 of checkpoint: all zero" in parsed.text
+    assert str(page.parents[1]) not in parsed.text
     assert page.stat().st_size < 3e6
 
 
@@ -65,6 +68,14 @@ def test_a_folder_that_cannot_be_read_shows_its_findings(tmp_path: Path) -> None
     assert main(["check", str(tmp_path / "nothing"), "--out", str(tmp_path / "out")]) == 2
     text = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "<img" not in text and 'class="finding error"' in text
+
+
+def test_the_title_names_what_avatar_create_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (subject := tmp_path / "me" / "subject").mkdir(parents=True)
+    monkeypatch.chdir(subject)
+    for folder in (subject, Path()):
+        page = render_page(Check(folder, (), None, None))
+        assert "<title>Check of me</title>" in page and "<h1>Check of me</h1>" in page
 
 
 def test_the_table_has_a_line_for_every_image(page: Path) -> None:
