@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
+import re
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from avatar.errors import UserError
+from avatar.files.video import video_writer
 from data_prep.check import own_tracking
 from data_prep.check.own_tracking import tracking_sections
 from data_prep.formats.avatar_track import TrackingInfo, write_tracking
@@ -36,7 +41,7 @@ def test_figures_lens_and_notes_are_shown(folder: Path) -> None:
         "landmark error",
         "1.235",
         "fair",
-        "look &lt;again&gt;",
+        '<td>landmark error<div class="soft">look &lt;again&gt;</div></td>',
         "Focal length: assumed: a lens.",
         "The video is HDR.",
     ):
@@ -50,7 +55,17 @@ def test_the_video_is_inside_the_page_unless_it_is_large(folder: Path, monkeypat
     assert 'src="data:video/mp4;base64,ZmlsbQ=="' in "".join(tracking_sections(folder))
     monkeypatch.setattr(own_tracking, "MAX_EMBEDDED", 3)
     page = "".join(tracking_sections(folder))
-    assert "<video" not in page and "overlay.mp4" in page
+    assert "<video" not in page and "overlay.mp4" in page and str(folder) not in page
+
+
+def test_the_videos_first_picture_is_shown_before_it_starts(folder: Path) -> None:
+    with video_writer(folder / "overlay" / "overlay.mp4", 25) as add:
+        for level in (200, 20):
+            add(np.full((32, 48, 3), level, np.uint8))
+    found = re.search(r'poster="data:image/jpeg;base64,([^"]+)"', "".join(tracking_sections(folder)))
+    assert found
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(found[1]), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None and picture.shape == (32, 48, 3) and abs(picture.mean() - 200) < 5
 
 
 def test_folders_of_others_have_none_of_it(tracked_folder: Path) -> None:
