@@ -173,6 +173,7 @@ def judge_tracking(info: TrackingInfo, subject: Path, anyway: bool) -> None:
     print(
         f"{', '.join(counts)} of {len(judged)} figures; look at {subject / 'overlay'}: does the mesh lie on the face?"
     )
+    print(f"Warnings about frames, masks and light do not stop the training: avatar check {subject} shows them")
     figures = [
         f"{figure['name'].replace('  of', 'landmark error of')}: {figure['value']:.4g} {figure['unit']}".rstrip()
         + (f" -> {figure['advice']}" if figure["advice"] else "")
