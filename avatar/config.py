@@ -265,6 +265,12 @@ def declared_keys(schema: type = Config, prefix: str = "") -> dict[str, str]:
     return keys
 
 
+def check_value(key: str, value: Any, name: str) -> None:
+    """Raises UserError, in which the key is called `name`, for a value that it cannot have."""
+    kind = reduce(lambda schema, part: get_type_hints(schema, include_extras=True)[part], key.split("."), Config)
+    checked_value(name, value, kind)
+
+
 def _nearest_hint(key: str, groups: Sequence[str] = ()) -> str:
     known = [*declared_keys(), *groups]
     by_last = {name.rsplit(".", 1)[-1]: name for name in known}

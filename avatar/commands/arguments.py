@@ -30,6 +30,9 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in commands:
         parser.error(f"there is no command '{name}'{nearest(name, commands)}; avatar --help lists them")
+    for word in words[1:]:
+        if word.startswith("-") and "." in word and os.path.exists(word):  # noqa: PTH110 (as below)
+            parser.error(f"{word} is read as an option: write ./{word} for the file")
     arguments, rest = parser.parse_known_args(words)
     takes_words = "words" in arguments
     unknown = [word for word in rest if word.startswith("-") or not takes_words]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from avatar.commands.arguments import parse
 from avatar.commands.held_out_figures import discard, evaluate_or_read, figures_line
 from avatar.commands.outputs import check_folder_output, check_outputs
-from avatar.commands.train import check_rounds, config_overrides, train_as_asked
+from avatar.commands.train import MAX_ROUNDS, check_rounds, config_overrides, train_as_asked
 from avatar.compute.device import free_bytes
 from avatar.compute.memory import available_bytes, check_memory, in_words
 from avatar.compute.native import thread_count
@@ -117,6 +117,8 @@ def training_arguments(arguments: Namespace, paths: OutputPaths) -> Namespace:
     """
     given = {name: getattr(arguments, name) for name in ("size", "iterations", "device", "refine")}
     begun, has_rounds = is_begun(paths.run), plan_file(paths.run).exists()
+    if given["refine"] is not None and not 0 <= given["refine"] <= MAX_ROUNDS:
+        raise UserError(f"--refine must be from 0 to {MAX_ROUNDS}, not {given['refine']}")
     if given["refine"] is None and not begun and not has_rounds:
         given["refine"] = ROUNDS
     if given["refine"] == 0 and not has_rounds:

@@ -65,13 +65,13 @@ def chosen_format(format: str | None, out: Path | None) -> str:
 
 def check_options(arguments: Namespace, format: str) -> None:
     """Raise UserError for an option that another format has."""
-    if arguments.texture is not None and not 64 <= arguments.texture <= MAX_SIZE:
-        raise UserError(f"--texture must be from 64 to {MAX_SIZE}, not {arguments.texture}")
     for option, formats in OPTIONS.items():
         value = getattr(arguments, option)
         if value is not None and value is not False and format not in formats:
             name = option.replace("_", "-")
             raise UserError(f"--{name} belongs to --format {' or '.join(formats)}; this writes {format}")
+    if arguments.texture is not None and not 64 <= arguments.texture <= MAX_SIZE:
+        raise UserError(f"--texture must be from 64 to {MAX_SIZE}, not {arguments.texture}")
 
 
 def write_web(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:

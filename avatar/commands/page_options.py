@@ -51,7 +51,9 @@ def add_export(export: argparse.ArgumentParser) -> None:
     )
     export.add_argument("--texture", type=int, metavar="N", help="glb: width of the texture (default: 1024)")
     export.add_argument(
-        "--camera", choices=("recorded", "still", "turntable", "orbit"), help="video: its path (default: recorded)"
+        "--camera",
+        choices=("recorded", "still", "swing", "orbit"),
+        help="video: its path; swing: from side to side, orbit: on an ellipse, as far as in training (default: recorded)",
     )
     export.add_argument("--size", type=int, metavar="N", help="video: its width in pixels (default: as in training)")
     add_background(export, "video: what is behind; transparent: .webm or .mov (default: as in training)")

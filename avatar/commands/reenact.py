@@ -10,13 +10,14 @@ from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.numbered import existing
+from avatar.files.read import is_there
 from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
 from avatar.pipeline.backdrop import parse_backdrop
 from avatar.pipeline.cached_tracking import cached_tracking, is_video
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file, open_driver
-from avatar.pipeline.reenact import PICTURES, Choices, first_file, reenact, sidecars
+from avatar.pipeline.reenact import PICTURES, Choices, check_choices, first_file, reenact, sidecars
 from avatar.runs.run import RUN_FILE, open_trained, read_run_info
 from avatar.runs.trained_avatar import TrainedAvatar
 from data_prep.formats.avatar_track import read_info
@@ -25,10 +26,16 @@ READING_OPTIONS = ("driver_tracking", "frame_offset", "data_format", "cameras", 
 
 
 def run_reenact(arguments: Namespace) -> int:
+    choices = Choices(**{field.name: getattr(arguments, field.name) for field in fields(Choices)})
+    check_choices(choices)
+    driver: Path = arguments.driver
+    is_drive_file = driver.suffix.lower() in DRIVE_SUFFIXES
+    if is_drive_file:
+        refuse_reading_options(arguments)
+    if not is_there(driver):
+        raise UserError(f"{driver}: there is no such file or folder")
     trained = open_trained(arguments.run, arguments.head)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
-    choices = Choices(**{field.name: getattr(arguments, field.name) for field in fields(Choices)})
-    driver: Path = arguments.driver
     backdrop = None if arguments.background is None else parse_backdrop(arguments.background)
     has_alpha = backdrop is not None and backdrop.behind is None
     out = arguments.out or default_video(arguments.run, driver, choices, ".webm" if has_alpha else ".mp4")
@@ -40,8 +47,7 @@ def run_reenact(arguments: Namespace) -> int:
     behind = None if arguments.background is None else Path(arguments.background)
     inputs = [driver, behind, arguments.run, arguments.head, arguments.driver_tracking, trained.source]
     check_outputs([first_file(out), *(existing(out) if first_file(out) != out else ()), *sidecars(out)], inputs)
-    if driver.suffix.lower() in DRIVE_SUFFIXES:
-        refuse_reading_options(arguments)
+    if is_drive_file:
         reenact(trained, open_drive_file(driver, trained), out, choices, backdrop=backdrop)
     else:
         sound = None

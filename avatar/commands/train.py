@@ -11,7 +11,7 @@ from typing import Any
 
 from avatar.commands.outputs import check_run_folder
 from avatar.commands.train_view import train_in_view
-from avatar.config import MAX_OVERRIDE, chosen_options, flatten, load_config
+from avatar.config import MAX_OVERRIDE, check_value, chosen_options, flatten, load_config
 from avatar.config_values import shown
 from avatar.data.source import Source
 from avatar.errors import UserError
@@ -28,6 +28,7 @@ from avatar.runs.run import RUN_FILE, RunInfo, read_run_info, refuse_trained
 from data_prep.prepare.wrong_inputs import check_folder
 
 MAX_ROUNDS = 10
+SHORT_FORMS = ("data.size", "trainer.iterations", "trainer.seed")  # keys whose last part is an option
 
 
 def run_train(arguments: Namespace) -> int:
@@ -194,11 +195,14 @@ def default_run(folder: Path | None) -> Path:
 
 
 def config_overrides(arguments: Namespace) -> list[str]:
-    """The options that are short forms of configuration keys, before the overrides, so that those win."""
-    short = {"data.size": arguments.size, "trainer.iterations": arguments.iterations, "trainer.seed": arguments.seed}
+    """The options that are short forms of configuration keys, before the overrides, so that those win. Raises UserError
+    for an option's value that its key does not take."""
+    short = {key: value for key in SHORT_FORMS if (value := getattr(arguments, key.rpartition(".")[2])) is not None}
+    for key, value in short.items():
+        check_value(key, value, f"--{key.rpartition('.')[2]}")
     groups = [o for o in arguments.overrides if "." not in o.partition("=")[0]]
     keys = [o for o in arguments.overrides if o not in groups]
-    return [*groups, *(f"{key}={value}" for key, value in short.items() if value is not None), *keys]
+    return [*groups, *(f"{key}={value}" for key, value in short.items()), *keys]
 
 
 def refuse_changed_run(run: Path, info: RunInfo, arguments: Namespace, overrides: list[str]) -> None:

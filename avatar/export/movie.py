@@ -18,7 +18,7 @@ from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.tensors import to_8_bit
 from avatar.types import Camera, HeadParams
 
-CameraPath = Literal["recorded", "still", "turntable", "orbit"]
+CameraPath = Literal["recorded", "still", "swing", "orbit"]
 PERIOD = 6.0  # seconds of one round
 
 
@@ -29,11 +29,11 @@ def limits_of(trained: TrainedAvatar) -> OrbitLimits:
 
 
 def path_camera(rest: Camera, limits: OrbitLimits, path: CameraPath, seconds: float, period: float = PERIOD) -> Camera:
-    """Where the camera of a path is: turntable from side to side, orbit around an ellipse; both within `limits`."""
+    """Where the camera of a path is: swing from side to side, orbit around an ellipse; both within `limits`."""
     phase = 2 * math.pi * seconds / period
     middle_yaw, middle_pitch = ((high + low) / 2 for low, high in limits)
     reach_yaw, reach_pitch = ((high - low) / 2 for low, high in limits)
-    if path == "turntable":
+    if path == "swing":
         return orbited(rest, middle_yaw + reach_yaw * math.sin(phase))
     if path == "orbit":
         return orbited(rest, middle_yaw + reach_yaw * math.sin(phase), middle_pitch + reach_pitch * math.cos(phase))

@@ -65,6 +65,15 @@ class HeadAssets:
         return self.layout_method != 0
 
     @property
+    def fixed_joints(self) -> tuple[str, ...]:
+        """Those of jaw and eyes whose rotation moves no vertex; such head models open the mouth by expressions."""
+        turns = self.pose_dirs.unflatten(2, (-1, 9)).abs().amax(dim=(0, 1, 3))  # of the joints without the root
+        moves = (self.weights != 0).any(dim=0)[1:] | (turns > 0)
+        return tuple(
+            name for name, one in zip(JOINT_NAMES[1:], moves.tolist(), strict=True) if not one and name != "neck"
+        )
+
+    @property
     def num_vertices(self) -> int:
         return self.template.shape[0]
 

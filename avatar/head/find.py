@@ -9,6 +9,7 @@ from avatar.errors import UserError
 from avatar.files.read import is_there
 
 NAMED = ("generic_model.pkl", "generic_model.npz")  # FLAME's own name for the model of no gender
+MODEL_SUFFIXES = (".npz", ".pkl")
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz")
 _OTHERS = ("mask", "embedding", "texture")  # in names of files that lie beside models
 _DEPTH = 2  # folders down that are looked into
@@ -27,6 +28,8 @@ def find_model_file(path: Path) -> Path:
     if not path.is_dir():
         if path.is_file() and (path.suffix.lower() in ARCHIVES or (path.suffix != ".npz" and zipfile.is_zipfile(path))):
             raise UserError(f"{path} is an archive; unpack it, and give --head the folder")
+        if path.suffix.lower() not in MODEL_SUFFIXES:
+            raise UserError(f"the head model {path} is neither .pkl nor .npz; give --head the model file or its folder")
         return path  # its reader refuses what is no regular file
     for depth in range(_DEPTH + 1):
         found = candidates(path, depth)
@@ -48,7 +51,7 @@ def find_model_file(path: Path) -> Path:
 
 def candidates(folder: Path, depth: int = 0) -> list[Path]:
     """The files in the folder, or so many folders down, that could be a head model."""
-    found = (file for suffix in (".npz", ".pkl") for file in folder.glob(f"{'*/' * depth}*{suffix}"))
+    found = (file for suffix in MODEL_SUFFIXES for file in folder.glob(f"{'*/' * depth}*{suffix}"))
     return sorted(
         file
         for file in found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.head.assets import EYES
 from avatar.head.expression_names import plain
 from avatar.head.model import HeadModel, matrix_from_6d
 from avatar.motion.component_names import name_components
@@ -115,19 +116,28 @@ def posed(
     )
 
 
-def posed_by_name(values: Mapping[str, float], controls: Sequence[ExpressionControl], rest: HeadParams) -> HeadParams:
-    """`posed` by the names of expressions, in any style of writing, and of joints.
+def posed_by_name(
+    values: Mapping[str, float], controls: Sequence[ExpressionControl], rest: HeadParams, fixed: Collection[str] = ()
+) -> HeadParams:
+    """`posed` by the names of expressions, in any style of writing, and of joints other than those that are `fixed`.
 
     Raises UserError for another name, with those that there are.
     """
     known = {plain(c.name): c for c in reversed(controls)} | {plain(f"{c.part} {c.name}"): c for c in controls}
-    joints = {name: value for name, value in values.items() if name in JOINTS}
-    expressions = {name: value for name, value in values.items() if name not in JOINTS}
+    own = [name for name in JOINTS if name not in fixed]
+    joints = {name: value for name, value in values.items() if name in own}
+    expressions = {name: value for name, value in values.items() if name not in own}
     for name in expressions:
         if plain(name) not in known:
-            names = [*JOINTS, *(re.sub(r"\W+", "_", f"{c.part} {c.name}".lower()).strip("_") for c in controls)]
+            names = [*own, *(re.sub(r"\W+", "_", f"{c.part} {c.name}".lower()).strip("_") for c in controls)]
             raise UserError(f"this avatar has no {name}; it has {', '.join(names)}")
     return posed(rest, {known[plain(name)]: value for name, value in expressions.items()}, joints)
+
+
+def fixed_controls(fixed_joints: Collection[str]) -> set[str]:
+    """Those of JOINTS that turn joints of a head model of which no vertex follows them."""
+    joints_of = {"jaw": {"jaw"}, "look_down": set(EYES), "look_left": set(EYES)}
+    return {name for name, joints in joints_of.items() if joints.issubset(fixed_joints)}
 
 
 def turned(about_x: float, about_y: float) -> Float[Tensor, 6]:

@@ -75,6 +75,8 @@ def parse_table(path: Path, data: bytes) -> Table:
     if len(lines) < 2:
         raise UserError(f"{path} needs a line of column names and at least one frame")
     names = lines[0][1]
+    if all(map(_is_number, filter(None, names))):
+        raise UserError(f"{path}, line {lines[0][0]} holds numbers: the first line must name the columns")
     if double := [name for name, count in Counter(map(plain, filter(None, names))).items() if count > 1]:
         raise UserError(f"{path} has two columns of the name {double[0]}")
     width = max(i for i, name in enumerate(names, start=1) if name)
@@ -89,6 +91,14 @@ def parse_table(path: Path, data: bytes) -> Table:
         not name and any(row[i : i + 1] not in ([], [""]) for _, row in lines[1:]) for i, name in enumerate(names)
     )
     return Table(path, header, rows, [number for number, _ in lines[1:]], _decimal_commas(rows), unnamed)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return _WITH_COMMA.fullmatch(cell) is not None
+    return True
 
 
 def _parse(text: str) -> list[tuple[int, list[str]]]:

@@ -8,6 +8,7 @@ Nothing in a drive file can execute code.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from avatar.motion.drive_times import BOUNDS
 from avatar.types import IDENTITY_6D, Camera, HeadParams
 
 MAX_FRAMES = 1_000_000
+MOST_TURN = math.pi * (1 + 1e-5)  # radians of a rotation vector
 CAMERA_KEYS = ("R", "t", "K", "size")
 FLAME_KEYS = {
     "expr": "expression",
@@ -50,10 +52,11 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     arrays = read_arkit(path, assets.num_expressions, assets.names, say) if read_arkit else load_npz(path)
     if "expression" not in arrays:
         arrays = _renamed(path, arrays)
-    unknown = sorted(set(arrays) - set(KEYS))
     if "expression" not in arrays:
-        raise UserError(f"{path} holds no expression (it holds {', '.join(unknown) or 'nothing'}); see docs/reenact.md")
-    if unknown:
+        raise UserError(
+            f"{path} holds no expression (it holds {', '.join(sorted(arrays)) or 'nothing'}); see docs/reenact.md"
+        )
+    if unknown := sorted(set(arrays) - set(KEYS)):
         say(f"Note: {path.name} also holds {', '.join(unknown)}, which a drive file does not have; left unread")
     fingerprint = _text(path, arrays, "head")
     if fingerprint and fingerprint != assets.fingerprint:
@@ -77,6 +80,8 @@ def read_drive(path: Path | str, assets: HeadAssets, width: int, say: Callable[[
     jaw = _rotations(path, arrays, "jaw", T, 1)
     eyes = _rotations(path, arrays, "eyes", T, 2)
     neck = _rotations(path, arrays, "neck", T, 1)
+    if "jaw" in assets.fixed_joints and bool((jaw - torch.tensor(IDENTITY_6D)).abs().amax() > 1e-4):
+        say(f"Warning: {path.name} turns the jaw, but no vertex of the avatar's head model follows its jaw")
     eyelids = _numbers(path, arrays, "eyelids", (T, 2)) if "eyelids" in arrays else torch.zeros(T, 2)
     fps = float(_numbers(path, arrays, "fps", ())) if "fps" in arrays else DEFAULT_FPS
     if not BOUNDS[0] <= fps <= BOUNDS[1]:
@@ -147,7 +152,14 @@ def _rotations(path: Path, arrays: Mapping[str, np.ndarray], key: str, T: int, c
         return torch.tensor(IDENTITY_6D).repeat(T, count)
     values = _numbers(path, arrays, key, (T, None))
     if values.shape[1] == 3 * count:
-        return axis_angle_to_rotation_matrix(values.reshape(-1, 3))[:, :2].reshape(T, 6 * count)
+        vectors = values.reshape(-1, 3)
+        if bool((large := vectors.norm(dim=1) > MOST_TURN).any()):
+            row = int(large.int().argmax())
+            raise UserError(
+                f"{path}: {key} of frame {row // count} turns by {float(vectors[row].norm()):.3g} radians, more than half "
+                "a turn; give radians, not degrees"
+            )
+        return axis_angle_to_rotation_matrix(vectors)[:, :2].reshape(T, 6 * count)
     if values.shape[1] != 6 * count:
         raise UserError(
             f"{path}: {key} has {values.shape[1]} values a frame; {3 * count} (rotation vectors) or {6 * count} "

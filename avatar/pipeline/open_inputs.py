@@ -16,6 +16,7 @@ from avatar.motion.drive_file import read_drive
 from avatar.runs.run import Run, RunInfo, read_run_info
 from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 from data_prep.prepare.open_subject import find_head, open_subject
+from data_prep.prepare.pairing import TooManyLeftOut
 from data_prep.prepare.wrong_inputs import check_folder
 
 DRIVE_SUFFIXES = (".npz", ".csv", ".json")
@@ -44,9 +45,13 @@ def open_run(
     info = read_run_info(path)
     source = moved_source(path, info, head, folder)
     trained = load_avatar(path, head, recorded_head=source.head)
-    subject, _ = open_subject(
-        source, trained.config.data.test_frames, say, trained.assets, trained.config.data.test_cameras
-    )
+    data = trained.config.data
+    try:
+        subject, _ = open_subject(source, data.test_frames, say, trained.assets, data.test_cameras)
+    except TooManyLeftOut as error:
+        raise UserError(
+            f"{error.problem}; the data is not what {path} was trained on: restore it, or train again"
+        ) from None
     check_data(path, info, subject)
     return Run(path, trained, subject)
 

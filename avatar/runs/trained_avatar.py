@@ -18,13 +18,13 @@ from avatar.files.environment import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets, load_head_assets
-from avatar.motion.controls import expression_controls, posed_by_name
+from avatar.motion.controls import expression_controls, fixed_controls, posed_by_name
 from avatar.motion.neutral_pose import RestPose
 from avatar.motion.orbit import orbited
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_avatar_file
-from avatar.runs.inputs import checked_camera, checked_params
+from avatar.runs.inputs import check_turn, checked_camera, checked_params, checked_size
 from avatar.splat import checked_drawings
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
 
@@ -73,7 +73,9 @@ class TrainedAvatar:
         return learn_statistics(self.recording.motion(self.recording.split.train), self.avatar.head, self.neutral)
 
     def rest_camera(self, size: int | None = None) -> Camera:
-        """The camera of the neutral face, `size` pixels wide; by default as in training."""
+        """The camera of the neutral face, `size` pixels wide; by default as in training. Raises UserError for a size that
+        is no whole number of pixels."""
+        size = checked_size(size)
         train = self.recording.moments(self.recording.split.train)
         return self.recording.reference_camera(
             train[self.neutral.frame or 0], self.config.data.size if size is None else size
@@ -109,12 +111,15 @@ class TrainedAvatar:
         of the torso, lean and turn in radians, left_lid and right_lid from 0 to 1. The head is
         turned by `yaw` and `pitch` degrees.
 
-        Raises UserError, with the names that there are, for another name, and as `render`.
+        Raises UserError, with the names that there are, for another name and for a joint that moves no vertex of the head
+        model; for a size, turn or zoom of no picture; and as `render`.
         """
+        check_turn(yaw, pitch, zoom)
         train = self.recording.times(self.recording.split.train)
         rest = self.rest_params()
         expressions = self.recording.tracks["expression"][train]
-        params = posed_by_name(values, expression_controls(expressions, rest.expression, self.avatar.head), rest)
+        controls = expression_controls(expressions, rest.expression, self.avatar.head)
+        params = posed_by_name(values, controls, rest, fixed_controls(self.assets.fixed_joints))
         return self.render(params, orbited(self.rest_camera(size), yaw, pitch, zoom))
 
     def _repr_png_(self) -> bytes:

@@ -26,12 +26,20 @@ class Pairing:
     notes: list[str]
 
 
+class TooManyLeftOut(UserError):
+    """More frames are unusable than --max-left-out allows; `problem` is the sentence without that advice."""
+
+    def __init__(self, problem: str, advice: str) -> None:
+        super().__init__(f"{problem}{advice}")
+        self.problem = problem
+
+
 def refuse_if_many(bad: Mapping[int, str], total: int, what: str, share: float) -> None:
-    """Raise UserError when more than `share` of `total` are bad: then something is wrong with the whole."""
+    """Raise TooManyLeftOut when more than `share` of `total` are bad: then something is wrong with the whole."""
     if len(bad) > share * total:
-        raise UserError(
-            f"{len(bad)} of {total} {what} cannot be used, more than {share:.0%}: {describe_reasons(bad)}; mend them, or "
-            "allow more with --max-left-out"
+        raise TooManyLeftOut(
+            f"{len(bad)} of {total} {what} cannot be used, more than {share:.0%}: {describe_reasons(bad)}",
+            "; mend them, or allow more with --max-left-out",
         )
 
 
@@ -123,10 +131,10 @@ def _refuse_if_unpaired(files: FrameFiles, paired: int, offset: int, share: floa
     for kind, found in (("images", files.images), ("tracking frames", files.tracking)):
         unpaired = len(found) - paired
         if unpaired > max(share * len(found), RADIUS):
-            raise UserError(
+            raise TooManyLeftOut(
                 f"{unpaired} of {len(found)} {kind} have no partner under offset {offset}: images are "
-                f"{_range(files.images)}, tracking is {_range(files.tracking)}; are they of the same video? If so, allow "
-                "more with --max-left-out"
+                f"{_range(files.images)}, tracking is {_range(files.tracking)}",
+                "; are they of the same video? If so, allow more with --max-left-out",
             )
 
 

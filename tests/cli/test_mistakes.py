@@ -34,8 +34,8 @@ MISTAKES = {
     "no head model": (["train", "{bare}"], "no head model for {bare}: give --head PATH, or set AVATAR_HEAD"),
     "head model gone": (["train", "{data}", "--head", "{tmp}/x.pkl"], "x.pkl does not exist; give --head"),
     "unknown key": (["train", "{data}", "trainer.iteration=5"], "the nearest is 'trainer.iterations'"),
-    "bad size": (["train", "{data}", "--size", "3"], "data.size=3 is out of range"),
-    "no iterations": (["train", "{data}", "--iterations", "0"], "trainer.iterations=0 is out of range"),
+    "bad size": (["train", "{data}", "--size", "3"], "--size=3 is out of range"),
+    "no iterations": (["train", "{data}", "--iterations", "0"], "--iterations=0 is out of range"),
     "run exists": (["train", "{data}", "--out", "{run}"], "holds a run already: add --resume"),
     "nothing to resume": (["train", "{data}", "--out", "{tmp}/new", "--resume"], "is not a run folder"),
     "resume with another key": (
@@ -151,3 +151,7 @@ def test_data_that_changed_since_training_is_noticed(tmp_path: Path) -> None:
     image = folder / "imgs" / "00003.jpg"
     image.write_bytes((folder / "imgs" / "00004.jpg").read_bytes())
     assert "the data of someone is not what" in avatar("eval", run, status=1)
+    for number in range(4, 9):
+        (folder / "imgs" / f"{number:05d}.jpg").unlink()
+    gone = avatar("eval", run, status=1)
+    assert f"the data is not what {run} was trained on: restore it" in gone and "--max-left-out" not in gone

@@ -222,7 +222,7 @@ def test_paths_stay_where_the_training_video_was(trained: TrainedAvatar) -> None
     limits = limits_of(trained)
     rest = trained.rest_camera()
     own = seen_from(rest)
-    turns = [seen_from(path_camera(rest, limits, "turntable", s / 10)).yaw - own.yaw for s in range(60)]
+    turns = [seen_from(path_camera(rest, limits, "swing", s / 10)).yaw - own.yaw for s in range(60)]
     assert min(turns) == pytest.approx(-limits.yaw[1], abs=0.2) and max(turns) == pytest.approx(-limits.yaw[0], abs=0.2)
     assert max(turns) - min(turns) > 4
     heights = [path_camera(rest, limits, "orbit", s / 10) for s in range(60)]
@@ -236,7 +236,7 @@ def test_the_command_writes_videos(run: Path, tracked_folder: Path, tmp_path: Pa
     avatar("export", run, "--out", out, "--motion", "all", "--size", 64)
     recorded = iio.imread(out)
     assert recorded.shape == (30, 64, 64, 3)
-    avatar("export", run, "--out", out, "--motion", "all", "--size", 64, "--camera", "turntable")
+    avatar("export", run, "--out", out, "--motion", "all", "--size", 64, "--camera", "swing")
     turned = iio.imread(out)
     assert turned.shape == recorded.shape and np.abs(turned.astype(int) - recorded).mean() > 1
     csv = tmp_path / "drive.csv"

@@ -70,10 +70,26 @@ def test_little_is_enough_and_short_vectors_are_padded_aloud(tmp_path: Path) -> 
     assert read(npz(tmp_path / "long.npz", expression=long))[0].params[0].expression.tolist() == [1, 0, 0, 0, 0]
 
 
+def test_a_jaw_that_no_vertex_follows_is_said(tmp_path: Path) -> None:
+    weights = ASSETS.weights.clone()
+    weights[:, 0] += weights[:, 2]
+    weights[:, 2] = 0.0
+    fixed = replace(ASSETS, weights=weights, pose_dirs=torch.zeros_like(ASSETS.pose_dirs))
+    assert "jaw" in fixed.fixed_joints and "jaw" not in ASSETS.fixed_joints
+    turned = npz(tmp_path / "d.npz", expression=FINE, jaw=[[0, 0, 0], [0.2, 0, 0]])
+    still = npz(tmp_path / "still.npz", expression=FINE, jaw=np.zeros((2, 3)))
+    for assets, path, warns in ((fixed, turned, True), (fixed, still, False), (ASSETS, turned, False)):
+        said: list[str] = []
+        read_drive(path, assets, 64, said.append)
+        assert any("no vertex of the avatar's head model follows its jaw" in line for line in said) == warns
+
+
 FINE = np.zeros((2, EXPRESSIONS))
 CAMERA = {"R": np.tile(np.eye(3), (2, 1, 1)), "t": np.ones((2, 3)), "K": np.eye(3), "size": [64, 64]}
 BAD = {
     "nothing": ({"x": FINE}, "holds no expression (it holds x)"),
+    "jaw alone": ({"jaw": np.zeros((2, 3))}, "holds no expression (it holds jaw)"),
+    "degrees": ({"expression": FINE, "jaw": [[0, 0, 0], [20, 0, 0]]}, "jaw of frame 1 turns by 20 radians"),
     "no frame": ({"expression": np.zeros((0, 5))}, "has 0 frames"),
     "flat": ({"expression": np.zeros(5)}, "expression has shape [5], expected [any, any]"),
     "text": ({"expression": np.array([["a"]])}, "expression holds <U1 values, not real numbers"),
@@ -143,6 +159,7 @@ BAD_CSV = {
     "empty": ("", "needs a line of column names and at least one frame"),
     "no frame": ("expression_0\n", "needs a line of column names and at least one frame"),
     "no expression": ("a,b\n1,2\n", "has no column expression_0"),
+    "no names": ("\n0,0,0.5\n1,1,0.25\n", "line 2 holds numbers: the first line must name the columns"),
     "ragged": ("expression_0,expression_1\n1\n", "line 2: 1 values for 2 columns"),
     "text": ("expression_0\n1\nx\n", "line 3: expression_0 is 'x', not a finite number"),
     "infinite": ("expression_0\ninf\n", "line 2: expression_0 is 'inf'"),

@@ -87,9 +87,30 @@ def test_a_stream_of_something_else_is_refused(anna: TrainedAvatar) -> None:
 
 def test_the_cameras_width_is_a_whole_number_of_pixels(anna: TrainedAvatar) -> None:
     for size in (0, -1, 1.5):
-        with pytest.raises(ValueError, match=f"size must be .* pixels?, got {size}"):
+        with pytest.raises(UserError, match=f"size is {size}: give a whole number of pixels"):
             anna.rest_camera(size)  # type: ignore[arg-type]
     assert anna.rest_camera(64).width == 64
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"size": 0}, {"zoom": 0}, {"zoom": -1.0}, {"zoom": NAN}, {"yaw": INF}, {"pitch": "up"}]
+)
+def test_a_pose_that_is_no_picture_names_the_value(wrong: dict[str, Any], anna: TrainedAvatar) -> None:
+    with pytest.raises(UserError, match=f"^{next(iter(wrong))} is "):
+        anna.pose(**wrong)
+
+
+def test_a_joint_that_moves_no_vertex_is_no_pose(anna: TrainedAvatar) -> None:
+    assets = anna.assets
+    weights = assets.weights.clone()
+    weights[:, 0] += weights[:, 2]
+    weights[:, 2] = 0.0
+    fixed = replace(assets, weights=weights, pose_dirs=torch.zeros_like(assets.pose_dirs))
+    anna.pose(jaw=0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(anna.avatar.head, "assets", fixed)
+        with pytest.raises(UserError, match="this avatar has no jaw; it has look_down"):
+            anna.pose(jaw=0.1)
 
 
 def test_an_avatar_is_shown_in_one_line(anna: TrainedAvatar) -> None:
