@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.stats import trim_mean
 from torch import Tensor
 
 from avatar.pose_refinement.tracking_values import NECK, POSE, SHIFT, TURN, Tracks, accelerations, values_of
@@ -71,6 +70,8 @@ class PoseParameterization:
         """
         if not frames.any():
             return moves
+        from scipy.stats import trim_mean  # takes half a second to import
+
         common = torch.from_numpy(trim_mean(moves[frames].numpy(), EXTREMES, axis=0))
         return moves - torch.where(self.index < POSE.stop, common, 0.0)
 
