@@ -105,7 +105,7 @@ def _irises(value: float | None) -> list[Figure]:
 def _of_outline(outline: Outline | None) -> list[Figure]:
     if outline is None:
         return []
-    advice = "light the background evenly, or give mattes with --matte"
+    advice = "light the background evenly, film the face larger, or give mattes with --matte"
     return [
         Figure("jitter of the outline, at 512", outline.jitter, "px", 0.5, 1.0, advice),
         Figure("width of the matte's edge, at 512", outline.width, "px"),
