@@ -10,7 +10,6 @@ import sys
 import time
 import webbrowser
 from argparse import Namespace
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +24,7 @@ from avatar.config import Config, load_config
 from avatar.data.split import split_frames
 from avatar.errors import UserError
 from avatar.export.web_page import write_page
-from avatar.files.names import RUN_FOLDER, SUBJECT_FOLDER, safe_name
+from avatar.files.names import RUN_FOLDER, SUBJECT_FOLDER
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import head_for_video, progress_bar, tracking_lacks
@@ -83,8 +82,8 @@ def run_create(arguments: Namespace) -> int:
         print("Start the same command again to go on.")
         return status
     say_stage(4, "the avatar is measured, and its page written")
-    results, trained = evaluate_or_read(paths.run), open_trained(paths.run)
-    write_page(replace(trained, recording=replace(trained.recording, name=safe_name(video.stem))), paths.page)
+    results = evaluate_or_read(paths.run)
+    write_page(open_trained(paths.run), paths.page)
     print(f"Held-out frames: {figures_line(results)}")
     print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {paths.page}, the avatar in a browser.")
     print(f"  {paths.subject / 'overlay'}   the tracked mesh on the video")
@@ -175,7 +174,7 @@ def judge_tracking(info: TrackingInfo, subject: Path, anyway: bool) -> None:
     print(
         f"{', '.join(counts)} of {len(judged)} figures; look at {subject / 'overlay'}: does the mesh lie on the face?"
     )
-    print(f"Warnings about frames, masks and light do not stop the training: avatar check {subject} shows them")
+    print(f"Frames, masks and light: avatar check {subject} shows warnings, which do not stop the training")
     figures = [
         f"{figure['name'].replace('  of', 'landmark error of')}: {figure['value']:.4g} {figure['unit']}".rstrip()
         + (f" -> {figure['advice']}" if figure["advice"] else "")

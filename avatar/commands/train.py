@@ -16,7 +16,7 @@ from avatar.config_values import shown
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.lock import locked
-from avatar.files.names import ROUNDS_FOLDER, safe_name
+from avatar.files.names import ROUNDS_FOLDER, display_name, safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import cached_tracking, head_for_video, is_video
 from avatar.pipeline.dry_run import estimate_training
@@ -191,7 +191,8 @@ def asked_device(overrides: list[str]) -> str | None:
 def default_run(folder: Path | None) -> Path:
     if folder is None:
         raise UserError("say which run to go on with: avatar train --resume RUN")
-    return Path("runs") / safe_name(folder.resolve().stem if folder.is_file() else folder.resolve().name)
+    folder = folder.resolve()
+    return Path("runs") / safe_name(folder.stem if folder.is_file() else display_name(folder))
 
 
 def config_overrides(arguments: Namespace) -> list[str]:

@@ -29,7 +29,7 @@ def shortened(name: str) -> str:
     return f"{data[: MAX_NAME_BYTES - 9].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
 
 
-def telling_path(folder: Path) -> Path:
+def display_path(folder: Path) -> Path:
     """The end of an absolute path that begins with a name a person gave: `me/run` of what `avatar create` made in `me`."""
     parts = folder.parts
     first = len(parts) - 1
@@ -38,8 +38,8 @@ def telling_path(folder: Path) -> Path:
     return Path(*parts[first:])
 
 
-def telling_name(folder: Path) -> str:
-    return next(iter(telling_path(folder).parts), "")
+def display_name(folder: Path) -> str:
+    return next(iter(display_path(folder).parts), "")
 
 
 def natural_order(name: str) -> tuple[Any, ...]:

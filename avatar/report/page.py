@@ -13,7 +13,7 @@ from avatar.errors import check_installed
 from avatar.evaluation.compare import read_evaluation
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
-from avatar.files.names import RUN_FOLDER, telling_name, telling_path
+from avatar.files.names import RUN_FOLDER, display_name, display_path
 from avatar.files.read import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.document import Content
@@ -62,7 +62,7 @@ def render_report(run: Run) -> str:
     is_measured = is_there(run.path / "eval" / "results.json")
     results = read_evaluation(run.path.name, run.path).results if is_measured else None
     facts = {
-        "subject": telling_name(Path(run.subject.manifest.source)),
+        "subject": run.subject.name,
         "method": run.config.model.name,
         "perceptual term": run.trained.perceptual,
         "Gaussians": f"{len(run.avatar):,}",
@@ -71,7 +71,7 @@ def render_report(run: Run) -> str:
         "held-out frames": len(run.subject.split.test),
     }
     folder, link = run.path.resolve(), ""
-    title = f"Run {telling_name(folder)}"
+    title = f"Run {display_name(folder)}"
     if folder.name == RUN_FOLDER and is_there(folder.parent / PAGE):  # as avatar create and demo lay them out
         link = element("p", element("a", "The avatar in its page", href=f"../{PAGE}"))
     parts = [
@@ -171,7 +171,7 @@ def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
     mark = f" {MARK}" if is_marked(tracking) else ""
     shown.append(means_table(protocols, mark))
     kind = "finding warning" if tracking["rounds"] else "soft"
-    rounds = [{**one, "run": telling_path(Path(one["run"]))} for one in tracking["rounds"]]
+    rounds = [{**one, "run": display_path(Path(one["run"]))} for one in tracking["rounds"]]
     shown += [element("p", line, class_=kind) for line in tracking_lines({**tracking, "rounds": rounds})]
     networks = dict.fromkeys(entry["lpips"]["note"] for entry in protocols.values())
     shown += [element("p", f"LPIPS: {note}", class_="soft") for note in networks]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.files.names import telling_name
+from avatar.files.names import display_name
 from avatar.html import Markup, document, element, fold, join, picture, section, tiles
 from avatar.version import __version__
 from data_prep.check.clip import Clip
@@ -39,7 +39,7 @@ def write_page(check: Check, out: Path) -> Path:
 
 
 def render_page(check: Check) -> str:
-    title, badge = f"Check of {telling_name(check.folder.resolve())}", _BADGES[check.status]
+    title, badge = f"Check of {display_name(check.folder.resolve())}", _BADGES[check.status]
     verdict = element("a", check.summary(), href="#findings") if check.findings else check.summary()
     header = element(
         "header",

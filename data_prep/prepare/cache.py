@@ -9,14 +9,14 @@ from pathlib import Path
 
 from avatar.data.manifest import MANIFEST_VERSION
 from avatar.files.environment import cache_folder
-from avatar.files.names import safe_name
+from avatar.files.names import display_name, safe_name
 from data_prep.formats.frame_files import FrameFiles
 
 
 def default_location(folder: Path, files: FrameFiles, options: dict[str, object]) -> Path:
     tracking = next(iter(files.tracking.values())).parent
     key = hashlib.sha256(json.dumps([str(folder), str(tracking), options], allow_nan=False).encode()).hexdigest()[:12]
-    return cache_folder() / "subjects" / f"{safe_name(folder.name)}-{key}"
+    return cache_folder() / "subjects" / f"{safe_name(display_name(folder))}-{key}"
 
 
 def input_hash(files: FrameFiles, options: Mapping[str, object]) -> str:

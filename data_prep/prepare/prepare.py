@@ -14,7 +14,7 @@ import torch
 from avatar.data.manifest import GIVEN, MASKS, FrameRecord, Manifest
 from avatar.data.source import DEFAULT_FPS, MAX_FPS, Source
 from avatar.errors import UserError, refuse
-from avatar.files.names import safe_name
+from avatar.files.names import display_name, safe_name
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.formats.detect import open_tracked_folder
@@ -146,7 +146,7 @@ def prepare(
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
     mouth_kind = "source" if files.mouth_masks else "derived" if files.parsing or has_lips else "none"
     manifest = Manifest(
-        name=safe_name(folder.name),
+        name=safe_name(display_name(folder)),
         format=tracked.format,
         source=str(files.folder),
         tracking=str(next(iter(files.tracking.values())).parent),

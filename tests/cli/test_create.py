@@ -109,7 +109,7 @@ def test_one_command_makes_the_page_and_again_does_nothing_twice(
     assert "Stage 2 of 4" in stopped and "Stage 3" not in stopped and "1 good, 0 fair, 1 poor of 2 figures" in stopped
     assert "frames with a face: 50 % -> light the face" in stopped and "--anyway" in stopped
     output = avatar(*words, "--anyway", "--open")
-    assert "do not stop the training: avatar check me/subject shows them" in output
+    assert "avatar check me/subject shows warnings" in output
     page = video.parent / "me" / "avatar.html"
     assert "poor: frames with a face: 50 %" in output and "There is no desktop here" in output
     assert "Stage 4 of 4" in output and "Done in" in output and "Round" not in output
@@ -207,7 +207,7 @@ MOMENTS = (
 
 @pytest.mark.slow
 def test_killed_again_and_again_it_makes_the_same_page(video: Path, tracked_folder: Path) -> None:
-    out, whole, log = video.parent / "killed", video.parent / "whole", video.parent / "log.txt"
+    out, whole, log = video.parent / "killed" / "me", video.parent / "whole" / "me", video.parent / "log.txt"
     command = [sys.executable, "-c", SCRIPT, str(tracked_folder), str(video)]
     with (
         log.open("w") as said,

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from avatar.files.names import telling_name, telling_path
+from avatar.files.names import display_name, display_path
 
 
 @pytest.mark.parametrize(
-    ("folder", "told"),
+    ("folder", "expected"),
     [
         ("/films/me/subject", "me/subject"),
         ("/films/me/run", "me/run"),
@@ -23,7 +23,7 @@ from avatar.files.names import telling_name, telling_path
         ("/", "/"),
     ],
 )
-def test_the_end_of_a_path_begins_with_a_name_that_a_person_gave(folder: str, told: str) -> None:
-    assert telling_path(Path(folder)) == Path(told)
-    assert telling_name(Path(folder)) == Path(told).parts[0]
-    assert telling_name(Path()) == ""
+def test_the_end_of_a_path_begins_with_a_name_that_a_person_gave(folder: str, expected: str) -> None:
+    assert display_path(Path(folder)) == Path(expected)
+    assert display_name(Path(folder)) == Path(expected).parts[0]
+    assert display_name(Path()) == ""
