@@ -29,12 +29,13 @@ from avatar.view.view_renderer import Setting, ViewOffset, ViewRenderer
 
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 FRAMES, SIZE, SECONDS, MIB = 20, 256, 6, 2**20
-SETTLED = """() => new Promise(done => {
-  let timer;
+# Shows the picture at a time: nothing has been drawn for 0.4 s after it, or for 5 s where it was there already.
+SEEK = """seconds => new Promise(done => {
   const rest = () => { avatar.removeEventListener("drawn", wait); done(); };
+  let timer = setTimeout(rest, 5000);
   const wait = () => { clearTimeout(timer); timer = setTimeout(rest, 400); };
   avatar.addEventListener("drawn", wait);
-  wait();
+  avatar.seek(seconds);
 })"""
 
 
@@ -54,8 +55,7 @@ def fitter(page: Any, trained: TrainedAvatar) -> tuple[float, float]:
     found = []
     for k in range(FRAMES):
         frame = k * len(test) // FRAMES
-        page.evaluate(f"avatar.seek({frame} / avatar.header.fps)")
-        page.evaluate(SETTLED)
+        page.evaluate(SEEK, frame / page.evaluate("avatar.header.fps"))
         data = page.evaluate("avatar.screenshot().then(b => b.arrayBuffer()).then(b => Array.from(new Uint8Array(b)))")
         picture = iio.imread(io.BytesIO(bytes(data)))[..., :3].astype(np.float64)
         index = test[frame]
