@@ -134,19 +134,21 @@ def read_listings(folder: Path) -> list[ListedFrame]:
 
 
 def numbered(frames: Sequence[ListedFrame]) -> dict[int, ListedFrame]:
-    """The frames by number, from 0. A number is missing between two folders of images, which are two sequences, and where
-    the numbers in the images' names skip more than they usually do."""
-    found: dict[int, ListedFrame] = {}
-    number = -1
-    for _, group in groupby(frames, key=lambda frame: frame.image.parent):
-        inside = list(group)
-        steps = [after - before for before, after in pairwise(_name_numbers([frame.image.stem for frame in inside]))]
+    """The frames by number, from 0, with gaps as in `spaced`."""
+    return dict(zip(spaced([frame.image for frame in frames]), frames, strict=True))
+
+
+def spaced(files: Sequence[Path]) -> list[int]:
+    """Numbers of files, from 0. A number is missing between two folders, which are two sequences, and where the numbers in
+    the files' names skip more than they usually do."""
+    found: list[int] = []
+    for _, group in groupby(files, key=lambda file: file.parent):
+        names = _name_numbers([file.stem for file in group])
+        steps = [after - before for before, after in pairwise(names)]
         usual = median(steps) if steps else 0
-        number += 2 if found else 1
-        found[number] = inside[0]
-        for frame, step in zip(inside[1:], steps, strict=True):
-            number += 2 if step > usual else 1
-            found[number] = frame
+        found.append(found[-1] + 2 if found else 0)
+        for step in steps:
+            found.append(found[-1] + (2 if step > usual else 1))
     return found
 
 

@@ -27,6 +27,7 @@ import numpy as np
 
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
+from avatar.files.names import natural_order
 from avatar.files.pickles import load_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK, ROOT
@@ -43,6 +44,7 @@ from data_prep.formats.transforms import (
     is_union,
     numbered,
     pinhole,
+    spaced,
 )
 
 NAME = "VHAP"
@@ -190,15 +192,10 @@ def _shots(listed: dict[int, ListedFrame], parameters: dict[int, Path]) -> dict[
     """
     if len({_camera(frame) for frame in listed.values()}) == 1:
         return {}
-    time, times, seen = -1, {}, {}
+    times, seen = _times(parameters), {}
     shots: dict[int, Shot] = {}
-    before: Path | None = None
     for number, frame in listed.items():
         path = parameters[number]
-        if path not in times:
-            time += 1 if before is None or path.parent == before.parent else 2  # another sequence
-            times[path] = time
-            before = path
         shot = Shot(_camera(frame), times[path])
         if shot in seen:
             raise UserError(
@@ -208,6 +205,14 @@ def _shots(listed: dict[int, ListedFrame], parameters: dict[int, Path]) -> dict[
         seen[shot] = number
         shots[number] = shot
     return shots
+
+
+def _times(parameters: dict[int, Path]) -> dict[Path, int]:
+    """The time of each parameter file: sequences as they come, the files of one in the order of their names."""
+    files = dict.fromkeys(parameters.values())
+    folders = {folder: place for place, folder in enumerate(dict.fromkeys(file.parent for file in files))}
+    ordered = sorted(files, key=lambda file: (folders[file.parent], natural_order(file.name)))
+    return dict(zip(ordered, spaced(ordered), strict=True))
 
 
 def _one_identity(tracking: Tracking) -> Tracking:

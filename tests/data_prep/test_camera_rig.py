@@ -153,6 +153,32 @@ def test_a_union_joins_sequences_of_other_worlds(tmp_path: Path) -> None:
     assert subject.frame(0).image.shape == (56, 64, 3)
 
 
+def test_a_time_that_is_missing_is_no_neighbour(single: Path, tmp_path: Path) -> None:
+    folder = edited(single, tmp_path / "copy", lambda entry: entry["timestep_index"] != 2)
+    subject, _ = opened(folder, tmp_path / "out")
+    assert sorted({record.tracking for record in subject.manifest.frames}) == [0, 1, 3, 4, 5]
+
+
+def test_times_are_in_order_where_a_camera_lacks_one(single: Path, tmp_path: Path) -> None:
+    """With a folder for each camera, whose pictures come one camera after the other."""
+
+    def by_camera(entry: dict[str, Any]) -> bool:
+        camera, time = entry["camera_id"], entry["timestep_index"]
+        path = folder / "images" / camera / f"{time:05d}.png"
+        path.parent.mkdir(exist_ok=True)
+        shutil.copy(folder / entry["file_path"], path)
+        entry["file_path"] = f"images/{camera}/{path.name}"
+        return (camera, time) != ("07", 1)
+
+    folder = tmp_path / "copy" / single.name
+    edited(single, tmp_path / "copy", by_camera)
+    subject, _ = opened(folder, tmp_path / "out", test_frames=1)
+    for record in subject.manifest.frames:
+        assert record.tracking == int(record.name[-5:])
+    recording = subject.recording
+    assert {recording.names[i] for i in recording.split.test} == {f"images_{name}_00005" for name in AZIMUTHS}
+
+
 def edited(folder: Path, copy: Path, edit: Any) -> Path:
     """The folder with every listed entry of every listing edited; paths stay where they were."""
     shutil.copytree(folder.parent, copy)
