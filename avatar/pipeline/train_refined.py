@@ -48,8 +48,9 @@ def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
             plan.save(run)
             if status != OK:
                 return status
-        # The folder knows its tracking, numbers and rate; what was let pass in the first is let pass in it.
-        source = replace(source, folder=stage / name, tracking=None, frame_offset=None, data_format=None, fps=None)
+        # The folder knows its tracking, numbers, rate and cameras; what was let pass in the first is let pass in it.
+        known = dict.fromkeys(("tracking", "frame_offset", "data_format", "fps", "cameras"))
+        source = replace(source, folder=stage / name, **known)
     status = continue_or_begin(source, plan.final_overrides(), run)
     plan = replace(plan, spent=time.monotonic() - begin)
     plan.save(run)
