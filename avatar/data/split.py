@@ -18,6 +18,10 @@ class Split(NamedTuple):
     train: tuple[int, ...]  # indices into the prepared subject, increasing
     test: tuple[int, ...]
 
+    def to_lists(self) -> list[list[int]]:
+        """As JSON has it."""
+        return [list(self.train), list(self.test)]
+
 
 def check_divided(split: Split) -> None:
     """Raises UserError for a subject of a single frame or time, which is enough to drive an avatar."""

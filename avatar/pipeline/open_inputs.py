@@ -53,6 +53,7 @@ def open_run(
             f"{error.problem}; the data is not what {path} was trained on: restore it, or train again"
         ) from None
     check_data(path, info, subject)
+    check_division(path, trained.recording.split.to_lists(), subject)
     return Run(path, trained, subject)
 
 
@@ -88,6 +89,16 @@ def check_data(path: Path, info: RunInfo, subject: Subject) -> None:
         raise UserError(
             f"the data of {subject.name} is not what {path} was trained on: it has changed, or is another video; restore "
             "it, or train again"
+        )
+
+
+def check_division(path: Path, split: object, subject: Subject) -> None:
+    """Raise UserError where the folder divides its frames otherwise than in the run's `Split.to_lists`: what was trained on
+    would be held out."""
+    if split != subject.split.to_lists():
+        raise UserError(
+            f"{subject.name} is divided into training and test frames otherwise than when {path} was trained: restore its "
+            "listing, or train again"
         )
 
 

@@ -21,7 +21,7 @@ from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.open_inputs import check_data, moved_source
+from avatar.pipeline.open_inputs import check_data, check_division, moved_source
 from avatar.runs.avatar_file import check_head
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.runs.memory_estimate import training_needs
@@ -72,6 +72,8 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, 
         subject, assets = open_subject(source, held_out.test_frames, test_cameras=held_out.test_cameras)
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
+        if "split" in checkpoint.meta:
+            check_division(run, checkpoint.meta["split"], subject)
         return continue_training(run, info, checkpoint, subject, assets, device)
 
 

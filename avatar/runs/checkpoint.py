@@ -38,7 +38,7 @@ class Checkpoint:
 
     step: int
     tensors: Mapping[str, Tensor]  # "model.*" and "optimizer.*"
-    meta: Mapping[str, Any]  # head_fingerprint, data_hash, config
+    meta: Mapping[str, Any]  # head_fingerprint, data_hash, split, config
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint, keep: int = KEPT) -> Path:

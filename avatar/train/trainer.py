@@ -75,6 +75,7 @@ def train(
     meta = {
         "head_fingerprint": avatar.head.assets.fingerprint,
         "data_hash": subject.data_hash,
+        "split": subject.split.to_lists(),
         "config": config.to_dict(),
         "perceptual": perceptual.name,
         "threads": torch.get_num_threads(),
