@@ -14,7 +14,7 @@ from avatar.data.colours import Colour
 from avatar.data.frame import Frame
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import ImageFormat
-from avatar.files.video import error_map, side_by_side
+from avatar.files.video import error_map, padded, side_by_side
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
 
@@ -46,12 +46,6 @@ def panel(
     render, truth = (image.cpu() / 255.0 if image.dtype == torch.uint8 else image.cpu() for image in pair)
     images = (truth, render, error_map(render, truth, ERROR_SCALE))
     return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"), rows)
-
-
-def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
-    """With white below and at the right."""
-    rows, columns = height - panel.shape[0], width - panel.shape[1]
-    return np.pad(panel, ((0, rows), (0, columns), (0, 0)), constant_values=255)
 
 
 def contact_sheet(panels: Sequence[UInt8[np.ndarray, "H W 3"]]) -> bytes:

@@ -170,6 +170,12 @@ def side_by_side(
     return np.concatenate(columns, axis=1)
 
 
+def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
+    """With white below and at the right."""
+    rows, columns = height - panel.shape[0], width - panel.shape[1]
+    return np.pad(panel, ((0, rows), (0, columns), (0, 0)), constant_values=255)
+
+
 def error_map(
     image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], full_scale: float
 ) -> Float[Tensor, "H W 3"]:

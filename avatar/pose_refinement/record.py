@@ -16,7 +16,7 @@ from torch import Tensor
 from avatar.data.recording import Recording
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
-from avatar.files.video import error_map, side_by_side
+from avatar.files.video import error_map, padded, side_by_side
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.refine_subject import Refined
 from avatar.render import Renderer
@@ -104,7 +104,9 @@ def sheet(
             "error after",
         )
         rows.append(side_by_side((truth, *renders, *errors), captions))
-    return cv2.imencode(".png", np.concatenate(rows)[..., ::-1])[1].tobytes()
+    width = max(row.shape[1] for row in rows)
+    filled = np.concatenate([padded(row, len(row), width) for row in rows])
+    return cv2.imencode(".png", filled[..., ::-1])[1].tobytes()
 
 
 def sheet_frames(test: Sequence[int], refined: Refined) -> list[int]:
