@@ -63,9 +63,11 @@ def _divide_shots(
     if held_out is None:
         held_out = {shot.camera for shot in shots} - trained if is_own else set()
     tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test" and shot.camera in trained}
-    notes = []
+    notes, unused = [], set()
     if is_own and (tested or ("test" in parts and held_out)):
-        notes.append("the folder's own division into training and test times is kept")
+        unused = set(times) - tested - {shot.time for shot, part in zip(shots, parts, strict=True) if part != "val"}
+        left = f" ({len(unused)} of validation are not used)" if unused else ""
+        notes.append(f"the folder's own division into training and test times is kept{left}")
     else:
         tested = {times[place] for place in split_frames(len(times), test_frames).test}
     if held_out == {shot.camera for shot in shots}:
@@ -75,11 +77,12 @@ def _divide_shots(
         notes.append(
             f"{'camera' if len(held_out) == 1 else 'cameras'} {names} {'is' if len(held_out) == 1 else 'are'} held out"
         )
-    train = [i for i, shot in enumerate(shots) if shot.time not in tested and shot.camera not in held_out]
+    used = [(i, shot) for i, shot in enumerate(shots) if shot.time not in unused]
+    train = [i for i, shot in used if shot.time not in tested and shot.camera not in held_out]
     seen = set(train)
     if not train:
         raise UserError("no picture is left to train on: every time or camera is held out")
-    return Split(tuple(train), tuple(i for i in range(len(shots)) if i not in seen)), notes
+    return Split(tuple(train), tuple(i for i, _ in used if i not in seen)), notes
 
 
 def chosen_cameras(

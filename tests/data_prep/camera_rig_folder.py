@@ -7,6 +7,7 @@ every camera's principal point is off the centre, and each sequence has a world 
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,12 @@ import numpy as np
 import torch
 from tracked_folder import SHAPE_COEFFICIENTS, motion, render, rotation, write_head_model
 
+from avatar.data.source import Source
+from avatar.data.subject import Subject
+from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from data_prep.formats.root_pose import rotation_matrix
+from data_prep.prepare.prepare import prepare
 
 WIDTH, HEIGHT, FOCAL = 64, 56, 160.0
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -172,3 +177,27 @@ def write_union(root: Path) -> Path:
     (folder / "sequences_trainval.txt").write_text("EMO\n")
     (folder / "sequences_test.txt").write_text("FREE\n")
     return folder
+
+
+def edited(folder: Path, copy: Path, edit: Any) -> Path:
+    """The folder with every listed entry of every listing edited; paths stay where they were."""
+    shutil.copytree(folder.parent, copy)
+    for listing in (copy / folder.name).glob("transforms_*.json"):
+        content = json.loads(listing.read_text())
+        content["frames"] = [entry for entry in content["frames"] if edit(entry) is not False]
+        listing.write_text(json.dumps(content))
+    return copy / folder.name
+
+
+def opened(folder: Path, out: Path, test_frames: int | None = None, test_cameras: str | None = None, **options: Any):
+    head = folder.parent / "head_model"
+    said: list[str] = []
+    prepared = prepare(
+        Source(folder, head, **options),
+        load_head_assets(head),
+        out=out,
+        test_frames=test_frames,
+        test_cameras=test_cameras,
+        say=said.append,
+    )
+    return Subject.open(prepared), said

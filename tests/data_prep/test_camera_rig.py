@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +10,23 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_rig_folder import AZIMUTHS, CENTRE, SEQUENCES, from_front, lens, write_single, write_union
+from camera_rig_folder import (
+    AZIMUTHS,
+    CENTRE,
+    SEQUENCES,
+    edited,
+    from_front,
+    lens,
+    opened,
+    write_single,
+    write_union,
+)
 from tracked_folder import motion
 
-from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
-from data_prep.prepare.prepare import prepare
-
-
-def opened(folder: Path, out: Path, test_frames: int | None = None, test_cameras: str | None = None, **options: Any):
-    head = folder.parent / "head_model"
-    said: list[str] = []
-    prepared = prepare(
-        Source(folder, head, **options),
-        load_head_assets(head),
-        out=out,
-        test_frames=test_frames,
-        test_cameras=test_cameras,
-        say=said.append,
-    )
-    return Subject.open(prepared), said
 
 
 @pytest.fixture(scope="module")
@@ -151,42 +144,6 @@ def test_a_union_joins_sequences_of_other_worlds(tmp_path: Path) -> None:
     numbers = sorted({record.tracking for record in subject.manifest.frames})
     assert numbers == [*range(times[0]), *range(times[0] + 1, sum(times) + 1)]  # no frame follows across the cut
     assert subject.frame(0).image.shape == (56, 64, 3)
-
-
-def test_a_time_that_is_missing_is_no_neighbour(single: Path, tmp_path: Path) -> None:
-    folder = edited(single, tmp_path / "copy", lambda entry: entry["timestep_index"] != 2)
-    subject, _ = opened(folder, tmp_path / "out")
-    assert sorted({record.tracking for record in subject.manifest.frames}) == [0, 1, 3, 4, 5]
-
-
-def test_times_are_in_order_where_a_camera_lacks_one(single: Path, tmp_path: Path) -> None:
-    """With a folder for each camera, whose pictures come one camera after the other."""
-
-    def by_camera(entry: dict[str, Any]) -> bool:
-        camera, time = entry["camera_id"], entry["timestep_index"]
-        path = folder / "images" / camera / f"{time:05d}.png"
-        path.parent.mkdir(exist_ok=True)
-        shutil.copy(folder / entry["file_path"], path)
-        entry["file_path"] = f"images/{camera}/{path.name}"
-        return (camera, time) != ("07", 1)
-
-    folder = tmp_path / "copy" / single.name
-    edited(single, tmp_path / "copy", by_camera)
-    subject, _ = opened(folder, tmp_path / "out", test_frames=1)
-    for record in subject.manifest.frames:
-        assert record.tracking == int(record.name[-5:])
-    recording = subject.recording
-    assert {recording.names[i] for i in recording.split.test} == {f"images_{name}_00005" for name in AZIMUTHS}
-
-
-def edited(folder: Path, copy: Path, edit: Any) -> Path:
-    """The folder with every listed entry of every listing edited; paths stay where they were."""
-    shutil.copytree(folder.parent, copy)
-    for listing in (copy / folder.name).glob("transforms_*.json"):
-        content = json.loads(listing.read_text())
-        content["frames"] = [entry for entry in content["frames"] if edit(entry) is not False]
-        listing.write_text(json.dumps(content))
-    return copy / folder.name
 
 
 def turned(degrees: float, name: str = "12"):
