@@ -79,14 +79,20 @@ class PoseParameterization:
         return torch.zeros(self.given.shape[1], dtype=torch.bool).index_fill(0, self.index, True)
 
 
-def find_parameterization(tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3]) -> PoseParameterization:
-    """What may move in a tracking whose frames `train` the avatar was trained on; `centre` of the head, metres."""
+def find_parameterization(
+    tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3], numbers: Sequence[int] | None = None
+) -> PoseParameterization:
+    """What may move in a tracking whose frames `train` the avatar was trained on; `centre` of the head, metres.
+
+    numbers   of the frames in the video, in which neighbours follow each other; None: all frames do
+    """
     given = values_of(tracks)
     training = given[list(train)]
     spread = training.std(dim=0, unbiased=False)
     motion = accelerations(tracks, given, centre)
-    trained_on = set(train)  # a difference over neighbours that are held out would tell of them
-    inner = [i for i in train if {i - 1, i + 1} <= trained_on]
+    numbers = range(len(given)) if numbers is None else numbers
+    own = {numbers[i] for i in train}  # a difference over neighbours that are held out would tell of them
+    inner = [i for i in train if {numbers[i] - 1, numbers[i] + 1} <= own]
     typical = motion[inner].square().mean(dim=0).sqrt() if inner else motion.new_zeros(motion.shape[1])
     # The torso turns against the head, so that one's accelerations are plausible for the other.
     typical[NECK] = typical[NECK].maximum(typical[TURN])

@@ -42,7 +42,7 @@ COARSE_STEPS, FINE_STEPS = 3, 8
 SAMPLES = 6  # training frames whose mean curvature stands for all
 SAVE_EVERY = 50  # frames
 TIMED_FRAMES = 4  # for an estimate
-PROGRESS_FORMAT = 4  # grows with every change of what refinement finds
+PROGRESS_FORMAT = 5  # grows with every change of what refinement finds
 
 
 @dataclass(frozen=True)
@@ -154,14 +154,16 @@ class _Work:
         self.train = subject.recording.times(subject.split.train)
         self.pictures = fitted_pictures(subject.recording)
         self.count = len(self.pictures)
-        self.parameterization = find_parameterization(self.tracks, self.train, self.centre)
+        records = subject.manifest.frames
+        self.numbers = [records[index].tracking for index in subject.recording.moments(range(len(records)))]
+        self.parameterization = find_parameterization(self.tracks, self.train, self.centre, self.numbers)
         self.there = self.parameterization.on(self.device)
         self.levels = coarse_levels(subject.image_size(size)[0])
 
     def key(self) -> str:
         """Changes with everything that the result depends on."""
         avatar, background = fingerprint(self.fitter.avatar), self.background.tolist()
-        choices = (PROGRESS_FORMAT, avatar, self.subject.data_hash, self.size, background)
+        choices = (PROGRESS_FORMAT, avatar, self.subject.data_hash, self.size, background, self.numbers)
         return hashlib.sha256(repr(choices).encode()).hexdigest()
 
     def pose(self, frame: int) -> HeadPose:
@@ -240,8 +242,7 @@ class _Work:
     def finish(self, moves: Float[Tensor, "T F"], matrix: Float[Tensor, "F F"], before: np.ndarray) -> Refined:
         """Smooth over time, keep the given tracking of frames that then fit no better than with it, and centre the rest."""
         parameterization = self.parameterization
-        records = self.subject.manifest.frames
-        numbers = np.array([records[index].tracking for index in self.subject.recording.moments(range(len(records)))])
+        numbers = np.array(self.numbers)
         trained_on = torch.zeros(len(moves), dtype=torch.bool)
         trained_on[self.train] = True
         for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one

@@ -116,6 +116,17 @@ def test_the_head_is_calmer_than_the_face() -> None:
     assert float(parameterization.calm[7]) == pytest.approx(HEAD_CALM / float(scale) ** 2, rel=1e-5)
 
 
+def test_a_cut_is_no_acceleration() -> None:
+    """The head is elsewhere after it."""
+    one = true_tracks(40)
+    cut = {n: v if n == "shape" else torch.cat((v, v)) for n, v in one.items()}
+    cut["t"] = cut["t"] + torch.tensor([0.03, 0.01, 0.05]) * (torch.arange(80) >= 40)[:, None]
+    whole = find_parameterization(one, tuple(range(40)), CENTRE)
+    numbers = [*range(5, 45), *range(46, 86)]
+    parameterization = find_parameterization(cut, tuple(range(80)), CENTRE, numbers)
+    torch.testing.assert_close(parameterization.calm, whole.calm, rtol=0.1, atol=0)
+
+
 def test_held_out_frames_say_nothing_of_what_may_move() -> None:
     made = true_tracks(30)
     parameterization, other = (
