@@ -19,7 +19,7 @@ from avatar.data.loader import FrameLoader
 from avatar.data.recording import Recording
 from avatar.runs.model_registry import make_avatar
 from avatar.splat import splat_features
-from avatar.train.loss import PerceptualTerm, TrainingLoss, Weighted
+from avatar.train.loss import PerceptualTerm, TrainingLoss, Weighted, at_size
 from avatar.train.optimizer import make_optimizer
 from avatar.train.step import TrainState, train_step
 from avatar.train.step_runner import StepRunner
@@ -89,6 +89,16 @@ def test_pixels_that_are_not_seen_cost_nothing_at_either_size() -> None:
     assert torch.equal((large != 0).any(dim=2), frame.seen)
     whole = frame.seen.view(HEIGHT // 2, 2, WIDTH // 2, 2).all(dim=3).all(dim=1)
     assert torch.equal((small != 0).any(dim=2), whole)
+
+
+@pytest.mark.parametrize(("width", "factor"), [(64, 4), (50, 4), (51, 2), (49, 1)])
+def test_at_size_takes_means_over_what_each_small_pixel_covers(width: int, factor: int) -> None:
+    """In an image whose values are the places of its pixels."""
+    places, small = torch.arange(width) + 0.5, -(-width // factor)
+    image = places[None, :, None].expand(width - 2, -1, 3)
+    found = at_size(image, torch.zeros(-(-(width - 2) // factor), small, 3))
+    wanted = torch.stack([part.mean() for part in places.split(factor)])
+    torch.testing.assert_close(found, wanted[None, :, None].expand(found.shape))
 
 
 def test_the_factor_is_a_function_of_seed_and_step() -> None:
