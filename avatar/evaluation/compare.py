@@ -72,7 +72,7 @@ class Evaluation:
         return parts(self.results["protocols"][protocol])
 
     def figures(self, protocol: str, drive: Drive) -> dict[str, dict[str, float]]:
-        """Name of the frame -> figures, in the order of the video, as the table of the frames holds them."""
+        """Name of the frame -> figures, as the table of the frames holds them, in the order of time."""
         part = self.parts(protocol)[drive]
         path = self.folder / protocol / part.table
         try:
@@ -81,11 +81,9 @@ class Evaluation:
             raise UserError(f"{error}; evaluate the run again") from None
         if hashlib.sha256(data).hexdigest() != part.figures["frames_sha256"]:
             raise UserError(f"{path} is not the file that results.json was written with; evaluate the run again")
+        rows = sorted(csv.DictReader(io.StringIO(data.decode())), key=lambda row: float(row.get("time", 0)))
         try:
-            return {
-                row["name"]: {name: float(row[name]) for name in part.figures["means"]}
-                for row in csv.DictReader(io.StringIO(data.decode()))
-            }
+            return {row["name"]: {name: float(row[name]) for name in part.figures["means"]} for row in rows}
         except KeyError as error:
             raise UserError(f"{path} has no column {error}; evaluate the run again") from None
 

@@ -57,8 +57,9 @@ def summarise(
 def _figures(
     protocol: Protocol, results: Sequence[FrameResult], block: int, seen: Mapping[int, View] | None
 ) -> dict[str, Any]:
-    """Means are over the frames that have a finite figure."""
+    """Means are over the frames that have a finite figure; blocks are of frames in the order of time."""
     of = [seen[result.index] for result in results] if seen else []
+    order = sorted(range(len(results)), key=lambda row: of[row].time if of else row)
     groups = {
         "by_held_out": [view.held_out for view in of],
         "by_camera": [f"{view.camera}, {view.held_out}" for view in of],
@@ -69,7 +70,7 @@ def _figures(
     distances = np.array([result.conditions.expression_distance for result in results])
     return {
         "means": means(figures),
-        "intervals": {name: bootstrap.interval(values) for name, values in figures.items()},
+        "intervals": {name: bootstrap.interval(values[order]) for name, values in figures.items()},
         "frames_with_a_figure": {name: int(np.isfinite(values).sum()) for name, values in figures.items()},
         "by_yaw": binned(yaws, YAW_EDGES, figures),
         "by_expression_distance": binned(distances, np.quantile(distances, DISTANCE_QUANTILES), figures),

@@ -89,6 +89,23 @@ def test_only_frames_that_all_runs_have_count(tmp_path: Path) -> None:
         compare_runs([b, d])
 
 
+def test_blocks_hold_what_several_cameras_saw_at_once_in_whatever_order_their_frames_come(tmp_path: Path) -> None:
+    times = np.repeat(np.arange(20), 2)
+    names = [f"{time}_{n % 2}" for n, time in enumerate(times)]
+    cells = []
+    for way, rows in (("by_time", [*range(40)]), ("by_camera", [*range(0, 40, 2), *range(1, 40, 2)])):
+        runs = [
+            write_run(
+                tmp_path / way / str(seed),
+                {"psnr": smooth(seed)[rows], "time": times[rows].astype(float)},
+                [names[row] for row in rows],
+            )
+            for seed in range(2)
+        ]
+        cells.append(compare_runs(runs).protocols[0].rows["psnr"][1])
+    assert cells[0] == cells[1]
+
+
 def test_frames_without_a_figure_in_one_run_count_in_none(tmp_path: Path) -> None:
     values, holes = smooth(1), smooth(1)
     holes[3], holes[5] = np.nan, np.inf

@@ -14,10 +14,13 @@ from heads import grid_head, random_params, rest_params
 
 from avatar.data.split import Split
 from avatar.evaluation.bootstrap import RESAMPLES, BlockBootstrap, block_length
+from avatar.evaluation.find_lpips import ChosenLpips
 from avatar.evaluation.frame_curves import line
+from avatar.evaluation.held_out import View
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import Pair
-from avatar.evaluation.results import FrameResult, binned, worst_frames
+from avatar.evaluation.protocol import choose_protocols
+from avatar.evaluation.results import FrameResult, binned, summarise, worst_frames
 from avatar.evaluation.training_coverage import Conditions, conditions, expression_distances
 from avatar.head.model import HeadModel
 from avatar.motion.orbit import seen_from
@@ -157,6 +160,24 @@ def test_frames_without_a_figure_are_left_out_of_an_interval() -> None:
     assert BlockBootstrap(6, 2).interval(values) == (1.0, 1.0)
     assert BlockBootstrap(6, 2).interval(np.array([1.0, *[np.nan] * 5])) is None
     assert RESAMPLES == 2000
+
+
+def test_intervals_do_not_depend_on_which_camera_comes_first() -> None:
+    """Blocks hold what all cameras saw in a second, also where the frames of one camera come after those of another."""
+    protocol, noise = choose_protocols(["strict"])[0], np.random.default_rng(0).normal(size=60).cumsum()
+    rows = {
+        (time, camera): FrameResult(
+            60 * camera + time, "", dict.fromkeys(protocol.columns, noise[time] + camera), Conditions(0.0, 0.0)
+        )
+        for time in range(60)
+        for camera in range(3)
+    }
+    seen = {row.index: View(str(camera), time, "time") for (time, camera), row in rows.items()}
+    by_time, by_camera = (
+        summarise(protocol, {"tracked": ordered}, ChosenLpips(None, ""), 10.0, seen)["intervals"]["psnr"]
+        for ordered in ([*rows.values()], sorted(rows.values(), key=lambda row: row.index))
+    )
+    assert by_time == by_camera
 
 
 def test_bins_hold_their_lower_edge() -> None:
