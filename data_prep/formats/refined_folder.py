@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from avatar.data.manifest import Manifest
 from avatar.data.recording import Recording
 from avatar.data.refinement import Refinement
 from avatar.data.subject import Subject
@@ -173,8 +174,6 @@ def _link(source: Path, target: Path) -> None:
 
 def _info(subject: Subject, head_path: str) -> TrackingInfo:
     manifest = subject.manifest
-    gone = manifest.left_out if manifest.rig is None else {}  # pictures of a rig have other numbers
-    left_out = {int(match[0]): why for name, why in gone.items() if (match := re.search(r"\d+$", name))}
     focal, is_assumed = "that of the tracking before", False
     if manifest.format == avatar_track.NAME:
         before = avatar_track.read_info(Path(manifest.source))
@@ -189,9 +188,21 @@ def _info(subject: Subject, head_path: str) -> TrackingInfo:
         head_path=head_path,
         head_fingerprint=manifest.head_fingerprint,
         source={"folder": manifest.source, "format": manifest.format, "data_hash": manifest.data_hash},
-        left_out=left_out,
+        left_out=_left_out(manifest),
         notes=manifest.notes,
     )
+
+
+def _left_out(manifest: Manifest) -> dict[int, str]:
+    """By number; nothing where the images' names do not end in their numbers, and of several cameras."""
+
+    def numbers(name: str) -> list[int]:
+        return [int(digits) for digits in re.findall(r"[0-9]+$", name)]
+
+    is_named = all(numbers(record.name) == [manifest.number(n)] for n, record in enumerate(manifest.frames))
+    if manifest.rig is not None or not is_named:
+        return {}
+    return {number: why for name, why in manifest.left_out.items() for number in numbers(name)}
 
 
 def _frame_tracks(subject: Subject, tracks: Mapping[str, Tensor]) -> dict[int, FrameTrack]:

@@ -19,6 +19,7 @@ from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from data_prep.check.folder import check_tracked_folder
+from data_prep.formats.avatar_track import read_info
 from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.refined_folder import REFINEMENT_FILE, frame_numbers, write_folder
 from data_prep.prepare.open_subject import open_subject
@@ -171,3 +172,13 @@ def test_tracking_of_a_refined_rig_has_a_row_for_each_time(union: tuple[Subject,
     with np.load(written / "tracking.npz") as arrays:
         assert arrays["number"].tolist() == sorted({record.tracking for record in subject.manifest.frames})
         assert len(arrays["number"]) == 10
+
+
+def test_what_was_left_out_has_no_number_where_names_end_in_something_else(tmp_path: Path) -> None:
+    """Here in the camera's."""
+    folder = write_single(tmp_path)
+    (folder / "images" / "00001_12.png").unlink()
+    subject = opened(folder, tmp_path / "head_model", cameras="12", max_left_out=0.2)
+    write_folder(tmp_path / "refined", subject, better(subject), history(subject), {})
+    assert list(subject.manifest.left_out) == ["00001_12"] and frame_numbers(subject) == [0, 2, 3, 4, 5]
+    assert read_info(tmp_path / "refined").left_out == {}
