@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from avatar.data.recording import Recording
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, choose_cameras
@@ -40,9 +42,17 @@ def own_clip(trained: TrainedAvatar, which: str, size: int | None = None) -> Cli
     indices: Sequence[int] = {"test": split.test, "train": split.train, "all": range(len(recording))}[which]
     if len(indices) == 0:
         raise UserError(f"the video of {recording.name} has no {which} frames")
-    shown = recording.moments(indices)
+    shown = _moments_of_a_camera(recording, indices)
     frames = [(recording.params(i), recording.camera(i, size)) for i in shown]
     return Clip(which, recording.fps, frames, shown)
+
+
+def _moments_of_a_camera(recording: Recording, indices: Sequence[int]) -> tuple[int, ...]:
+    """`Recording.moments`, but by the camera that has most of the frames, where it has one: a film does not jump."""
+    counts = Counter(recording.view(index) for index in indices)
+    most = min(counts, key=lambda view: (-counts[view], view))
+    by_time = {recording.time(index): index for index in indices if recording.view(index) == most}
+    return tuple(by_time.get(recording.time(index), index) for index in recording.moments(indices))
 
 
 def driven_clip(trained: TrainedAvatar, drive: Drive, size: int | None = None) -> Clip:

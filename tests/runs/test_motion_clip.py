@@ -1,0 +1,51 @@
+"""Frames of an avatar's own video as a film."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+from drawn_clip import true_tracks
+
+from avatar.data.camera_rig import CameraRig, RigCamera
+from avatar.data.recording import Recording
+from avatar.data.split import Split
+from avatar.runs.motion_clip import own_clip
+from avatar.runs.trained_avatar import TrainedAvatar
+
+
+def filmed_by_two(test: tuple[int, ...]) -> TrainedAvatar:
+    """Pictures 2 n and 2 n + 1 are of time n, by a small and by a large camera."""
+    cameras = tuple(
+        RigCamera(name, side, side, (2.0 * side, 2.0 * side, side / 2, side / 2))
+        for name, side in (("a", 32), ("b", 48))
+    )
+    train = tuple(index for index in range(12) if index not in test)
+    recording = Recording(
+        name="someone",
+        fps=25.0,
+        width=32,
+        height=32,
+        intrinsics=cameras[0].intrinsics,
+        names=tuple(f"{index:02d}" for index in range(12)),
+        split=Split(train, test),
+        tracks=true_tracks(6),
+        data_hash="",
+        head_fingerprint="",
+        rig=CameraRig(cameras, tuple(index // 2 for index in range(12)), (0, 1) * 6),
+    )
+    return cast(TrainedAvatar, SimpleNamespace(recording=recording))
+
+
+def test_a_film_of_held_out_frames_is_of_one_camera() -> None:
+    """Of the second one, which is held out at all times; the first one at the last times."""
+    trained = filmed_by_two((1, 3, 5, 7, 8, 9, 10, 11))
+    clip = own_clip(trained, "test")
+    assert clip.recorded == (1, 3, 5, 7, 9, 11)
+    assert {camera.width for _, camera in clip.frames} == {48}
+    assert own_clip(trained, "train").recorded == (0, 2, 4, 6)
+    assert own_clip(trained, "all").recorded == (0, 2, 4, 6, 8, 10)
+
+
+def test_a_time_that_the_camera_did_not_film_is_seen_by_another() -> None:
+    assert own_clip(filmed_by_two((2, 5, 7, 9)), "test").recorded == (2, 5, 7, 9)
