@@ -11,6 +11,7 @@ DEFAULT_FPS = 25.0
 COMMON_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 15.0, 12.5, 12.0, 10.0, 20.0, 5.0, 1.0)
 _SNAP = 0.005  # relative: what time stamps in whole milliseconds do to a regular rate
 _SNAP_VARIABLE = 0.02
+_DRIFT = 0.25  # pictures at the end, by which a usual rate may be off: with more it is another one
 _REGULAR = (0.5, 1.5)  # times the median distance, within which pictures are taken one by one
 
 
@@ -39,7 +40,9 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
     median = float(np.median(forward))
     low, high = (share * median for share in _REGULAR)
     if steps.min() >= low and steps.max() <= high:
-        return Timing(_common(float((T - 1) / (times[-1] - times[0]))), np.arange(T), ())
+        fps, slope = _common(float((T - 1) / (times[-1] - times[0]))), float(np.polyfit(np.arange(T), times, 1)[0])
+        drift = (T - 1) * abs(slope * fps - 1)
+        return Timing(fps if drift <= _DRIFT else 1 / slope, np.arange(T), ())
     usual = forward[(forward > 0.8 * median) & (forward < 1.2 * median)]
     fps = _common(float(1.0 / usual.mean()), _SNAP_VARIABLE)
     places = np.maximum.accumulate(times - times[0]) * fps  # a time that runs backwards stays where it was

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
+from data_prep.track.camera_rig.camera_pictures import Times
+from data_prep.track.footage.source import Footage, whole
 from data_prep.track.footage.timing import regular_timing
 
 
@@ -14,6 +19,16 @@ def test_regular_times(fps: float, digits: int) -> None:
     timing = regular_timing(np.round(3.7 + np.arange(200) / fps, digits))
     assert timing.fps == pytest.approx(fps, rel=1e-9) and not timing.notes
     assert timing.numbers.tolist() == list(range(200))
+
+
+@pytest.mark.parametrize("fps", [24.1, 24.97, 29.9, 30.05])
+def test_a_rate_beside_a_usual_one_stays_where_pictures_would_drift_from_their_numbers(fps: float) -> None:
+    times = 3.7 + np.arange(600) / fps
+    timing = regular_timing(times, fps)
+    assert np.abs(timing.numbers / timing.fps - (times - times[0])).max() < 0.01 / fps
+    footage = SimpleNamespace(read=lambda *_: zip(times, range(600), strict=True))
+    picked = Times(timing.numbers.tolist(), 3.7, timing.fps).pick(cast(Footage, footage), whole(64, 64))
+    assert list(picked) == [(number, number) for number in range(600)]
 
 
 def test_an_unusual_rate_stays() -> None:
