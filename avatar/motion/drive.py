@@ -35,14 +35,15 @@ class Drive:
 
 
 def subject_drive(subject: Subject, size: int | None) -> Drive:
-    """All frames of a tracked subject, seen `size` pixels wide; one of each time, where there are several cameras."""
+    """All frames of a tracked subject, seen `size` pixels wide; one of each time, where there are several cameras, seen by
+    the first of them."""
     frames = all_moments(subject)
     return Drive(
         subject.name,
         subject.recording.fps,
         tuple(subject.recording.names[i] for i in frames),
         [subject.params(i) for i in frames],
-        [subject.camera(i, size) for i in frames],
+        [subject.recording.reference_camera(i, size) for i in frames],
         subject.identity,
     )
 

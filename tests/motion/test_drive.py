@@ -2,13 +2,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from camera_rig_folder import opened, write_single
 from heads import random_params, rest_params
 
 from avatar.head.model import matrix_from_6d
-from avatar.motion.drive import Drive, choose_cameras, smoothed
+from avatar.motion.drive import Drive, choose_cameras, smoothed, subject_drive
 from avatar.motion.training_distance import FAR, DistanceStrip, distances_csv
 from avatar.types import Camera
 
@@ -98,3 +100,14 @@ def test_one_frame_has_a_strip_and_the_csv_has_one_line_per_frame() -> None:
     assert DistanceStrip([0.0], width=64, picture_height=64).frame(0).shape == (38, 64, 3)
     text = distances_csv(("00007", "00009"), (0.5, 1.25))
     assert text.splitlines() == ["frame,name,distance", "0,00007,0.5000", "1,00009,1.2500"]
+
+
+def test_a_time_that_the_first_camera_did_not_film_is_seen_by_it_all_the_same(tmp_path: Path) -> None:
+    folder = write_single(tmp_path)
+    (folder / "images" / "00002_08.png").unlink()
+    subject, _ = opened(folder, tmp_path / "out", max_left_out=0.1)
+    assert subject.recording.cameras[0].name == "08"
+    cameras = subject_drive(subject, None).cameras
+    assert cameras is not None and {camera.cx for camera in cameras} == {subject.recording.intrinsics[2]}
+    for name, poses in (("R", "R_cam_world"), ("t", "t_cam_world")):
+        assert torch.equal(torch.stack([getattr(one, poses) for one in cameras]), subject.recording.tracks[name])
