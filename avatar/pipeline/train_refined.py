@@ -39,7 +39,7 @@ def begin_rounds(
 
 def train_refined(run: Path, plan: Plan, source: Source, begin: float) -> int:
     """Train, refine, and so on, and at last train the run itself; what is done already is not done again."""
-    name = safe_name(plan.source.folder.resolve().name)
+    name = refined_name(plan)
     for number in range(1, plan.rounds + 1):
         stage = run / ROUNDS_FOLDER / str(number)
         if not (stage / name).is_dir():
@@ -68,13 +68,19 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
     if status != OK:
         return status, replace(plan, spent=trained - begin)
     run = open_run(stage / RUN_FOLDER, source.head, source.folder)
-    status = refine_run(run, stage / safe_name(plan.source.folder.resolve().name))
+    status = refine_run(run, stage / refined_name(plan))
     refined = time.monotonic()
     plan = replace(plan, spent=refined - begin)
     if status == OK and at_once and plan.minutes is not None:
         times = RoundTimes((trained - started) / plan.round_iterations, refined - trained)
         plan = plan.replanned(times, to_come, len(run.subject.split.train))
     return status, plan
+
+
+def refined_name(plan: Plan) -> str:
+    """The tracked folder's own, where that is not the round's run's."""
+    name = safe_name(plan.source.folder.resolve().name)
+    return f"{name}-refined" if name.lower() == RUN_FOLDER else name
 
 
 def continue_or_begin(source: Source, overrides: list[str], run: Path) -> int:
