@@ -72,8 +72,7 @@ def resume_run(run: Path, head: Path | None = None, folder: Path | None = None, 
         subject, assets = open_subject(source, held_out.test_frames, test_cameras=held_out.test_cameras)
         check_head(info.head_fingerprint, assets, run)
         check_data(run, info, subject)
-        if "split" in checkpoint.meta:
-            check_division(run, checkpoint.meta["split"], subject)
+        check_division(run, checkpoint.meta["split"], subject)
         return continue_training(run, info, checkpoint, subject, assets, device)
 
 

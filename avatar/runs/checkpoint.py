@@ -25,7 +25,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.tensors import describe_non_finite
 
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 KEPT = 3  # checkpoints of a run, the newest
 _MAX_BYTES = 2**34  # an avatar and the optimizer's two moments of it
 _MODEL = "model."  # begins the names of parameters
