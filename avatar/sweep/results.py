@@ -26,7 +26,8 @@ def fold_results(folder: Path, spec: Spec) -> Comparison:
     """
     notes: list[str] = []
     evaluations = read_evaluations(folder, spec.jobs, notes)
-    variants = list(dict.fromkeys(job.variant for job, _ in evaluations))
+    evaluated = {job.variant for job, _ in evaluations}
+    variants = [variant for variant in dict.fromkeys(job.variant for job in spec.jobs) if variant in evaluated]
     protocols = list(dict.fromkeys(name for _, each in evaluations for name in each.results["protocols"]))
     comparisons = []
     drives: tuple[Drive, ...] = ("tracked", "refined")

@@ -58,3 +58,12 @@ def test_a_variant_with_a_job_that_saw_measured_frames_is_marked_and_mixed_terms
         shown = FORMATS[name][1](comparison)
         assert "b (!)" in shown and "a (!)" not in shown and "(!): " in shown
         assert "a dssim and lpips-vgg, b dssim" in shown
+
+
+def test_the_first_variant_of_the_file_is_compared_with_where_its_first_job_has_no_results(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, "one", "b", 21)]
+    jobs += [write_job(tmp_path, "two", variant, psnr) for variant, psnr in (("a", 20), ("b", 21))]
+    failed = Job("one-a", "one", "a", 0, {"folder": "one"}, (), ("strict",))
+    comparison = fold_results(tmp_path, Spec((failed, *jobs), Resources(), 0))
+    first, second = comparison.protocols[0].rows["psnr"]
+    assert comparison.labels == ["a", "b"] and (first.mean, second.difference) == (20, 1)
