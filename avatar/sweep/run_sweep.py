@@ -40,10 +40,12 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
     places = {job.name: folder / "jobs" / job.name for job in spec.jobs}
     states = {name: read_state(place) for name, place in places.items()}
     handles: dict[str, Any] = {}
+    left: dict[str, State] = {}  # by whoever had the job before its worker begins
     stalls, ended = StallTimer(), dict[str, str]()
 
     def submit(names: list[str]) -> None:
         if names:
+            left.update({name: stored_state(places[name]) for name in names})
             handles.update(zip(names, engine.submit([places[name] for name in names]), strict=True))
 
     elsewhere = {name for name, state in states.items() if state.status == "running"}
@@ -62,7 +64,8 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                         again += [name] if is_open(states[name], spec.retries) else []
                     continue
                 states[name] = read_state(places[name])
-                is_running = name not in ended and stored_state(places[name]).status == "running"
+                stored = stored_state(places[name])
+                is_running = name not in ended and stored.status == "running" and stored != left[name]
                 if is_running and stalls.stalled_seconds(places[name]) > STALLED_SECONDS:
                     ended[name] = f"the worker hung: no progress for {duration(STALLED_SECONDS)}"
                     engine.stop([handle])

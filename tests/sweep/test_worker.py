@@ -150,6 +150,30 @@ def test_a_worker_that_computes_is_left_alone(place: Path, monkeypatch: pytest.M
     assert not engine.ended
 
 
+class Queued(Hanging):
+    """An engine that has no place for the job for a while."""
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        return list(folders)
+
+    def poll(self, handle: Any) -> str | None:
+        self.polls += 1
+        if self.polls < 10:
+            return None
+        write_state(self.place, State("done", 2))
+        return ""
+
+
+@pytest.mark.timeout(30)
+def test_a_job_that_waits_for_a_place_does_not_hang_whatever_a_crash_has_left_of_it(place: Path) -> None:
+    write_state(place, State("running", 1, "here:1"))
+    write_heartbeat(place, 3)
+    os.utime(place / "heartbeat", (time.time() - 120, time.time() - 120))
+    engine = Queued(place)
+    assert run_jobs(place.parents[1], SPEC, engine, Progress())["j"] == State("done", 2)
+    assert not engine.ended
+
+
 @pytest.mark.timeout(30)
 def test_a_worker_of_another_sweep_that_hangs_is_named_and_not_waited_for(place: Path) -> None:
     write_state(place, State("running", 1, "elsewhere:17"))
