@@ -85,7 +85,7 @@ function faceSliders(view, header) {
   };
   const made = header.controls.map(({ group, name, range, values }) => ({
     group, name, range, rest: 0,
-    set: (value) => view.setExpression({ [`${group}: ${name}`]: value ?? 0 }),
+    set: (value) => view.setExpression({ [`${group}: ${name}`]: value }),
     read: (p) => values.reduce((sum, share, i) => (share === 0 ? sum : sum + share * (p[i] - rest[i])), 0),
   }));
   for (const [joint, group, name] of JOINTS) {

@@ -53,7 +53,7 @@ export class AvatarView extends EventTarget {
   background: [red: number, green: number, blue: number] | null; // from 0 to 1; null: that of training
   readonly statistics: { milliseconds: number; framesPerSecond: number };
   /** Coefficients by name or number, or controls as "Group: name"; unknown names are returned. */
-  setExpression(values: Record<string, number>): string[];
+  setExpression(values: Record<string, number | null>): string[]; // null lets go
   setPose(pose: Pose): void;
   setParameters(values: ArrayLike<number> | null): void; // in the order of header.rest
   /** Show a face; `taken` in milliseconds of performance.now(), of its picture. Faces depart from the neutral one. */
@@ -86,7 +86,7 @@ export function steer(view: AvatarView, element: HTMLElement): () => void;
 export class AvatarViewElement extends HTMLElement {
   readonly view?: AvatarView;
   load(source: string | ArrayBuffer): Promise<Header>;
-  setExpression(values: Record<string, number>): string[];
+  setExpression(values: Record<string, number | null>): string[]; // null lets go
   setPose(pose: Pose): void;
   play(kind?: Motion, options?: { from?: number }): void;
   pause(): void;

@@ -12,15 +12,16 @@ export class Settings {
     this.#header = header;
   }
 
-  /** Coefficients by name or number, or controls as "Group: name"; returns the names that are unknown. */
+  /** Coefficients by name or number, or controls as "Group: name"; null lets go. Returns the names that are unknown. */
   setExpression(values) {
     const { controls, expressions, sizes } = this.#header, unknown = [];
+    const put = (map, key, value) => (value === null ? map.delete(key) : map.set(key, value));
     for (const [key, value] of Object.entries(values)) {
       const control = controls.find((c) => `${c.group}: ${c.name}` === key);
       const index = /^\d+$/.test(key) ? Number(key) : expressions.indexOf(key);
-      if (!Number.isFinite(value)) unknown.push(key);
-      else if (control) this.#controls.set(control, value);
-      else if (index >= 0 && index < sizes.expressions) this.#pinned.set(index, value);
+      if (value !== null && !Number.isFinite(value)) unknown.push(key);
+      else if (control) put(this.#controls, control, value);
+      else if (index >= 0 && index < sizes.expressions) put(this.#pinned, index, value);
       else unknown.push(key);
     }
     return unknown;

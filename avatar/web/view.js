@@ -89,7 +89,7 @@ export class AvatarView extends EventTarget {
     return this.#pose?.parameters; // what is shown, in the order of `header.rest`
   }
 
-  /** Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); returns unknown names. */
+  /** Expression coefficients by name or number, or controls as "Group: name" (`header.controls`); null lets go. Returns unknown names. */
   setExpression(values) {
     return this.#settings.setExpression(values);
   }

@@ -83,6 +83,25 @@ def test_presets_move_the_face_and_go_again(visit: Any, motion: str) -> None:
 
 
 @pytest.mark.chromium
+def test_what_a_preset_has_moved_is_let_go_of_when_it_ends(visit: Any) -> None:
+    page = visit(reduced_motion="reduce")
+    expression = "Array.from(avatar.parameters.slice(0, avatar.header.sizes.expressions)).join()"
+    page.evaluate("avatar.seek(avatar.frameCount / avatar.header.fps)")
+    page.wait_for_timeout(600)
+    recorded = page.evaluate(expression)
+    page.locator("#reset").click()
+    button = page.get_by_role("button", name="Smile")
+    button.click()
+    until(page, "document.querySelectorAll('#presets [aria-pressed=true]').length === 1")
+    page.wait_for_timeout(300)
+    button.click()
+    until(page, "document.querySelectorAll('#presets [aria-pressed=true]').length === 0")
+    page.evaluate("avatar.seek(avatar.frameCount / avatar.header.fps)")
+    page.wait_for_timeout(600)
+    assert page.evaluate(expression) == recorded, "the recorded motion moves the face again"
+
+
+@pytest.mark.chromium
 def test_a_first_slider_moves_both_sides_and_a_double_click_undoes_it(visit: Any) -> None:
     page = visit(reduced_motion="reduce")
     slider = page.locator("input[name='Close eyes']")
