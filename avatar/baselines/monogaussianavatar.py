@@ -83,9 +83,10 @@ class MonoGaussianAvatar(FlashAvatar):
         return self.active(self.mesh_points.points(vertices))
 
     def encode_points(self) -> None:
-        """Give the network the places that the points have now."""
+        """Give the network the places that the points have now; before any growth to the bit what it begins with."""
         vertices = self.mesh.neutral_vertices().to(self.device)
-        self.code = positional_encoding(self.active(self.mesh_points.points(vertices)))
+        points = self.embedding if int(self.count) == active_count(0, 1, len(self)) else self.mesh_points
+        self.code = positional_encoding(self.active(points.points(vertices)))
 
     def after_load(self) -> None:
         super().after_load()

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+import shutil
+from pathlib import Path
+
+import pytest
 import torch
 from heads import grid_head
+from small_runs import train_small
 
 from avatar.baselines.monogaussianavatar import active_count, evenly_ordered
 from avatar.gaussians.uv import UVTexels, uv_texels
+from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint, save_checkpoint
+from avatar.train import trainer as trainer_module
 
 
 def test_a_set_doubles_at_every_tenth_of_the_training() -> None:
@@ -34,3 +42,19 @@ def test_a_heads_texels_stay_themselves() -> None:
     ordered = evenly_ordered(texels)
     before = {(r, c): f for r, c, f in zip(*(values.tolist() for values in texels[:3]), strict=True)}
     assert before == {(r, c): f for r, c, f in zip(*(values.tolist() for values in ordered[:3]), strict=True)}
+
+
+def test_a_run_that_is_resumed_before_its_points_grow_has_the_same_bits(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    overrides = ["model=monogaussianavatar", "trainer.iterations=48", "trainer.checkpoint_every=4"]
+    monkeypatch.setattr(trainer_module, "save_checkpoint", functools.partial(save_checkpoint, keep=12))
+    train_small(tracked_folder, tmp_path / "whole", overrides)
+    shutil.copytree(tmp_path / "whole", tmp_path / "broken")
+    for path in list_checkpoints(tmp_path / "broken" / "checkpoints")[1:]:
+        path.unlink()
+    begun = newest_checkpoint(tmp_path / "broken")
+    assert begun.step == 4, "the points grow after a tenth of the steps"
+    train_small(tracked_folder, tmp_path / "broken", overrides, resume=begun)
+    whole, broken = newest_checkpoint(tmp_path / "whole"), newest_checkpoint(tmp_path / "broken")
+    assert [name for name in whole.tensors if not torch.equal(whole.tensors[name], broken.tensors[name])] == []
