@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from tqdm import tqdm
@@ -224,13 +225,31 @@ def panels(
     name: str,
     distances: Sequence[float],
 ) -> Iterator[UInt8[np.ndarray, "H_panel W_panel 3"]]:
-    """The driver's picture, if any, beside the render, over the strip of distances."""
+    """The driver's picture, if any, beside the render, over the strip of distances; all as large as the first."""
     strip: DistanceStrip | None = None
+    size: tuple[int, int] | None = None
     for index, render in enumerate(renders):
-        images = [render] if pictures is None else [next(pictures), render]
+        images = [render]
+        if pictures is not None:
+            picture = next(pictures)
+            size = size or (picture.shape[0], picture.shape[1])
+            images = [fitted(picture, *size), render]
         panel = side_by_side(images, [name] if pictures is None else ["driver", name])
         strip = strip or DistanceStrip(distances, panel.shape[1], panel.shape[0])
         yield np.concatenate((panel, strip.frame(index)))
+
+
+def fitted(picture: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tensor, "H W 3"]:
+    """As large as a picture of this size holds it, over white: where the first camera lacks one, another's stands in."""
+    h, w = picture.shape[:2]
+    if (h, w) == (height, width):
+        return picture
+    scale = min(height / h, width / w)
+    rows, columns = max(1, round(scale * h)), max(1, round(scale * w))
+    top, left, sheet = (height - rows) // 2, (width - columns) // 2, torch.ones(height, width, 3)
+    small = cv2.resize(picture.numpy(), (columns, rows), interpolation=cv2.INTER_AREA)
+    sheet[top : top + rows, left : left + columns] = torch.from_numpy(small)
+    return sheet
 
 
 def describe(
