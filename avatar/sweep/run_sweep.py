@@ -23,6 +23,10 @@ class StallTimer:
     def __init__(self) -> None:
         self._marks: dict[Path, tuple[bytes, float]] = {}
 
+    def begin(self, place: Path) -> None:
+        """Forget the worker that had the job before."""
+        self._marks.pop(place, None)
+
     def stalled_seconds(self, place: Path) -> float:
         now, mark = time.monotonic(), progress_mark(place)
         if place not in self._marks or self._marks[place][0] != mark:
@@ -46,6 +50,8 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
     def submit(names: list[str]) -> None:
         if names:
             left.update({name: stored_state(places[name]) for name in names})
+            for name in names:
+                stalls.begin(places[name])
             handles.update(zip(names, engine.submit([places[name] for name in names]), strict=True))
 
     elsewhere = {name for name, state in states.items() if state.status == "running"}

@@ -1,28 +1,21 @@
-"""What a worker prints never holds it up, and one that hangs is found and ended."""
+"""What a worker prints never holds it up."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from avatar.errors import UserError
-from avatar.files.lock import locked
-from avatar.sweep import run_sweep
 from avatar.sweep import worker as workers
 from avatar.sweep.engines import EngineOptions, LocalProcesses, make_engine
 from avatar.sweep.output import BoundedLog, end_of, old_of
-from avatar.sweep.run_sweep import run_jobs
 from avatar.sweep.spec import Job, Resources, Spec
-from avatar.sweep.state import State, progress_mark, read_state, write_heartbeat, write_state
-from avatar.sweep.status import Progress
+from avatar.sweep.state import progress_mark, write_heartbeat
 from avatar.sweep.worker import OUTPUT_FILE, Worker
 
 JOB = Job("j", "s", "v", 0, {"folder": "/f"}, (), ())
@@ -95,126 +88,6 @@ def test_the_log_keeps_what_is_new(tmp_path: Path) -> None:
     assert path.stat().st_size <= 100 and old_of(path).stat().st_size <= 100
     assert b"line 049" in end_of(old_of(path)) + end_of(path)
     assert len(end_of(path, 5)) == 5 and end_of(tmp_path / "none") == b""
-
-
-class Hanging:
-    """An engine whose workers never end by themselves."""
-
-    name = "hanging"
-
-    def __init__(self, place: Path, computes: bool = False) -> None:
-        self.place, self.computes, self.polls, self.ended = place, computes, 0, False
-
-    def submit(self, folders: Sequence[Path]) -> list[Any]:
-        write_state(self.place, State("running", 1, "here:1"))
-        write_heartbeat(self.place, 0)
-        return list(folders)
-
-    def poll(self, handle: Any) -> str | None:
-        self.polls += 1
-        if self.computes:
-            write_heartbeat(self.place, self.polls)
-            if self.polls == 5:
-                write_state(self.place, State("done", 1))
-                return ""
-        return "killed by signal 9" if self.ended else None
-
-    def stop(self, handles: Sequence[Any]) -> None:
-        self.ended = True
-
-    def close(self) -> None: ...
-
-
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(run_sweep, "STALLED_SECONDS", 0.05)
-    monkeypatch.setattr(run_sweep, "POLL_SECONDS", 0.02)
-    place = tmp_path / "jobs" / "j"
-    place.mkdir(parents=True)
-    return place
-
-
-@pytest.mark.timeout(30)
-def test_a_worker_whose_heartbeat_goes_on_without_progress_is_ended(place: Path) -> None:
-    engine = Hanging(place)
-    state = run_jobs(place.parents[1], SPEC, engine, Progress())["j"]
-    assert engine.ended and state.status == "failed" and state.attempts == 1
-    assert "the worker hung: no progress for" in state.sentence
-    assert read_state(place) == state
-
-
-def test_a_worker_that_computes_is_left_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = Hanging(place, computes=True)
-    monkeypatch.setattr(run_sweep, "STALLED_SECONDS", 1.0)
-    assert run_jobs(place.parents[1], SPEC, engine, Progress())["j"].status == "done"
-    assert not engine.ended
-
-
-class Queued(Hanging):
-    """An engine that has no place for the job for a while."""
-
-    def submit(self, folders: Sequence[Path]) -> list[Any]:
-        return list(folders)
-
-    def poll(self, handle: Any) -> str | None:
-        self.polls += 1
-        if self.polls < 10:
-            return None
-        write_state(self.place, State("done", 2))
-        return ""
-
-
-@pytest.mark.timeout(30)
-def test_a_job_that_waits_for_a_place_does_not_hang_whatever_a_crash_has_left_of_it(place: Path) -> None:
-    write_state(place, State("running", 1, "here:1"))
-    write_heartbeat(place, 3)
-    os.utime(place / "heartbeat", (time.time() - 120, time.time() - 120))
-    engine = Queued(place)
-    assert run_jobs(place.parents[1], SPEC, engine, Progress())["j"] == State("done", 2)
-    assert not engine.ended
-
-
-@pytest.mark.timeout(30)
-def test_a_worker_of_another_sweep_that_hangs_is_named_and_not_waited_for(place: Path) -> None:
-    write_state(place, State("running", 1, "elsewhere:17"))
-    write_heartbeat(place, 3)
-    state = run_jobs(place.parents[1], SPEC, Hanging(place), Progress())["j"]
-    assert state.status == "failed" and "elsewhere:17 hangs" in state.sentence
-    assert json.loads((place / "state.json").read_text())["status"] == "running", "it is not ours"
-
-
-class TakenByAnother(Hanging):
-    """An engine whose worker finds that another sweep's has the job."""
-
-    submissions = 0
-
-    def submit(self, folders: Sequence[Path]) -> list[Any]:
-        self.submissions += 1
-        write_state(self.place, State("running", 1, "elsewhere:17"))
-        write_heartbeat(self.place, 3)
-        return list(folders)
-
-    def poll(self, handle: Any) -> str | None:
-        with pytest.raises(UserError) as error, locked(self.place):
-            pass
-        return str(error.value)
-
-
-@pytest.mark.timeout(30)
-def test_a_job_that_another_sweep_has_taken_is_waited_for(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    engine, looks = TakenByAnother(place), list[str]()
-    monkeypatch.setattr(run_sweep, "STALLED_SECONDS", 10.0)
-
-    def look(progress: Progress, states: dict[str, State], last: bool = False) -> None:
-        looks.append(json.loads((place / "state.json").read_text())["status"])
-        if len(looks) == 3:
-            write_state(place, State("done", 1, "elsewhere:17"))
-
-    monkeypatch.setattr(Progress, "show", look)
-    with locked(place):
-        state = run_jobs(place.parents[1], SPEC, engine, Progress())["j"]
-    assert state == State("done", 1, "elsewhere:17") and engine.submissions == 1
-    assert looks[:3] == ["running"] * 3, "nothing is written over"
 
 
 def test_progress_is_processor_time_or_something_said(tmp_path: Path) -> None:
