@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def fold_results(folder: Path, spec: Spec) -> Comparison:
     drives: tuple[Drive, ...] = ("tracked", "refined")
     for protocol in protocols:
         for drive in drives:
-            compared = compare_variants(evaluations, variants, protocol, drive)
+            compared = compare_variants(evaluations, variants, protocol, drive, notes)
             if compared is not None:
                 comparisons.append(compared)
     if not comparisons:
@@ -47,7 +48,7 @@ def fold_results(folder: Path, spec: Spec) -> Comparison:
         [" and ".join(sorted({results["perceptual"] for results in own})) for own in by_variant.values()],
         comparisons,
         legend([each.results["tracking"] for _, each in evaluations]),
-        notes,
+        list(dict.fromkeys(notes)),
     )
 
 
@@ -63,19 +64,28 @@ def read_evaluations(folder: Path, jobs: Sequence[Job], notes: list[str]) -> lis
 
 
 def compare_variants(
-    evaluations: Sequence[tuple[Job, Evaluation]], variants: Sequence[str], protocol: str, drive: Drive
+    evaluations: Sequence[tuple[Job, Evaluation]],
+    variants: Sequence[str],
+    protocol: str,
+    drive: Drive,
+    notes: list[str],
 ) -> ProtocolComparison | None:
-    """None where no (subject, seed) pair is there for all variants, driven so."""
+    """None where no (subject, seed) pair is there for all variants, driven so. What is left out goes into `notes`."""
     means: dict[str, dict[tuple[str, int], Mapping[str, float]]] = {variant: {} for variant in variants}
+    networks: dict[tuple[str, int], set[str | None]] = defaultdict(set)
     for job, evaluation in evaluations:
         if protocol in evaluation.results["protocols"] and (part := evaluation.parts(protocol).get(drive)):
             means[job.variant][job.subject, job.seed] = part.figures["means"]
+            networks[job.subject, job.seed].add(evaluation.results["protocols"][protocol]["lpips"]["weights_sha256"])
     pairs = sorted(set.intersection(*(set(found) for found in means.values()))) if means else []
     if not pairs:
         return None
     figures = [
         name for name in means[variants[0]][pairs[0]] if all(name in means[v][p] for v in variants for p in pairs)
     ]
+    if len(set().union(*(networks[pair] for pair in pairs))) > 1:
+        figures = [name for name in figures if not name.startswith("lpips")]
+        notes.append(f"{protocol}: LPIPS is left out, because the jobs were measured with different networks")
     rows: dict[str, list[Cell]] = {}
     for figure in figures:
         values = [np.array([_number(means[variant][pair][figure]) for pair in pairs]) for variant in variants]

@@ -67,3 +67,17 @@ def test_the_first_variant_of_the_file_is_compared_with_where_its_first_job_has_
     comparison = fold_results(tmp_path, Spec((failed, *jobs), Resources(), 0))
     first, second = comparison.protocols[0].rows["psnr"]
     assert comparison.labels == ["a", "b"] and (first.mean, second.difference) == (20, 1)
+
+
+def test_lpips_of_different_networks_is_left_out_with_a_note(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, PLAIN, variant, 20) for variant in ("a", "b")]
+    for job, network in zip(jobs, ("1" * 64, "2" * 64), strict=True):
+        path = tmp_path / "jobs" / job.name / "run" / "eval" / "results.json"
+        results = json.loads(path.read_text())
+        strict = results["protocols"]["strict"]
+        strict["means"] |= {"lpips": 0.1, "lpips_head": 0.1}
+        strict["lpips"]["weights_sha256"] = network
+        path.write_text(json.dumps(results))
+    comparison = fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
+    assert list(comparison.protocols[0].rows) == ["psnr"]
+    assert comparison.notes == ["strict: LPIPS is left out, because the jobs were measured with different networks"]
