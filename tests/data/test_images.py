@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from avatar.data.images import read_image, read_mask, read_matte
 
@@ -63,6 +64,21 @@ def test_the_transparency_of_a_png_is_the_matte(kind: str, tmp_path: Path) -> No
     np.testing.assert_array_equal(read_matte(path, path), MATTE)
     expected = (120, 120, 120) if kind == "grey with alpha" else (200, 120, 10)
     assert (read_image(path) == expected).all()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_matte_is_turned_as_its_picture_is(orientation: int, tmp_path: Path) -> None:
+    """By the EXIF of a PNG, as telephones and programs that cut people out leave it."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "00001.png"
+    Image.fromarray(np.dstack([MATTE] * 4)).save(path, exif=exif)
+    np.testing.assert_array_equal(read_matte(path, path), read_image(path)[..., 0])
+    np.testing.assert_array_equal(read_mask(path), read_image(path)[..., 0])
+    labels = Image.frombytes("P", (4, 2), bytes(range(8)))
+    labels.putpalette([value for n in range(8) for value in (n, 0, 255)])
+    labels.save(path, exif=exif)
+    np.testing.assert_array_equal(read_mask(path), read_image(path)[..., 0])
 
 
 def test_16_bits_are_rounded_to_the_nearest_of_8(tmp_path: Path) -> None:
