@@ -12,7 +12,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES, has_transparency, read_bytes, read_image
+from avatar.data.images import (
+    IMAGE_SUFFIXES,
+    OTHER_PICTURES,
+    decode_image,
+    decode_transparency,
+    has_transparency,
+    read_bytes,
+    read_image,
+)
 from avatar.errors import UserError
 from avatar.files.names import natural_order
 from data_prep.track.footage.source import LAID_OVER_GREY, Footage, Span, TimedPicture, View, check_size, opaque, stride
@@ -26,14 +34,12 @@ _EXIF, _FOCAL_IN_35MM_FILM = 0x8769, 0xA405  # EXIF 2.3, tags of the sub-directo
 
 def read_picture(file: Path) -> tuple[np.ndarray, bool]:
     """A picture, and whether it has transparent parts, which are laid over grey."""
-    image = read_image(file)
     data = read_bytes(file)
+    image = decode_image(data, file)
     if not has_transparency(data):
         return image, False
-    four = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if four is None or four.ndim != 3 or four.shape[2] != 4 or four.dtype != np.uint8 or four[..., 3].min() == 255:
-        return image, False
-    return opaque(np.dstack((image, four[..., 3]))), True
+    matte = decode_transparency(data, file)
+    return (image, False) if matte.min() == 255 else (opaque(np.dstack((image, matte))), True)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from videos import ffmpeg
 
 from avatar.errors import UserError
@@ -19,15 +20,29 @@ def read(path: Path, span: Span | None = None) -> tuple[list, list[str]]:
     return list(footage.read(whole(footage.width, footage.height), span or Span(), said.append)), said
 
 
-def test_transparent_pictures_lie_over_grey(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_transparent_pictures_lie_over_grey(kind: type, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()
     image = np.full((64, 64, 4), (200, 40, 40, 255), np.uint8)
     image[:32, :, 3] = 0
-    cv2.imwrite(str(folder / "0.png"), cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))
+    scale = kind(np.iinfo(kind).max // 255)
+    cv2.imwrite(str(folder / "0.png"), cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA).astype(kind) * scale)
     pictures, said = read(folder)
     assert said == ["the pictures are transparent in parts: they are laid over grey"]
     assert (pictures[0].image[:32] == 127).all() and (pictures[0].image[32:] == (200, 40, 40)).all()
+
+
+def test_transparent_pictures_are_turned_as_their_exif_says(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter clockwise
+    image = np.full((64, 80, 4), (200, 40, 40, 255), np.uint8)
+    image[:, :40, 3] = 0
+    Image.fromarray(image).save(folder / "0.png", exif=exif)
+    (picture,), _ = read(folder)
+    assert (picture.image[:40] == 127).all() and (picture.image[40:] == (200, 40, 40)).all()
 
 
 def test_a_folder_of_pictures(tmp_path: Path) -> None:
