@@ -163,7 +163,7 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
         "errors": errors,
         "irises": _iris_distance(np.linalg.norm(residual, axis=2), embedding.landmarks, landmarks.open_shares()[rows]),
         "constant": float(np.linalg.norm(constant[features], axis=1).mean()),
-        "jitter": _jitter(placed[:, features]) / max(_jitter(observed[:, features]), 1e-9),
+        "jitter": _jitter(placed[:, features], rows) / max(_jitter(observed[:, features], rows), 1e-9),
         "worst_frames": sorted(worst),
         "identity": float(np.abs(next(iter(fit.tracks.values())).shape).max()),
     }
@@ -187,8 +187,8 @@ def _placed(head: HeadAssets, fit: Fit, embedding: LandmarkEmbedding) -> Float[n
     return np.stack(screens)
 
 
-def _jitter(points: Float[np.ndarray, "T L 2"]) -> float:
-    """Mean length of second differences over time, pixels."""
-    if len(points) < 3:
-        return 0.0
-    return float(np.linalg.norm(np.diff(points, n=2, axis=0), axis=-1).mean())
+def _jitter(points: Float[np.ndarray, "T L 2"], numbers: Sequence[int]) -> float:
+    """Mean length of second differences over time, pixels; of frames that follow each other."""
+    follows = np.diff(numbers) == 1
+    seconds = np.diff(points, n=2, axis=0)[follows[1:] & follows[:-1]]
+    return float(np.linalg.norm(seconds, axis=-1).mean()) if len(seconds) else 0.0

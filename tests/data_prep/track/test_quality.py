@@ -62,6 +62,25 @@ def test_errors_are_what_changes_from_frame_to_frame(monkeypatch: pytest.MonkeyP
     assert landmark_figures(grid_head(), Fit(tracks, {}), seen, embedding)["jitter"] == 0.0
 
 
+def test_where_a_face_comes_back_is_no_jitter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit that trembles twice as much as the landmarks does so whether the face was away or not."""
+    T, rng = 40, np.random.default_rng(0)
+    tremble = 0.2 * rng.standard_normal((T, len(NOSE), 2))
+    away = np.where(np.arange(T) < 20, 0.0, 300.0)[:, None, None]  # pixels
+    points = np.zeros((T + 5, NUM_POINTS, 3), np.float32)
+    numbers = [*range(20), *range(25, 45)]
+    rows = np.zeros((T, NUM_POINTS, 3), np.float32)
+    rows[:, NOSE, :2] = tremble + away
+    rows[:, LEFT_IRIS, 0] = 50.0
+    points[numbers] = rows
+    detected = np.isin(np.arange(T + 5), numbers)
+    seen = Landmarks(points, np.zeros((T + 5, len(BLENDSHAPES)), np.float32), detected, (640, 640), 25.0)
+    monkeypatch.setattr(quality, "_placed", lambda *_: 2 * tremble + away)
+    embedding = LandmarkEmbedding(np.array(NOSE), np.zeros((len(NOSE), 3), int), np.zeros((len(NOSE), 3)))
+    found = landmark_figures(grid_head(), Fit({n: track() for n in numbers}, {}), seen, embedding)
+    assert found["jitter"] == pytest.approx(2.0, abs=0.01)
+
+
 def test_the_terminals_lines() -> None:
     told = Quality((Figure("error", 1.5, "px", 1.0, 2.0, "track again"),), (3, 17), "given with --focal")
     assert told.lines()[0] == "quality of the tracking"
