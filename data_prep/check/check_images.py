@@ -157,7 +157,7 @@ def _mask_area(clip: Clip) -> Iterator[Finding]:
 def exposure(clip: Clip) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Image numbers and, in stops against the clip's median, the light of head and of background [n].
 
-    The background is NaN where there is none to see, or where it is a flat colour that was put in.
+    Both are NaN where they are black; the background where there is none to see.
     """
     numbers = [n for n, view in clip.views.items() if view.head_colour is not None]
     if not numbers:
@@ -180,6 +180,8 @@ def _exposure(clip: Clip) -> Iterator[Finding]:
     if measured is None:
         return
     numbers, head, background = measured
+    if np.isnan(head).all():
+        return
     has_background = bool(np.isfinite(background).all()) and _flat_background(clip) is None
     both = np.where(np.sign(head) == np.sign(background), np.sign(head), 0) * np.minimum(abs(head), abs(background))
     change = moving_median(both if has_background else head)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from some_tracks import track
 
+from data_prep.check.check_images import _exposure
 from data_prep.check.check_tracking import _camera
 from data_prep.check.coverage import Coverage, measure_coverage
 from data_prep.check.head_angles import head_angles, measure_jumps
@@ -72,6 +73,15 @@ def test_a_frame_is_compared_with_its_neighbours_in_time() -> None:
     np.testing.assert_allclose(found.translation, [np.nan, 0.0, 5.0, 10.0, 5.0, np.nan], atol=1e-4)
     gap = measure_jumps([0, 1, 2, 4, 5, 6], tracks)
     assert np.isnan(gap.rotation).tolist() == [True, False, True, True, False, True]
+
+
+@pytest.mark.parametrize(("level", "changes"), [(100.0, 1), (1.0, 0)])
+def test_light_that_changes_is_told_where_there_is_light(level: float, changes: int) -> None:
+    """Pictures that are black have no light that could change."""
+    colours = [np.full(3, level * (1 if n < 30 else 2)) for n in range(60)]
+    views = {n: SimpleNamespace(head_colour=colour, background_colour=None) for n, colour in enumerate(colours)}
+    read: Any = SimpleNamespace(views=views, name=str, names=tuple, files=SimpleNamespace(images={}, alphas={}))
+    assert len(list(_exposure(read))) == changes
 
 
 def test_a_lens_is_judged_by_the_width() -> None:
