@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 
 from avatar.html import Markup, figure_of, plot
@@ -26,7 +29,8 @@ def coverage_plots(coverage: Coverage) -> list[Markup]:
     course, axes = figure_of()
     for name, colour in zip(("yaw", "pitch", "roll"), SERIES, strict=False):
         axes.plot(coverage.images, getattr(coverage.angles, name), color=colour, linewidth=1, label=name)
-    axes.axvspan(coverage.images[test[0]], coverage.images[test[-1]], color=TEST, alpha=0.1, linewidth=0)
+    for first, last in runs(test):
+        axes.axvspan(coverage.images[first] - 0.5, coverage.images[last] + 0.5, color=TEST, alpha=0.1, linewidth=0)
     axes.set(xlabel=_FRAME, ylabel="degrees")
     axes.legend(frameon=False, fontsize=8, ncols=3)
     return [
@@ -69,6 +73,13 @@ def course_plots(clip: Clip) -> list[Markup]:
         axes.set(xlabel=_FRAME, ylabel="grey levels", ylim=(0, None))
         plots.append(plot(figure, "Mean change of the image since the frame before; zero is a repeat", "image change"))
     return plots
+
+
+def runs(places: Sequence[int]) -> list[tuple[int, int]]:
+    """The first and the last of each row of increasing places that follow each other."""
+    ends = [n for n, (place, after) in enumerate(pairwise(places)) if after > place + 1]
+    starts = [0, *(n + 1 for n in ends)]
+    return [(places[a], places[b]) for a, b in zip(starts, [*ends, len(places) - 1], strict=True)]
 
 
 def _scatter(axes, x: np.ndarray, y: np.ndarray, train: list[int], test: list[int]) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from some_tracks import track
 
+from avatar.data.split import Split
+from data_prep.check import plots
 from data_prep.check.check_images import _exposure
 from data_prep.check.check_tracking import _camera
 from data_prep.check.coverage import Coverage, measure_coverage
@@ -92,3 +94,15 @@ def test_a_lens_is_judged_by_the_width() -> None:
 
     assert problems((1920, 400), 1000.0) == [] and problems((400, 1920), 1000.0) == []
     assert problems((1920, 400), 900.0) == ["focal-length"]  # 94 degrees
+
+
+def test_what_is_shaded_is_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing else, where a folder holds out frames from all over the clip."""
+    monkeypatch.setattr(plots, "plot", lambda figure, *_: figure)
+    images, test = tuple(range(7, 47)), (4, 10, 11, 12, 38)
+    split = Split(tuple(n for n in range(40) if n not in test), test)
+    angles = head_angles(np.stack([track((0.0, 0.0, 0.0)).R] * 40))
+    figure: Any = plots.coverage_plots(Coverage(images, split, angles, np.zeros((40, 2)), (), ()))[2]
+    spans = [patch.get_extents().transformed(figure.axes[0].transData.inverted()) for patch in figure.axes[0].patches]
+    shaded = [number for number in images if any(span.x0 < number < span.x1 for span in spans)]
+    assert shaded == [images[place] for place in test]
