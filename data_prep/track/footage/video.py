@@ -62,7 +62,7 @@ class Video(Footage):
             seek=[*(("-ss", f"{span.start:.6f}") if can_seek else ()), *self.decoder],
         )
         offset = span.start if can_seek else 0.0
-        every, last, was_transparent = every or stride(self.rate), -1.0, False
+        every, inside, last, was_transparent = every or stride(self.rate), -1, -1.0, False
         for n, (shown, pixels) in enumerate(decoder):
             if (shown.width, shown.height) != (self.first.width, self.first.height):
                 raise UserError(
@@ -73,7 +73,10 @@ class Video(Footage):
             if span.end is not None and time >= span.end:
                 break
             last = time
-            if n % every or time < span.start - 1e-6:
+            if time < span.start - 1e-6:
+                continue
+            inside += 1
+            if inside % every:
                 continue
             was_transparent |= is_transparent and pixels[..., 3].min() < 255
             yield TimedPicture(time, opaque(pixels) if is_transparent else pixels)

@@ -154,6 +154,15 @@ def test_a_high_rate_is_thinned_and_said(tmp_path: Path) -> None:
     assert [p.image.mean() for p in pictures] == pytest.approx([0, 64, 128], abs=3)
 
 
+@pytest.mark.parametrize("options", [("-f", "matroska"), ("-f", "matroska", "-live", "1")])  # as browsers record
+def test_a_high_rate_is_thinned_from_the_start_on(options: tuple[str, ...], tmp_path: Path) -> None:
+    """Whether the file can be entered there or not."""
+    encode(tmp_path / "a.mkv", counting(24), 50, (*LOSSLESS, *options))
+    assert (open_video(tmp_path / "a.mkv").duration is None) == ("-live" in options)
+    pictures, _ = read(tmp_path / "a.mkv", span=Span(0.1, 0.2))
+    assert [p.image.mean() for p in pictures] == pytest.approx([40, 56, 72], abs=1)
+
+
 def test_the_lens_in_the_metadata(tmp_path: Path) -> None:
     tag = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
     encode(tmp_path / "a.mov", still(), options=("-metadata", f"{tag}=26", "-movflags", "use_metadata_tags", *X264))
