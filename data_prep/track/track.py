@@ -89,7 +89,7 @@ def track(
             say(f"{out} holds this tracking already")
             return known
         raise UserError(f"{out} exists and is not this tracking: choose another --out, or remove it first")
-    mattes = None if choices.matte is None else open_mattes(choices.matte, footage)
+    mattes = None if choices.matte is None else open_mattes(choices.matte, footage, choices.span)
     for note in mattes.notes if mattes else ():
         say(f"note: {note}")
     if mattes is None and network in MATTING_FILES:

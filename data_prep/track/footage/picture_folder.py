@@ -44,19 +44,21 @@ def read_picture(file: Path) -> tuple[np.ndarray, bool]:
 
 @dataclass(frozen=True)
 class PictureFolder(Footage):
-    """The pictures are taken in the order of their numbers, `rate` a second."""
+    """The pictures are taken in the order of their numbers, `rate` a second, or at the `times` where there are any."""
 
     rate: float
     files: tuple[Path, ...]
     decode: Callable[[Path], tuple[np.ndarray, bool]] = read_picture
+    times: tuple[float, ...] = ()  # seconds, of each file
 
     def read(
         self, view: View, span: Span, complain: Callable[[str], object], every: int | None = None
     ) -> Iterator[TimedPicture]:
         """Raises UserError for pictures of another size and for files that cannot be decoded."""
         was_transparent = False
-        times = [(n / self.rate, file) for n, file in enumerate(self.files)]
-        inside = [(t, f) for t, f in times if t >= span.start - 1e-6 and (span.end is None or t < span.end)]
+        times = self.times or [n / self.rate for n in range(len(self.files))]
+        both = zip(times, self.files, strict=True)
+        inside = [(t, f) for t, f in both if t >= span.start - 1e-6 and (span.end is None or t < span.end)]
         for time, file in inside[:: every or stride(self.rate)]:
             image, is_transparent = self.decode(file)
             was_transparent |= is_transparent

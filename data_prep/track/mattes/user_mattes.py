@@ -21,7 +21,7 @@ from data_prep.prepare.mask_values import SAMPLES, coloured_sentence, is_coloure
 from data_prep.track.faces.detect import Face
 from data_prep.track.footage.picture_folder import PictureFolder, open_footage, resampled
 from data_prep.track.footage.rotated import turned
-from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
+from data_prep.track.footage.source import MIN_SIDE, Footage, Span, TimedPicture, View, whole
 from data_prep.track.footage.timing import DEFAULT_FPS
 from data_prep.track.upright import LONGEST, sample_pictures
 
@@ -43,8 +43,8 @@ class OwnMattes:
             yield TimedPicture(time, _grey(image))
 
 
-def open_mattes(path: Path, video: Footage) -> OwnMattes:
-    """Raises UserError for what cannot be the mattes of the video's pictures."""
+def open_mattes(path: Path, video: Footage, span: Span | None = None) -> OwnMattes:
+    """Raises UserError for what cannot be the mattes of the video's pictures, of which those in `span` are used."""
     footage = open_footage(path)
     if (footage.width, footage.height) != (video.width, video.height):
         raise UserError(
@@ -66,9 +66,31 @@ def open_mattes(path: Path, video: Footage) -> OwnMattes:
         notes += [note] if note else []
     if isinstance(footage, PictureFolder):
         rate = video.rate or DEFAULT_FPS
-        as_masks = replace(footage, decode=_mask_reader(label), rate=rate, duration=len(footage.files) / rate)
+        times = () if span in (None, Span()) else _times_of(video, len(footage.files), span.end)
+        duration = len(footage.files) / rate
+        as_masks = replace(footage, decode=_mask_reader(label), rate=rate, duration=duration, times=times)
         return OwnMattes(as_masks, tuple(notes))
     return OwnMattes(footage, tuple(notes))
+
+
+def _times_of(video: Footage, count: int, end: float | None) -> tuple[float, ...]:
+    """When the video shows its first `count` pictures, which its rate alone does not say: it may begin late, or vary.
+
+    From `end` on as the rate says. Empty where that says it all, and where the video cannot be read from its beginning on.
+    """
+    if isinstance(video, PictureFolder):
+        return ()
+    times: list[float] = []
+    small = whole(video.width, video.height, MIN_SIDE)
+    try:
+        for picture in video.read(small, Span(), lambda _: None, every=1):
+            times.append(picture.time)
+            if len(times) == count or (end is not None and picture.time >= end):
+                break
+    except UserError:
+        return ()
+    missing = np.arange(1, count - len(times) + 1) / (video.rate or DEFAULT_FPS)
+    return (*times, *(times[-1] + missing).tolist())
 
 
 def refuse_mattes_of_others(mattes: OwnMattes, span: Span, faces: Sequence[Face | None]) -> None:

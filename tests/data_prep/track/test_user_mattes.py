@@ -12,7 +12,7 @@ import pytest
 from heads import grid_head
 from marked_face import HEIGHT, WIDTH, matte, picture
 from PIL import Image
-from videos import LOSSLESS, X264, encode
+from videos import LOSSLESS, X264, encode, ffmpeg
 
 from avatar.errors import UserError
 from data_prep.formats.avatar_track import read_info
@@ -204,11 +204,35 @@ def test_a_folder_of_mattes_has_the_times_of_the_video(rate: int, tmp_path: Path
         mask[0, 0] = n
         cv2.imwrite(str(folder / f"{n}.png"), mask)
     footage, span = open_footage(video), Span(0.2, 0.6)
-    mattes = open_mattes(folder, footage)
+    mattes = open_mattes(folder, footage, span)
     pictures = [p.time for p in footage.read(whole(WIDTH, HEIGHT), span, lambda _: None)]
     read = [(p.time, int(p.image[0, 0])) for p in mattes.read(whole(WIDTH, HEIGHT), span)]
     assert [time for time, _ in read] == pytest.approx(pictures, abs=2e-3)
     assert [round(time * rate) for time in pictures] == [n for _, n in read]
+
+
+TIMES = {  # of picture n, in seconds
+    "later than the sound": "N/25+0.08",
+    "of a varying rate": "if(lt(N,20),N/25,0.8+(N-20)/15)",
+}
+
+
+@pytest.mark.parametrize("kind", TIMES)
+def test_mattes_of_a_part_are_of_its_own_pictures(kind: str, tmp_path: Path) -> None:
+    """Wherever the part begins and ends, whatever times the pictures have."""
+    folder, count = tmp_path / "m", 60
+    folder.mkdir()
+    for n in range(count):
+        cv2.imwrite(str(folder / f"{n}.png"), np.maximum(matte(), 4 * n * (np.arange(WIDTH) > 140)).astype(np.uint8))
+    greys = [np.full((HEIGHT, WIDTH, 3), 4 * n, np.uint8) for n in range(count)]
+    plain = encode(tmp_path / "a.mkv", greys, options=LOSSLESS)
+    silence = ("-f", "lavfi", "-i", "anullsrc=d=3", "-c:a", "pcm_s16le")
+    kept = ("-vf", f"setpts='({TIMES[kind]})/TB'", "-fps_mode", "passthrough", "-enc_time_base", "1/24000", *LOSSLESS)
+    ffmpeg("-i", plain, *silence, *kept, tmp_path / "v.mov")
+    video, view = open_footage(tmp_path / "v.mov"), whole(WIDTH, HEIGHT)
+    for span in (Span(1.0), Span(1.01, 1.5), Span(0.0, 1.2)):
+        pictures = [round(p.image.mean() / 4) for p in video.read(view, span, lambda _: None)]
+        assert [int(p.image[0, -1]) // 4 for p in open_mattes(folder, video, span).read(view, span)] == pictures
 
 
 def test_single_mattes_without_the_face_are_named_and_many_refused(video: Path, tmp_path: Path) -> None:
