@@ -98,11 +98,12 @@ def detect_offset(
     }
     residuals = _mask_residuals(predicted, observed, candidates)
     best, runner_up, t = _decide(_misfits(residuals))
-    used_images = t < MIN_T
-    if used_images:
-        moving = motion_residuals(head, tracks, first.intrinsics, images, candidates, sampled, (width, height))
+    moving: Residuals = {}
+    if t < MIN_T:
+        found = motion_residuals(head, tracks, first.intrinsics, images, candidates, sampled, (width, height))
+        moving = {offset: rows for offset, rows in found.items() if len(rows) >= MIN_COMMON_FRAMES}
         best, runner_up, t = _decide(_misfits(_joined(residuals, moving)))
-    estimate = OffsetEstimate(best, t, runner_up, len(sampled), used_images)
+    estimate = OffsetEstimate(best, t, runner_up, len(sampled), bool(moving))
     is_edge = not {best - 1, best + 1} <= set(candidates)
     if t < MIN_T or is_edge:
         if not ignore_misfit:

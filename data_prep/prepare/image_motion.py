@@ -50,7 +50,8 @@ def motion_residuals(
             if number + offset in flows:
                 seen = _sample(flows[number + offset], positions)
                 rows[number] = np.concatenate([(seen - motion[number])[group].mean(axis=0) for group in groups])
-        residuals[offset] = rows
+        if rows:
+            residuals[offset] = rows
     return residuals
 
 

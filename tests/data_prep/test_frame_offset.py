@@ -19,6 +19,7 @@ from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import FrameFiles, find_frame_files
 from data_prep.formats.metrical_tracker import FrameTrack, read_tracking
+from data_prep.prepare import frame_offset
 from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 
 pytestmark = pytest.mark.slow
@@ -48,6 +49,19 @@ def test_synthetic_offsets(offset: int, tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "subject", frames=16, offset=offset)
     estimate = detect(folder, folder / "head_model")
     assert estimate.offset == offset and estimate.t > 10 and not estimate.used_images
+
+
+@pytest.mark.parametrize("following", [0, 4])
+def test_what_masks_say_is_named_where_few_frames_follow_each_other(
+    following: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their motion, which would have to decide, is not known."""
+    folder = write_tracked_folder(tmp_path / "subject", frames=32, offset=1)
+    for path in sorted((folder / "checkpoint").iterdir())[following::2]:
+        path.unlink()
+    monkeypatch.setattr(frame_offset, "MIN_T", 1e3)
+    with pytest.raises(UserError, match=r"image number = tracking number \+1\), better than offset -?[0-9]+ by [1-9]"):
+        detect(folder, folder / "head_model")
 
 
 @pytest.mark.parametrize("kinds", [{"mouth": False}, {"head": False}])
