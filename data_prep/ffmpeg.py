@@ -134,7 +134,8 @@ class Decoder:
 
     `stream` is a number, or "v:0" for the first stream of pictures.
     `filters` come after the place where time and size of a picture are noted; the last must make pictures of
-    `width` x `height` pixels. `errors` are ffmpeg's complaints so far, `error_count` how many there were.
+    `width` x `height` pixels. `errors` are ffmpeg's complaints so far, `error_count` how many there were, `heard` how
+    many before the picture that was given last: it decodes ahead.
     """
 
     def __init__(
@@ -159,8 +160,8 @@ class Decoder:
         self.path = path
         self.shape = height, width, channels
         self.errors: list[str] = []
-        self.error_count = 0
-        self._noted: queue.SimpleQueue[Shown | None] = queue.SimpleQueue()
+        self.error_count = self.heard = 0
+        self._noted: queue.SimpleQueue[tuple[Shown, int] | None] = queue.SimpleQueue()
 
     def __iter__(self) -> Iterator[Picture]:
         """Raises UserError when ffmpeg falls silent."""
@@ -170,11 +171,12 @@ class Decoder:
         try:
             while (pixels := self._within_time(process)) is not None:
                 try:
-                    shown = self._noted.get(timeout=STALL_SECONDS)
+                    noted = self._noted.get(timeout=STALL_SECONDS)
                 except queue.Empty:
-                    shown = None
-                if shown is None:
+                    noted = None
+                if noted is None:
                     raise UserError(f"{self.path}: ffmpeg gave a picture without saying which; convert the video first")
+                shown, self.heard = noted
                 yield Picture(shown, pixels)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(STALL_SECONDS)  # its output is closed, and it may still say why it ended there
@@ -220,7 +222,7 @@ class Decoder:
     def _note(self, line: str) -> None:
         if "Parsed_showinfo" in line:
             if (found := _PICTURE.search(line)) is not None:
-                self._noted.put(_shown(found))
+                self._noted.put((_shown(found), self.error_count))
             between = _BETWEEN.search(line)
             if between is not None and _OF_DAMAGE.search(between[1]):
                 self._complain(between[1])

@@ -71,6 +71,7 @@ class Video(Footage):
                 )
             time = offset + (n / (self.rate or 25.0) if shown.time is None else shown.time)
             if span.end is not None and time >= span.end:
+                _report_damage(decoder, decoder.heard, complain)
                 break
             last = time
             if time < span.start - 1e-6:
@@ -81,14 +82,12 @@ class Video(Footage):
             was_transparent |= is_transparent and pixels[..., 3].min() < 255
             yield TimedPicture(time, opaque(pixels) if is_transparent else pixels)
         else:
-            self._report(decoder, last, span, complain)
+            _report_damage(decoder, decoder.error_count, complain)
+            self._report_missing(last, span, complain)
         if was_transparent:
             complain(LAID_OVER_GREY)
 
-    def _report(self, decoder: Decoder, last: float, span: Span, complain: Callable[[str], object]) -> None:
-        if decoder.error_count:
-            shown = "; ".join(dict.fromkeys(decoder.errors[:_MAX_LISTED_ERRORS]))
-            complain(f"the video is damaged: ffmpeg complains {decoder.error_count} times ({shown})")
+    def _report_missing(self, last: float, span: Span, complain: Callable[[str], object]) -> None:
         wanted = min(x for x in (span.end, self.duration, float("inf")) if x is not None)
         if self.duration is not None and wanted - last > max(1.0, 0.02 * wanted) and last >= 0:
             complain(f"the video says that it is {self.duration:.1f} s long, but its pictures end after {last:.1f} s")
@@ -115,6 +114,12 @@ class Video(Footage):
                 return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
         except OSError as error:
             raise UserError(f"{self.path} cannot be read ({error.strerror})") from None
+
+
+def _report_damage(decoder: Decoder, count: int, complain: Callable[[str], object]) -> None:
+    if count:
+        shown = "; ".join(dict.fromkeys(decoder.errors[: min(count, _MAX_LISTED_ERRORS)]))
+        complain(f"the video is damaged: ffmpeg complains {count} times ({shown})")
 
 
 def open_video(path: Path) -> Video:

@@ -200,6 +200,19 @@ def test_damage_is_said(tmp_path: Path) -> None:
     assert said[1].startswith("the video says that it is 3.6 s long, but its pictures end after")
 
 
+def test_damage_before_the_end_is_said_and_behind_it_is_not(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (64, 64, 3), np.uint8) for _ in range(90)]
+    data = bytearray(encode(tmp_path / "a.mp4", noise, options=(*X264, "-g", "10")).read_bytes())
+    for place in range(len(data) // 3, len(data) // 2, 400):
+        data[place : place + 40] = bytes(40)
+    (tmp_path / "b.mp4").write_bytes(data)
+    pictures, said = read(tmp_path / "b.mp4", span=Span(0.0, 3.0))
+    assert len(pictures) < 75 and len(said) == 1 and said[0].startswith("the video is damaged: ffmpeg complains")
+    pictures, said = read(tmp_path / "b.mp4", span=Span(0.0, 0.6))
+    assert len(pictures) == 15 and not said
+
+
 REFUSED = {
     "text.mp4": (b"hello\n" * 100, "text.mp4 is not a video that ffmpeg can read (Invalid data found"),
     "text.txt": (b"hello\n" * 100, "text.txt is a text, not a video"),
