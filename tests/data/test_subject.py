@@ -25,7 +25,7 @@ from data_prep.prepare.prepare import prepare
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("prepared")
-    folder = write_tracked_folder(root / "subject", frames=10, size=64, height=48, suffix=".png")
+    folder = write_tracked_folder(root / "someone", frames=10, size=64, height=48, suffix=".png")
     head_path = folder / "head_model"
     return prepare(Source(folder, head_path, frame_offset=1), load_head_assets(head_path), out=root / "out", say=str)
 
@@ -34,7 +34,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def broken(prepared: Path, tmp_path: Path) -> Path:
     """A copy of subject and prepared folder to break."""
     shutil.copytree(prepared.parent, tmp_path / "copy")
-    edit_manifest(tmp_path / "copy" / "out", source=str(tmp_path / "copy" / "subject"))
+    edit_manifest(tmp_path / "copy" / "out", source=str(tmp_path / "copy" / "someone"))
     return tmp_path / "copy" / "out"
 
 
@@ -137,7 +137,7 @@ def test_a_damaged_subject_is_refused(name: str, broken: Path) -> None:
 IMAGE_CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "image gone": (lambda s: (s / "imgs/00003.png").unlink(), r"imgs/00003\.png does not exist"),
     "mask gone": (lambda s: (s / "parsing/00003_mouth.png").unlink(), r"00003_mouth\.png does not exist"),
-    "source gone": (shutil.rmtree, r"the subject's frames are gone: .*subject does not exist; prepare"),
+    "source gone": (shutil.rmtree, r"the subject's frames are gone: .*someone does not exist; prepare"),
     "image damaged": (lambda s: (s / "imgs/00003.png").write_bytes(b"?"), r"imgs/00003\.png is neither a JPEG nor"),
     "image of another size": (
         lambda s: cv2.imwrite(str(s / "imgs/00003.png"), np.zeros((8, 9, 3), np.uint8)),
@@ -190,7 +190,7 @@ def test_resized_frames_average_and_keep_the_view(prepared: Path) -> None:
 def test_frames_outside(index: int, prepared: Path) -> None:
     subject = Subject.open(prepared)
     for ask in (subject.frame, subject.camera, subject.params):
-        with pytest.raises(IndexError, match=f"frame {index} of subject subject, which has frames 0 to 9"):
+        with pytest.raises(IndexError, match=f"frame {index} of subject someone, which has frames 0 to 9"):
             ask(index)
     with pytest.raises(ValueError, match="size must be at least 1 pixel.* got 0"):
         subject.frame(0, size=0)

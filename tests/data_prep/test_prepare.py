@@ -42,10 +42,10 @@ def test_the_prepared_head_lies_on_the_masks(tmp_path: Path) -> None:
 
 
 def test_manifest_and_tracks(tmp_path: Path) -> None:
-    folder = write_tracked_folder(tmp_path / "subject", frames=15, offset=1, suffix=".png")
+    folder = write_tracked_folder(tmp_path / "someone", frames=15, offset=1, suffix=".png")
     subject, said = prepare_folder(folder, tmp_path / "out")
     manifest = subject.manifest
-    assert (manifest.name, manifest.fps, manifest.width, manifest.height) == ("subject", 25.0, 64, 64)
+    assert (manifest.name, manifest.fps, manifest.width, manifest.height) == ("someone", 25.0, 64, 64)
     assert manifest.frame_offset == 1 and manifest.offset_evidence == said[1]
     assert [(f.name, f.tracking) for f in manifest.frames] == [(f"{n + 1:05d}", n) for n in range(15)]
     assert manifest.frames[3].image == "imgs/00004.png" and manifest.frames[3].mouth_mask == "parsing/00004_mouth.png"
