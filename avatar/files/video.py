@@ -107,8 +107,9 @@ def _start_encoder(
         heard = ["-map", "0:v", "-map", "1:a?", "-c:a", codec]
     # -xerror: it ends with its first error, so that what it says fits into the pipe. Damaged sound is no such error.
     options = ["-y", "-loglevel", "error", "-xerror"] if sound is None else ["-y", "-loglevel", "fatal"]
+    out = f"file:{path}"  # a name may look like a protocol's
     return subprocess.Popen(
-        [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, *heard, str(path)],
+        [imageio_ffmpeg.get_ffmpeg_exe(), *options, *taken, *made, *heard, out],
         stdin=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,  # Ctrl-C in the terminal is for the caller: it may want the file completed

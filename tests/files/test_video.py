@@ -85,6 +85,12 @@ def test_an_encoder_that_ends_with_an_error_number_says_what_it_means(
         write_video(tmp_path / "clip.mp4", gradients(3, 64, 64), fps=25)
 
 
+def test_a_name_may_look_like_a_protocols(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_video(Path("take:1.mp4"), gradients(3, 64, 64), fps=25)
+    assert [path.name for path in tmp_path.iterdir()] == ["take:1.mp4"]
+
+
 def test_a_folder_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(UserError, match=r"the video .*clip\.mp4 cannot be written \(.*(Not a directory|File exists)"):
