@@ -187,7 +187,7 @@ def clips(trained: TrainedAvatar, drives: list[Path]) -> dict[str, Clip]:
     for path in drives:
         if path.suffix.lower() not in DRIVE_SUFFIXES:
             raise UserError(f"--drive takes drive files (.npz, .csv, .json), not {path}")
-        name = path.name if path.name not in found else str(path)
+        name = path.name if path.name not in found else str(path.absolute())
         found[name] = driven_clip(trained, open_drive_file(path, trained))
     return found
 

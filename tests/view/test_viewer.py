@@ -283,15 +283,17 @@ def test_what_cannot_be_shown_is_said(tracked_folder: Path, tmp_path: Path, monk
     assert "must be at least 8" in avatar("view", run, status=1)
 
 
-def test_drive_files_of_one_name_are_both_there(tracked_folder: Path, tmp_path: Path) -> None:
+def test_drive_files_of_one_name_are_both_there(tracked_folder: Path, tmp_path: Path, monkeypatch: Any) -> None:
     trained = lively_avatar(tracked_folder, tmp_path / "run")
-    paths = [tmp_path / folder / "x.npz" for folder in ("still", "moving")]
+    monkeypatch.chdir(tmp_path)
+    Path("still").mkdir()
+    paths = [Path("still/x.npz"), Path("x.npz")]
     for moves, path in enumerate(paths):
-        path.parent.mkdir()
         expression = np.zeros((2, trained.assets.num_expressions), np.float32)
         expression[1] = moves
         np.savez(path, expression=expression)
     found = clips(trained, paths)
-    assert list(found)[-2:] == ["x.npz", str(paths[1])]
-    still, moving = ([params.expression for params, _ in found[name].frames] for name in ("x.npz", str(paths[1])))
+    names = ["x.npz", str(tmp_path / "x.npz")]
+    assert list(found)[-2:] == names
+    still, moving = ([params.expression for params, _ in found[name].frames] for name in names)
     assert torch.equal(still[0], still[1]) and not torch.equal(moving[0], moving[1])
