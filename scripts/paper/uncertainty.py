@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,7 +81,7 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument("--frames", type=int, default=40, help="held-out frames, and as many of training")
     given = parser.parse_intermixed_args(words)
     request, status = request_of(given), 0
-    runs = {path.name: path for path in request.folders if (path / RUN_FILE).is_file()}
+    runs = named([path for path in request.folders if (path / RUN_FILE).is_file()])
     if not runs:
         status, spec = train(request, "uncertainty.to_train", systems([SYSTEM]))
         done = [job for job in spec.jobs if is_measured(given.out, job)]
@@ -92,6 +93,12 @@ def main(words: Sequence[str]) -> int:
     rows += [[f.name, name, *map(float, pair)] for f in found for name in PREDICTORS for pair in f.bins[name]]
     write_report(given.out, "uncertainty", page(found), rows, draw(found))
     return status
+
+
+def named(paths: Sequence[Path]) -> dict[str, Path]:
+    """Runs by their folders' names; those whose name another has, by their paths."""
+    names = [path.name for path in paths]
+    return {name if names.count(name) == 1 else str(path): path for name, path in zip(names, paths, strict=True)}
 
 
 def examine(run: Run, name: str, frames: int) -> Found:

@@ -200,6 +200,11 @@ def test_a_folder_may_have_an_equals_sign_in_its_name(tmp_path: Path) -> None:
     assert systems.folders_and_overrides([str(folder), "a.b=1", "someone"]) == ([folder, Path("someone")], ["a.b=1"])
 
 
+def test_runs_of_one_name_are_all_examined() -> None:
+    one, other, third = Path("me/run"), Path("you/run"), Path("n=8")
+    assert uncertainty.named([one, other, third]) == {"me/run": one, "you/run": other, "n=8": third}
+
+
 def test_finished_runs_are_examined_without_training(folder: Path, tmp_path: Path) -> None:
     run = lively_run(folder, tmp_path / "n=8", "data.size=32")
     words = [str(run), "--head", str(folder / "head_model"), "--out", str(tmp_path / "out"), "--frames", "1"]
