@@ -184,7 +184,7 @@ def made_layout(
 
 
 def _read_arrays(file: Path) -> Mapping[str, object]:
-    loaded = load_npz(file) if file.suffix == ".npz" else load_pickle(file)
+    loaded = load_npz(file) if file.suffix.lower() == ".npz" else load_pickle(file)
     if not isinstance(loaded, dict):
         raise UserError(f"{file} holds a {type(loaded).__name__}, not a dictionary of arrays")
     return loaded

@@ -26,7 +26,9 @@ def find_model_file(path: Path) -> Path:
             "(FLAME 2023 Open can be had from https://flame.is.tue.mpg.de)"
         )
     if not path.is_dir():
-        if path.is_file() and (path.suffix.lower() in ARCHIVES or (path.suffix != ".npz" and zipfile.is_zipfile(path))):
+        if path.is_file() and (
+            path.suffix.lower() in ARCHIVES or (path.suffix.lower() != ".npz" and zipfile.is_zipfile(path))
+        ):
             raise UserError(f"{path} is an archive; unpack it, and give --head the folder")
         if path.suffix.lower() not in MODEL_SUFFIXES:
             raise UserError(f"the head model {path} is neither .pkl nor .npz; give --head the model file or its folder")
@@ -51,7 +53,7 @@ def find_model_file(path: Path) -> Path:
 
 def candidates(folder: Path, depth: int = 0) -> list[Path]:
     """The files in the folder, or so many folders down, that could be a head model."""
-    found = (file for suffix in MODEL_SUFFIXES for file in folder.glob(f"{'*/' * depth}*{suffix}"))
+    found = (file for file in folder.glob(f"{'*/' * depth}*") if file.suffix.lower() in MODEL_SUFFIXES)
     return sorted(
         file
         for file in found

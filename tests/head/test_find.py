@@ -5,10 +5,12 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tracked_folder import write_head_model
 
 from avatar.errors import UserError
+from avatar.files.pickles import load_pickle
 from avatar.head.assets import load_head_assets
 from avatar.head.find import find_model_file
 
@@ -51,6 +53,16 @@ def test_several_that_could_be_it_are_named(model: Path, tmp_path: Path) -> None
     write_head_model(tmp_path / "two" / "b")
     with pytest.raises(UserError, match=r"several files that could be .*a/generic_model.pkl, b/generic_model.pkl"):
         find_model_file(tmp_path / "two")
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_suffix_may_be_written_large(named: bool, model: Path) -> None:
+    pickled, arrays = model / "generic_model.pkl", model / "MODEL.NPZ"
+    wanted = load_head_assets(model).fingerprint
+    with arrays.open("wb") as file:
+        np.savez(file, **load_pickle(pickled))
+    pickled.unlink()
+    assert load_head_assets(arrays if named else model).fingerprint == wanted
 
 
 @pytest.mark.parametrize("name", ["FLAME2023.zip", "FLAME2023.pkl", "FLAME2023"])
