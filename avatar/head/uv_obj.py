@@ -31,7 +31,7 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
         for number, line in enumerate(lines, start=1):  # noqa: B007 (the message names the line)
             if len(line) > MAX_LINE:
                 raise ValueError("no line is so long")
-            kind, _, rest = line.decode(errors="replace").partition(" ")
+            kind, _, rest = line.decode(errors="replace").strip().replace("\t", " ").partition(" ")
             if kind == "v":
                 positions += 1
             elif kind == "vt":

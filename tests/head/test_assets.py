@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from heads import grid_head
 
@@ -86,6 +87,13 @@ def test_the_objs_faces_may_come_in_another_order(head_dir: Path) -> None:
     order = np.random.default_rng(0).permutation(len(expected))
     (head_dir / "head_template.obj").write_text(obj_text(grid_head(), order))
     np.testing.assert_array_equal(load_head_assets(head_dir).uv_faces, expected)
+
+
+def test_the_objs_words_may_stand_apart_by_tabs(head_dir: Path) -> None:
+    expected = load_head_assets(head_dir)
+    (head_dir / "head_template.obj").write_text("  " + obj_text(grid_head()).replace(" ", "\t"))
+    found = load_head_assets(head_dir)
+    assert torch.equal(found.uvs, expected.uvs) and torch.equal(found.uv_faces, expected.uv_faces)
 
 
 def test_trimesh_reads_the_same_layout(head_dir: Path) -> None:
