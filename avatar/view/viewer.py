@@ -144,25 +144,27 @@ class Viewer:
         windows = tuple((number, client.camera.aspect) for number, client in clients.items())
         width = self._moving_width if is_moving else self._width
         key = (shown.key, setting, width, windows, is_moving, renderer)
-        if key != self._last:
-            self._last = key
-            begin = time.perf_counter()
-            picture = renderer.draw((shown.params, shown.camera), setting, width, shown.recorded)
-            self.milliseconds = 1000 * (time.perf_counter() - begin)
-            self.picture = picture
-            for number, aspect in windows:
-                self._send(clients[number], aspect, picture, is_moving)
-            if shown.taken is not None:
-                self.timing.add(shown.taken, time.monotonic())
-            if is_moving:
-                self._fit(self.milliseconds)
-        else:
-            self.wake.wait(0.01)
-            self.wake.clear()
-        if now - self._told > STATUS_EVERY:
-            self._told = now
-            is_recorded = shown.recorded is not None
-            self._show_status(renderer.distance(renderer.params(shown.params, setting)), setting, is_recorded)
+        try:
+            if key != self._last:
+                begin = time.perf_counter()
+                picture = renderer.draw((shown.params, shown.camera), setting, width, shown.recorded)
+                self._last = key  # one that could not be drawn is tried again
+                self.milliseconds = 1000 * (time.perf_counter() - begin)
+                self.picture = picture
+                for number, aspect in windows:
+                    self._send(clients[number], aspect, picture, is_moving)
+                if shown.taken is not None:
+                    self.timing.add(shown.taken, time.monotonic())
+                if is_moving:
+                    self._fit(self.milliseconds)
+            else:
+                self.wake.wait(0.01)
+                self.wake.clear()
+        finally:
+            if now - self._told > STATUS_EVERY:
+                self._told = now
+                is_recorded = shown.recorded is not None
+                self._show_status(renderer.distance(renderer.params(shown.params, setting)), setting, is_recorded)
 
     def _fit(self, milliseconds: float) -> None:
         low, high = TARGET_MS

@@ -7,6 +7,7 @@ from argparse import Namespace
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,6 +77,22 @@ def test_how_far_training_is(shown: TrainedAvatar) -> None:
     assert progress(early, run) == "Step 3 of 4: interrupted"
     with locked(run):
         assert progress(early, run) == "Step 3 of 4: training"
+
+
+def test_a_picture_that_could_not_be_drawn_is_drawn_later(viewer: Viewer) -> None:
+    until(lambda: viewer.picture is not None)
+    before, renderer = viewer.picture, viewer.renderer.of(viewer.renderer.trained)
+    draw, failures = renderer.draw, ["the GPU's memory is full: training has it"]
+
+    def draw_later(*arguments: Any) -> np.ndarray:
+        if failures:
+            raise RuntimeError(failures.pop())
+        return draw(*arguments)
+
+    renderer.draw = draw_later  # type: ignore[method-assign]
+    viewer.renderer = renderer
+    until(lambda: viewer.picture is not before)
+    assert not failures
 
 
 def test_the_viewer_shows_what_training_writes(
