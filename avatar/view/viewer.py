@@ -255,8 +255,10 @@ def padded(picture: np.ndarray, aspect: float, background: tuple[float, ...]) ->
 
 
 def _listen(host: str, port: int) -> socket.socket:
+    both = host == "::" and socket.has_dualstack_ipv6()  # else IPv6 alone, and not under the address that is printed
     try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"the viewer cannot listen on {host}:{port} ({reason}); give another --port") from None

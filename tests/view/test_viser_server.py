@@ -23,7 +23,7 @@ from websockets.typing import Origin
 
 from avatar.view import rate_limited_log, viser_server
 from avatar.view.view_renderer import ViewRenderer
-from avatar.view.viewer import LARGEST, Viewer
+from avatar.view.viewer import LARGEST, Viewer, _listen
 
 
 @pytest.fixture(autouse=True)
@@ -290,3 +290,9 @@ def test_complaints_are_counted() -> None:
     counted.close()
     assert lines[1] == "Viewer: a silent client (501 times)" and lines.count("Viewer: a silent client (502 times)") == 1
     assert len(lines) <= rate_limited_log.MAX_KINDS + 5
+
+
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this system has no IPv6")
+def test_every_address_is_ipv4s_too() -> None:
+    with _listen("::", 0) as listening:
+        socket.create_connection(("127.0.0.1", listening.getsockname()[1]), 5).close()
