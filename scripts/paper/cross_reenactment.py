@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,8 +70,9 @@ def main(words: Sequence[str]) -> int:
         driver = open_driver(folder, request, next(iter(avatars.values())))
         chosen = farthest(torch.stack([driver.params(i).expression for i in range(len(driver))]), given.frames)
         own = [driver.frame(i, next(iter(avatars.values())).config.data.size).image for i in chosen]
-        pictures[driver.name] = [as_bytes(image) for image in own]
-        found += [drive(trained, name, driver, chosen) for name, trained in avatars.items()]
+        label = driver.name if driver.name not in pictures else str(folder)
+        pictures[label] = [as_bytes(image) for image in own]
+        found += [replace(drive(trained, name, driver, chosen), driver=label) for name, trained in avatars.items()]
     rows = [["driver", "avatar", "frame", "distance"]]
     rows += [
         [f.driver, f.avatar, n, float(f.distances[i])] for f in found for n, i in zip(f.frames, f.shown, strict=True)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+from argparse import Namespace
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import conditioning
 import convergence
@@ -158,6 +161,34 @@ def test_uncertainty_and_cross_reenactment_leave_what_they_say(folder: Path, tmp
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit, match="there is no system 'NDGS'; there are FlashAvatar"):
         cross_reenactment.main([*words, "--systems", "NDGS"])
+
+
+def test_drivers_of_one_name_are_all_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job, trained = (
+        Namespace(subject="anna", variant="ours", seed=0),
+        Namespace(config=Namespace(data=Namespace(size=8))),
+    )
+    made: dict[str, Any] = {
+        "train": (0, Namespace(jobs=[job])),
+        "is_measured": True,
+        "run_of": tmp_path,
+        "open_trained": trained,
+    }
+
+    def driven(trained: Any, name: str, driver: Any, chosen: list[int]) -> cross_reenactment.Driven:
+        pictures = [np.zeros((8, 8, 3), np.uint8)] * len(chosen)
+        return cross_reenactment.Driven(driver.name, name, ["0", "1"], np.zeros(2), chosen, pictures)
+
+    made["open_driver"] = driver = MagicMock()
+    driver.name, driver.__len__.return_value = "ben", 2
+    driver.params = lambda i: Namespace(expression=torch.full((2,), float(i)))
+    driver.frame = lambda *_: Namespace(image=torch.zeros(8, 8, 3))
+    for name, value in made.items():
+        monkeypatch.setattr(cross_reenactment, name, lambda *_, value=value: value)
+    monkeypatch.setattr(cross_reenactment, "drive", driven)
+    words = ["anna", "--out", str(tmp_path), "--frames", "2", "--drivers", "old/ben", "new/ben"]
+    assert cross_reenactment.main(words) == 0
+    assert [line["driver"] for line in lines(tmp_path / "cross_reenactment.csv")] == ["ben"] * 2 + ["new/ben"] * 2
 
 
 def test_frames_of_a_driver_differ() -> None:
