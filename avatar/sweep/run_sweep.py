@@ -44,7 +44,7 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
     places = {job.name: folder / "jobs" / job.name for job in spec.jobs}
     states = {name: read_state(place) for name, place in places.items()}
     handles: dict[str, Any] = {}
-    left: dict[str, State] = {}  # by whoever had the job before its worker begins
+    left: dict[str, State] = {}  # of each job when it was submitted
     stalls, ended = StallTimer(), dict[str, str]()
 
     def submit(names: list[str]) -> None:
