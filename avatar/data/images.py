@@ -6,7 +6,6 @@ The foreground matte of an image is a mask file, or the image itself: then its t
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -22,15 +21,6 @@ _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 _PALETTE = 3  # the colour type of a PNG that holds indices into a palette
 _ORIENTATION = 0x0112  # EXIF 2.3
-_TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {  # by its value; 1 is upright
-    2: lambda pixels: pixels[:, ::-1],
-    3: lambda pixels: pixels[::-1, ::-1],
-    4: lambda pixels: pixels[::-1],
-    5: lambda pixels: pixels.T,
-    6: lambda pixels: pixels[::-1].T,
-    7: lambda pixels: pixels[::-1, ::-1].T,
-    8: lambda pixels: pixels.T[::-1],
-}
 EVERY_LABEL = 0  # as a label: every value but 0 is the person
 MAX_PIXELS = 2**26  # 8192x8192; a decoder allocates what the header says before it looks how much there is
 MAX_BYTES = 2**28  # of a file
@@ -140,14 +130,15 @@ def _upright(pixels: np.ndarray, data: bytes) -> np.ndarray:
     """The pixels [H, W] of a PNG as they stood in the file, turned as its EXIF says; OpenCV turns colours and greys so."""
     if b"eXIf" not in data:
         return pixels
-    from PIL import Image
+    from PIL import Image, ImageOps
 
+    turned = Image.fromarray(pixels)
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            turn = _TURNS.get(image.getexif().get(_ORIENTATION, 1))
+            turned.getexif()[_ORIENTATION] = image.getexif().get(_ORIENTATION, 1)
     except Exception:  # a header may be damaged in many ways; OpenCV leaves such a picture as it is
         return pixels
-    return pixels if turn is None else np.ascontiguousarray(turn(pixels))
+    return np.array(ImageOps.exif_transpose(turned))
 
 
 def read_bytes(path: Path) -> bytes:

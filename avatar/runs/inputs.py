@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Collection
 from dataclasses import fields
 
@@ -47,15 +48,15 @@ def checked_camera(camera: object) -> Camera:
 
 def checked_size(size: int | None) -> int | None:
     """A picture's width in pixels, or None. Raises UserError for any other value."""
-    if size is not None and (not isinstance(size, int) or size < 1):
+    if size is not None and (not isinstance(size, numbers.Integral) or size < 1):
         raise UserError(f"size is {size!r}: give a whole number of pixels, at least 1")
-    return size
+    return None if size is None else int(size)
 
 
 def check_turn(yaw: float, pitch: float, zoom: float) -> None:
     """Raises UserError, naming the value, where they are not degrees, degrees and a factor above 0."""
     for name, value in (("yaw", yaw), ("pitch", pitch), ("zoom", zoom)):
-        if not isinstance(value, int | float) or not math.isfinite(value):
+        if not isinstance(value, numbers.Real) or not math.isfinite(value):
             raise UserError(f"{name} is {value!r}, not a finite number")
     if zoom <= 0:
         raise UserError(f"zoom is {zoom}: give a factor above 0")

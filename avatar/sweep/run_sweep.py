@@ -44,13 +44,13 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
     places = {job.name: folder / "jobs" / job.name for job in spec.jobs}
     states = {name: read_state(place) for name, place in places.items()}
     handles: dict[str, Any] = {}
-    left: dict[str, State] = {}  # of each job when it was submitted
+    submitted: dict[str, State] = {}  # what each job's state was then
     stalls, ended = StallTimer(), dict[str, str]()
 
     def submit(names: list[str]) -> None:
         if names:
-            left.update({name: stored_state(places[name]) for name in names})
             for name in names:
+                submitted[name] = stored_state(places[name])
                 stalls.begin(places[name])
             handles.update(zip(names, engine.submit([places[name] for name in names]), strict=True))
 
@@ -71,7 +71,7 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                     continue
                 states[name] = read_state(places[name])
                 stored = stored_state(places[name])
-                is_running = name not in ended and stored.status == "running" and stored != left[name]
+                is_running = name not in ended and stored.status == "running" and stored != submitted[name]
                 if is_running and stalls.stalled_seconds(places[name]) > STALLED_SECONDS:
                     ended[name] = f"the worker hung: no progress for {duration(STALLED_SECONDS)}"
                     engine.stop([handle])

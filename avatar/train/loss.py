@@ -11,7 +11,7 @@ from typing import NamedTuple, cast
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, l1_loss
+from torch.nn.functional import avg_pool2d, l1_loss
 
 from avatar.compute.device import CPU
 from avatar.config import TrainerConfig
@@ -127,12 +127,8 @@ class TrainingLoss:
 def at_size(image: Float[Tensor, "H W C"], other: Float[Tensor, "h w _"]) -> Float[Tensor, "h w C"]:
     """`image` at the size of `other`, which is a whole number of times smaller and may reach beyond it at the right and the
     bottom: means over the area of each pixel, as far as the image has it."""
-    (H, W), (h, w) = image.shape[:2], other.shape[:2]
-    planes, factor = image.permute(2, 0, 1)[None], -(-max(H, W) // max(h, w))
-    if (factor * h, factor * w) == (H, W):
-        small = interpolate(planes, size=(h, w), mode="area")
-    else:
-        small = avg_pool2d(planes, factor, ceil_mode=True, count_include_pad=False)
+    factor = -(-max(image.shape[:2]) // max(other.shape[:2]))
+    small = avg_pool2d(image.permute(2, 0, 1)[None], factor, ceil_mode=True, count_include_pad=False)
     return small[0].permute(1, 2, 0)
 
 

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from small_runs import train_small
@@ -98,6 +99,12 @@ def test_the_cameras_width_is_a_whole_number_of_pixels(anna: TrainedAvatar) -> N
 def test_a_pose_that_is_no_picture_names_the_value(wrong: dict[str, Any], anna: TrainedAvatar) -> None:
     with pytest.raises(UserError, match=f"^{next(iter(wrong))} is "):
         anna.pose(**wrong)
+
+
+def test_a_pose_takes_the_numbers_of_numpy(anna: TrainedAvatar) -> None:
+    ours = anna.pose(yaw=5, pitch=2.5, zoom=1.5, size=32)
+    theirs = anna.pose(yaw=np.int64(5), pitch=np.float32(2.5), zoom=np.float64(1.5), size=np.int64(32))  # type: ignore[arg-type]
+    assert torch.equal(ours.image, theirs.image)
 
 
 def test_a_joint_that_moves_no_vertex_is_no_pose(anna: TrainedAvatar) -> None:

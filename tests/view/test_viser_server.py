@@ -294,5 +294,5 @@ def test_complaints_are_counted() -> None:
 
 @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this system has no IPv6")
 def test_every_address_is_ipv4s_too() -> None:
-    with _listen("::", 0) as listening:
-        socket.create_connection(("127.0.0.1", listening.getsockname()[1]), 5).close()
+    with _listen("::", 0) as listening, socket.socket() as caller:
+        assert caller.connect_ex(("127.0.0.1", listening.getsockname()[1])) == 0
