@@ -12,7 +12,10 @@ from pathlib import Path
 
 from avatar.bench import PARTS
 from avatar.commands.parser import build_parser
+from avatar.errors import UserError
+from avatar.files.read import is_there
 
+INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver")  # paths that are read; create has its own list
 KEY = re.compile(r"[+~]*[A-Za-z_][\w.]*")  # Hydra's own signs are no part of our keys, and refused as such
 
 
@@ -44,6 +47,14 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         arguments.words += rest
         SORTED_BY[arguments.command](commands[arguments.command], arguments)
     return arguments
+
+
+def refuse_missing(arguments: argparse.Namespace) -> None:
+    """Raises UserError for an input that nothing has the name of: before the command is imported, which takes seconds."""
+    for value in (getattr(arguments, name, None) for name in INPUTS):
+        for path in value if isinstance(value, list) else [value]:
+            if isinstance(path, Path) and not is_there(path):
+                raise UserError(f"{path}: there is no such file or folder")
 
 
 def nearest(word: str, known: Iterable[str] | Mapping[str, object]) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from avatar.commands import find_command
-from avatar.commands.arguments import parse
+from avatar.commands.arguments import parse, refuse_missing
 from avatar.errors import UserError
 
 EXIT_ERROR = 1
@@ -23,6 +23,7 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
     """
     try:
         arguments = parse(argv)
+        refuse_missing(arguments)
         command = find_command(arguments.command)
         when_loaded()
         return command(arguments)

@@ -10,7 +10,6 @@ from avatar.commands.outputs import check_file, check_outputs
 from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.numbered import existing
-from avatar.files.read import is_there
 from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
 from avatar.pipeline.backdrop import parse_backdrop
@@ -32,8 +31,6 @@ def run_reenact(arguments: Namespace) -> int:
     is_drive_file = driver.suffix.lower() in DRIVE_SUFFIXES
     if is_drive_file:
         refuse_reading_options(arguments)
-    if not is_there(driver):
-        raise UserError(f"{driver}: there is no such file or folder")
     trained = open_trained(arguments.run, arguments.head)
     trained.avatar.to(choose_device(arguments.device or "auto", print))
     backdrop = None if arguments.background is None else parse_backdrop(arguments.background)

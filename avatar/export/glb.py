@@ -20,6 +20,7 @@ from avatar.motion.controls import expression_controls, joint_ranges, joint_valu
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 
+NOTABLE = 0.2  # of a range, at its upper end: with less, training has not shown what the name says
 LEAST = 1e-6  # metres: a target that moves nothing so far is left out
 FLOAT = 5126  # of glTF
 
@@ -85,12 +86,19 @@ def offsets(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tenso
     for control in expression_controls(
         trained.recording.tracks["expression"][trained.recording.times(train)], trained.neutral.expression, head
     ):
-        far = max(control.low, control.high, key=abs)
-        moved = replace(params, expression=params.expression + far * control.direction)
-        found[f"{control.part}: {control.name}"] = head.vertices(moved) - start
+        far, ending = _end(control.low, control.high)
+        own_share = float((params.expression - trained.neutral.expression) @ control.direction)
+        moved = replace(params, expression=params.expression + (far - own_share) * control.direction)
+        found[f"{control.part}: {control.name}{ending}"] = head.vertices(moved) - start
     own = {joint: float(value) for joint, value in joint_values([params]).items()}
     start = head.vertices(posed(params, None, own))
     for joint, (low, high) in joint_ranges(trained.recording.motion(train)).items():
-        moved = posed(params, None, {**own, joint: max(low, high, key=abs)})
-        found[joint.replace("_", " ")] = head.vertices(moved) - start
+        far, ending = _end(low, high)
+        moved = posed(params, None, {**own, joint: far})
+        found[joint.replace("_", " ") + ending] = head.vertices(moved) - start
     return found
+
+
+def _end(low: float, high: float) -> tuple[float, str]:
+    """How far a target goes, and what its name ends with: to where the name says, unless training hardly shows that."""
+    return (high, "") if high >= NOTABLE * (high - low) else (low, " (reversed)")

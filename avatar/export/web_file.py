@@ -157,6 +157,8 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
         "camera": {
             "rotation": camera.R_cam_world.flatten().tolist(),
             "translation": camera.t_cam_world.tolist(),
+            # How the head is turned, which stays when a camera of a rig moves around it; null: before this camera.
+            "head": None if recording.rig is None else camera.head_rotation.flatten().tolist(),
             "fx": camera.fx / camera.width,
             "fy": camera.fy / camera.width,
             "cx": camera.cx / camera.width,

@@ -25,6 +25,7 @@ __all__ = ["CannotDraw", "checked_drawings", "is_checked", "splat", "splat_featu
 Backend = Literal["cpu", "gpu", "reference"]
 
 MAX_SIDE = 1 << 15  # pixels
+MAX_GPU_PIXELS = 2**31 // 3  # the kernels count the values of a picture in 32 bits
 T_MIN = 1e-30
 NEAR = 0.01  # metres
 
@@ -215,3 +216,5 @@ def _check_camera(camera: Camera, device: torch.device, backend: str) -> None:
         value = getattr(camera, name)
         if not 1 <= value <= MAX_SIDE:
             raise ValueError(f"camera.{name} must be 1 to {MAX_SIDE} pixels, got {value}")
+    if backend == "gpu" and camera.width * camera.height > MAX_GPU_PIXELS:
+        raise ValueError(f"camera has {camera.width}x{camera.height} pixels; a GPU draws at most {MAX_GPU_PIXELS}")

@@ -59,7 +59,8 @@ def intrinsics_on(camera: Camera, blur: float, near: float, device: torch.device
 
 @lru_cache(maxsize=8192)  # the frames of a training come again
 def _uploaded(values: tuple[float, ...], device: torch.device) -> Tensor:
-    return to_device(torch.tensor(values, dtype=torch.float64), device)
+    with torch.inference_mode(False):  # backward passes may save it later
+        return to_device(torch.tensor(values, dtype=torch.float64), device)
 
 
 @cache  # for good: a CUDA graph reads them

@@ -30,7 +30,7 @@ from avatar.train.zoom import Zoom, zoomed
 from avatar.types import Camera
 
 WARM = 3  # steps of a kind that are launched before: they compile, and make what is made once
-KEPT = 8  # kinds that are ready at a time
+KEPT = 8  # kinds of each lens that are ready at a time
 BLOCK = 64  # steps whose noise comes to a GPU at once
 
 
@@ -41,12 +41,14 @@ class Kind(NamedTuple):
     sh_degree: int
     term: Weighted | None
     crop: tuple[int, int] | None  # height and width of what the perceptual term sees
+    lens: tuple[float, float, float, float]  # fx, fy, cx, cy: launches hold them as numbers
 
     @classmethod
     def of(cls, step: int, inputs: StepInputs, term: Weighted | None) -> Kind:
         camera, rows, columns = inputs.frame.camera, inputs.crop_rows, inputs.crop_columns
         crop = None if rows is None or columns is None else (len(rows), len(columns))
-        return cls((camera.width, camera.height), sh_degree(step), term, crop)
+        lens = camera.fx, camera.fy, camera.cx, camera.cy
+        return cls((camera.width, camera.height), sh_degree(step), term, crop, lens)
 
 
 class FrameConstants(NamedTuple):
@@ -171,7 +173,8 @@ class StepRunner:
             self._replays = False
             self._say(f"Steps are launched one operation at a time, because they cannot be replayed: {error}")
             return None
-        while len(self._captured) >= KEPT:
+        lenses = {known.lens for known in self._launched}
+        while len(self._captured) >= KEPT * max(len(lenses), 1):
             self._captured.popitem(last=False)
         self._captured[kind] = replay
         return replay

@@ -15,7 +15,14 @@ from torch import Tensor
 
 from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
-from avatar.motion.controls import JOINT_FIELD, ExpressionControl, expression_controls, joint_ranges, posed
+from avatar.motion.controls import (
+    JOINT_FIELD,
+    ExpressionControl,
+    expression_controls,
+    joint_ranges,
+    joint_values,
+    posed,
+)
 from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import checked_drawings
@@ -96,7 +103,8 @@ class ViewRenderer:
         for number, value in setting.expressions.items():
             expression = expression + value * self.controls[number].direction
         moved = {name: value for name, value in setting.joints.items() if value != 0.0}
-        by_hand = posed(frame, None, moved)
+        own = {name: float(value) for name, value in joint_values([frame]).items()}
+        by_hand = posed(frame, None, {**own, **moved})
         fields = {JOINT_FIELD.get(name, "eyes") for name in moved} - {"eyelids"}
         eyelids = frame.eyelids.clone()
         for k, name in enumerate(("left_lid", "right_lid")):

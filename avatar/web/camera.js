@@ -47,6 +47,7 @@ export class FaceCamera extends EventTarget {
   async start(source) {
     try {
       this.#tell("starting", "Loading the landmarker …");
+      checkCamera();
       const files = await loadLandmarker(source);
       if (this.state === "starting") await this.#load(files);
       if (this.state === "starting") this.#tell("starting", "Waiting for the camera …");
@@ -191,11 +192,14 @@ export class FaceCamera extends EventTarget {
 
 const CALM = "Look into the camera for a moment, calmly, lips closed.";
 
-async function openCamera() {
+function checkCamera() {
   if (!navigator.mediaDevices?.getUserMedia)
     throw new AvatarError("This browser gives a page at such an address no camera: open it from a file, from this machine or with https.");
   if (!("requestVideoFrameCallback" in HTMLVideoElement.prototype))
     throw new AvatarError("This browser is too old to follow a face.");
+}
+
+async function openCamera() {
   const wanted = { video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 30 } }, audio: false };
   return navigator.mediaDevices.getUserMedia(wanted).catch((error) => {
     throw new AvatarError(REFUSALS[error.name] ?? `The camera cannot be used (${error.message}).`);

@@ -21,12 +21,14 @@ const PRESETS = { // name -> sliders and shares of their range, which may depend
 };
 const PAUSE = 80; // milliseconds after which sliders follow a motion: they cost time that the picture could have
 const EASE = 0.25; // seconds that a preset takes to come and to go
+const NOTABLE = 0.2; // of a slider's range above its rest: with less, training has not shown what the name says
 
 /** Fill the page with sliders and presets. `putBack` puts them all back; `isGazeHeld` tells whether a slider has set the eyes. */
 export function makeControls(view, header, { presets, first, more }) {
   const sliders = [...faceSliders(view, header), ...cameraSliders(view)], followers = new Map([[first, []], [more, []]]);
+  const stop = makePresets(view, sliders, presets);
   const add = (list, box, label, members) => {
-    const made = row(view, label, members);
+    const made = row(view, label, members, () => stop(members));
     followers.get(list).push(made.follow);
     box.append(made.label);
   };
@@ -48,7 +50,6 @@ export function makeControls(view, header, { presets, first, more }) {
   let due;
   for (const type of ["drawn", "view"]) view.addEventListener(type, () => (due ??= setTimeout(() => follow((due = undefined)), PAUSE)));
   details.addEventListener("toggle", follow);
-  const stop = makePresets(view, sliders, presets);
   const held = sliders.find((slider) => slider.held)?.held ?? new Map();
   const putBack = () => {
     stop();
@@ -57,6 +58,8 @@ export function makeControls(view, header, { presets, first, more }) {
   };
   return { putBack, isGazeHeld: () => held.has("look_left") || held.has("look_down") };
 }
+
+const rises = ({ range: [low, high], rest }) => high - rest > NOTABLE * (high - low);
 
 /** Sliders of a pattern: of all sides of the face, or the first where the names tell no sides. */
 function matching(sliders, pattern) {
@@ -77,13 +80,13 @@ function faceSliders(view, header) {
   const pose = (name, value) => {
     if (value === null) held.delete(name);
     else held.set(name, value);
-    const of = (...names) => (names.some((n) => held.has(n)) ? names.map((n) => held.get(n) ?? 0) : null);
+    const of = (...names) => (names.some((n) => held.has(n)) ? names.map((n) => held.get(n) ?? null) : null);
     if (name === "jaw") view.setPose({ jaw: value === null ? null : [value, 0, 0] });
     else if (name.endsWith("lid")) view.setPose({ lids: of("left_lid", "right_lid") });
     else if (name.startsWith("look")) view.setPose({ gaze: of("look_down", "look_left")?.concat(0) ?? null });
     else view.setPose({ neck: of("lean", "turn")?.concat(0) ?? null });
   };
-  const made = header.controls.map(({ group, name, range, values }) => ({
+  const made = header.controls.filter(({ range: [low, high] }) => high > low).map(({ group, name, range, values }) => ({
     group, name, range, rest: 0,
     set: (value) => view.setExpression({ [`${group}: ${name}`]: value }),
     read: (p) => values.reduce((sum, share, i) => (share === 0 ? sum : sum + share * (p[i] - rest[i])), 0),
@@ -102,8 +105,9 @@ function cameraSliders(view) {
   }));
 }
 
-/** A slider that moves one or several, with a mark at the neutral face, to which a double click returns. */
-function row(view, text, members) {
+/** A slider that moves one or several, with a mark at the neutral face, to which a double click returns. `begin` is called
+ * before it moves them. */
+function row(view, text, members, begin) {
   const low = Math.min(...members.map(({ range }) => range[0])), high = Math.max(...members.map(({ range }) => range[1]));
   const { group, rest } = members[0], name = members.length > 1 || FIRST[text] ? text : `${group}: ${text}`;
   const label = Object.assign(document.createElement("label"), { className: "row" });
@@ -113,12 +117,14 @@ function row(view, text, members) {
   input.style.setProperty("--rest", share(rest));
   input.setAttribute("aria-label", name);
   const set = () => {
+    begin();
     for (const { set, range } of members) set(Math.min(Math.max(Number(input.value), range[0]), range[1]));
     fill();
   };
   input.addEventListener("input", set);
   input.addEventListener("dblclick", () => {
     input.value = rest;
+    begin();
     for (const { set } of members) set(null);
     fill();
   });
@@ -135,11 +141,13 @@ function row(view, text, members) {
   return { label, follow };
 }
 
-/** Buttons that move several sliders until they are pressed again. Returns a function that stops them. */
+/** Buttons that move several sliders until they are pressed again. Returns a function that stops one, of certain sliders only
+ * where it is given those. */
 function makePresets(view, sliders, box) {
   let running = null; // { button, moves, since, left }
   const isCalm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const stop = () => {
+  const stop = (members) => {
+    if (members && !running?.moves.some(({ slider }) => members.includes(slider))) return;
     running?.button.setAttribute("aria-pressed", "false");
     for (const { slider } of running?.moves ?? []) slider.set(null);
     running = null;
@@ -150,14 +158,15 @@ function makePresets(view, sliders, box) {
     const come = isCalm ? 1 : Math.min(Math.max(seconds, 0) / EASE, 1), gone = left === undefined ? 0 : isCalm ? 1 : (now - left) / 1000 / EASE;
     if (gone >= 1) return stop();
     for (const { slider, share } of moves) {
-      const [low, high] = slider.range, end = high > -low ? high : low;
-      slider.set(slider.rest + come * (1 - gone) * (typeof share === "function" ? share(seconds) : share) * (end - slider.rest));
+      const most = slider.range[1] - slider.rest;
+      slider.set(slider.rest + come * (1 - gone) * (typeof share === "function" ? share(seconds) : share) * most);
     }
     requestAnimationFrame(step);
   };
+  const able = sliders.filter(rises);
   for (const [name, parts] of Object.entries(PRESETS)) {
-    if (matching(sliders, parts[0][0]).length === 0) continue; // what it is about
-    const moves = parts.flatMap(([pattern, share]) => matching(sliders, pattern).map((slider) => ({ slider, share })));
+    if (matching(able, parts[0][0]).length === 0) continue; // what it is about
+    const moves = parts.flatMap(([pattern, share]) => matching(able, pattern).map((slider) => ({ slider, share })));
     const button = Object.assign(document.createElement("button"), { type: "button", textContent: name });
     button.setAttribute("aria-pressed", "false");
     button.addEventListener("click", () => {

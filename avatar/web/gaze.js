@@ -18,8 +18,7 @@ export function followPointer(view, header, isHeld) {
     if (!isOn) return letGo();
     requestAnimationFrame(step);
     if (!target || isHeld() || !["idle", "rest"].includes(view.motion)) return letGo();
-    if (now.every((v, i) => Math.abs(v - target[i]) < 1e-4) && isSet) return;
-    now = now.map((v, i) => v + 0.25 * (target[i] - v));
+    if (!now.every((v, i) => Math.abs(v - target[i]) < 1e-4)) now = now.map((v, i) => v + 0.25 * (target[i] - v));
     view.setPose({ gaze: [...now, 0] });
     isSet = true;
   };

@@ -16,11 +16,12 @@ export interface Header {
   };
   rest: number[]; // the neutral face: expression, jaw 6, eyes 12, eyelids 2, neck 6
 }
-export interface Pose { // null lets go
-  jaw?: [number, number, number] | null;
-  gaze?: [number, number, number] | null;
-  neck?: [number, number, number] | null;
-  lids?: [left: number, right: number] | null; // 0 open, 1 closed
+export type Vector = [x: number | null, y: number | null, z: number | null];
+export interface Pose { // null lets go, also of one number
+  jaw?: Vector | null;
+  gaze?: Vector | null;
+  neck?: Vector | null;
+  lids?: [left: number | null, right: number | null] | null; // 0 open, 1 closed
   head?: [yaw: number, pitch: number] | null;
 }
 export type Motion = "idle" | "recorded" | "rest";
@@ -81,7 +82,7 @@ export class FaceCamera extends EventTarget {
   calibrate(): void;
 }
 /** Pointer, touch, wheel and keys on an element turn and zoom a view, until the function that is returned is called. */
-export function steer(view: AvatarView, element: HTMLElement): () => void;
+export function orbitControls(view: AvatarView, element: HTMLElement): () => void;
 /** <avatar-view src="..." renderer="auto">: fires "load", "drawn" and "error", whose detail is a sentence. */
 export class AvatarViewElement extends HTMLElement {
   readonly view?: AvatarView;

@@ -84,7 +84,10 @@ export class AvatarViewElement extends HTMLElement {
       view.resize(header.size, canvas.clientWidth * devicePixelRatio);
       canvas.setAttribute("aria-label", `Avatar of ${header.name}. Arrow keys turn it.`);
       this.#letGo = orbitControls(view, canvas);
-      view.addEventListener("drawn", () => this.dispatchEvent(new Event("drawn")));
+      view.addEventListener("drawn", () => {
+        message.hidden = true;
+        this.dispatchEvent(new Event("drawn"));
+      });
       view.addEventListener("failed", ({ detail }) => this.#say(detail));
       this.dispatchEvent(new Event("load"));
       return header;

@@ -12,6 +12,13 @@ export function rotation([x, y, z]) {
   ];
 }
 
+/** Of a rotation's first two rows: `rotation` takes it back. */
+export function rotationVector(six) {
+  const m = whole(six), axis = [m[7] - m[5], m[2] - m[6], m[3] - m[1]], sine = Math.hypot(...axis) / 2;
+  const angle = Math.atan2(sine, (m[0] + m[4] + m[8] - 1) / 2);
+  return axis.map((value) => (sine < 1e-9 ? 0 : (value * angle) / (2 * sine)));
+}
+
 export function multiply(a, b) {
   const out = new Array(9).fill(0);
   for (let i = 0; i < 3; ++i)
@@ -53,6 +60,7 @@ export function recorded(core, index) {
   return {
     parameters: core.motion.subarray(count * index, count * (index + 1)),
     rotation: Array.from(pose.subarray(0, 9)),
+    head: core.header.camera.head && Array.from(pose.subarray(0, 9)),
     translation: Array.from(pose.subarray(9, 12)),
   };
 }
@@ -100,7 +108,8 @@ const noise = (n) => {
 export function blended(from, to, share) {
   const mix = (name) => Float32Array.from(from[name], (value, i) => value + share * (to[name][i] - value));
   const [translation, rotation, turn] = ["translation", "rotation", "turn"].map((name) => Array.from(mix(name)));
-  return { parameters: mix("parameters"), translation, rotation: orthonormal(rotation), turn };
+  const head = to.head && orthonormal(Array.from(mix("head")));
+  return { parameters: mix("parameters"), translation, rotation: orthonormal(rotation), head, turn };
 }
 
 /** The rotation whose first rows are nearest to a matrix's. */

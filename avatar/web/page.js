@@ -19,13 +19,20 @@ async function start() {
   const parts = { worker: makeWorker("worker"), wasm: decoded("module"), file: decoded("data") };
   const view = new AvatarView(find("canvas"), parts, options);
   window.avatar = view; // for the curious, and for tests
-  view.addEventListener("failed", ({ detail }) => say(detail));
+  let isWaiting = true; // for a picture, with a sentence that tells so
+  view.addEventListener("failed", ({ detail }) => {
+    isWaiting = true;
+    say(detail);
+  });
   const header = await view.ready;
   orbitControls(view, find("canvas"));
   const [presets, first, more] = ["presets", "first", "more"].map(find);
   const { putBack, isGazeHeld } = makeControls(view, header, { presets, first, more });
   const putStageBack = connectPageDisplay(view, header, isGazeHeld, () => find("play").click());
-  view.addEventListener("drawn", () => say(""), { once: true });
+  view.addEventListener("drawn", () => {
+    if (isWaiting) say("");
+    isWaiting = false;
+  });
   view.addEventListener("view", () => (find("guess").hidden = view.isSupported));
   connectBar(view, header, putBack, putStageBack);
   if (asked.has("autoplay") && !options.still) view.play("recorded");
@@ -69,7 +76,7 @@ function connectBar(view, header, putBack, putStageBack) {
   view.addEventListener("motion", () => (play.textContent = view.isPlaying ? "Pause" : "Play"));
   view.addEventListener("drawn", () => {
     if (view.isPlaying || document.activeElement !== scrub) scrub.value = String(view.time);
-    scrub.style.setProperty("--at", scrub.value / (scrub.max || 1));
+    scrub.style.setProperty("--at", scrub.value / (Number(scrub.max) || 1));
     time.textContent = `${clock(view.time)} / ${clock(seconds)}`;
     scrub.setAttribute("aria-valuetext", `${view.time.toFixed(1)} seconds of ${seconds.toFixed(1)}`);
     const { milliseconds } = view.statistics, where = view.renderer === "webgl" ? "GPU" : "processor";
@@ -97,8 +104,10 @@ function connectBar(view, header, putBack, putStageBack) {
 
 /** How many of the screen's own pixels the picture is wide. */
 function shownWidth(header) {
-  const { clientWidth, clientHeight } = find("canvas");
-  return Math.min(clientWidth, clientHeight * header.camera.aspect) * devicePixelRatio;
+  const { clientWidth: width, clientHeight: height } = find("canvas"), { aspect } = header.camera;
+  // A height that nothing limits follows the picture's own, which is rounded: the width must not follow it in turn.
+  const isLimited = height < width / aspect - 2;
+  return (isLimited ? height * aspect : width) * devicePixelRatio;
 }
 
 /**

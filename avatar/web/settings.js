@@ -1,10 +1,13 @@
 // What a caller has set on a face: it stays until it is released, whatever else moves the face.
 import { AvatarError } from "./core.js";
-import { places, rotation, sixD } from "./motion.js";
+import { places, rotation, rotationVector, sixD } from "./motion.js";
+
+const COUNTS = { jaw: 3, gaze: 3, neck: 3, lids: 2, head: 2 }; // numbers of each part of a pose
 
 export class Settings {
   #header;
   #pinned = new Map(); // parameter index -> value
+  #turns = new Map(); // first index of a rotation -> its vector
   #controls = new Map(); // control -> value
   turned = [0, 0]; // of the head: yaw and pitch in degrees
 
@@ -27,11 +30,20 @@ export class Settings {
     return unknown;
   }
 
-  /** What is null is let go of. */
-  setPose({ jaw, gaze, neck, lids, head } = {}) {
-    const at = places(this.#header.sizes.expressions);
+  /** What is null is let go of, also one of several numbers. Throws AvatarError for another number of them, and for others. */
+  setPose(pose = {}) {
+    const at = places(this.#header.sizes.expressions), { jaw, gaze, neck, lids, head } = pose;
+    for (const [name, count] of Object.entries(COUNTS)) {
+      const given = Array.from(pose[name] ?? Array(count).fill(null));
+      if (given.length !== count || !given.every((value) => value === null || Number.isFinite(value)))
+        throw new AvatarError(`${name} of a pose is ${count} numbers.`);
+    }
     const pin = (start, values) => values.forEach((v, i) => (v === null ? this.#pinned.delete(start + i) : this.#pinned.set(start + i, v)));
-    const turn = (start, vector) => pin(start, vector ? sixD(rotation(vector)) : Array(6).fill(null));
+    const turn = (start, vector) => {
+      pin(start, Array(6).fill(null));
+      if (vector) this.#turns.set(start, Array.from(vector));
+      else this.#turns.delete(start);
+    };
     if (jaw !== undefined) turn(at.jaw, jaw);
     if (neck !== undefined) turn(at.neck, neck);
     if (gaze !== undefined) [at.eyes, at.eyes + 6].forEach((start) => turn(start, gaze));
@@ -50,16 +62,20 @@ export class Settings {
 
   release() {
     this.#pinned.clear();
+    this.#turns.clear();
     this.#controls.clear();
     this.turned = [0, 0];
   }
 
   /** Change parameters in place to what is set. */
   apply(parameters) {
-    const { rest, sizes } = this.#header;
-    if (this.#controls.size > 0) {
-      parameters.set(rest.slice(0, sizes.expressions));
-      for (const [{ values }, share] of this.#controls) values.forEach((value, i) => (parameters[i] += share * value));
+    const { rest } = this.#header;
+    const far = ({ values }) => values.reduce((sum, value, i) => sum + value * (parameters[i] - rest[i]), 0);
+    const moves = [...this.#controls].map(([control, share]) => [control.values, share - far(control)]);
+    for (const [values, more] of moves) values.forEach((value, i) => (parameters[i] += more * value));
+    for (const [start, vector] of this.#turns) {
+      const own = vector.includes(null) ? rotationVector(parameters.subarray(start, start + 6)) : vector;
+      parameters.set(sixD(rotation(vector.map((value, i) => value ?? own[i]))), start);
     }
     for (const [index, value] of this.#pinned) parameters[index] = value;
   }

@@ -199,6 +199,7 @@ export class AvatarView extends EventTarget {
     this.ready.catch(() => {}); // nobody need listen
     this.#reject("The avatar was closed.");
     this.#worker.terminate();
+    this.#gpu?.close();
     cancelAnimationFrame(this.#loop);
   }
 
@@ -207,7 +208,12 @@ export class AvatarView extends EventTarget {
   }
 
   #receive(data) {
-    if (data.type === "failed") return this.#fail(data.sentence);
+    if (data.type === "failed") {
+      if (!this.#core) return this.#fail(data.sentence);
+      if (data.wants === "saved") return this.#saving.shift().reject(new AvatarError(data.sentence));
+      this.#inFlight = false; // what cannot be drawn is not asked for again before it changes
+      return this.#tellFailed(data.sentence);
+    }
     if (data.type === "ready") return this.#start(data);
     if (data.type === "saved") {
       const { resolve, width, height } = this.#saving.shift(), canvas = document.createElement("canvas");
@@ -230,7 +236,7 @@ export class AvatarView extends EventTarget {
     if (this.#width.moving === 0) this.resize(header.size);
     if (this.#wantsGpu) {
       try {
-        this.#gpu = new WebglRenderer(this.canvas);
+        this.#gpu = new WebglRenderer(this.canvas, () => this.#shown && (this.#shown = { ...this.#shown, key: undefined }));
       } catch (error) {
         return this.#fail(`This browser cannot draw with WebGL2 (${error.message}).`);
       }
@@ -249,10 +255,13 @@ export class AvatarView extends EventTarget {
   #request(now) {
     const { header } = this, pose = this.#current(now), base = { ...header.camera, rotation: pose.rotation, translation: pose.translation };
     const [yaw, pitch] = [0, 1].map((i) => pose.turn[i] + this.#settings.turned[i]);
-    base.rotation = multiply(base.rotation, headTurn([yaw, pitch]));
+    const turn = headTurn([yaw, pitch]);
+    base.rotation = multiply(base.rotation, turn);
+    base.head = pose.head && multiply(pose.head, turn);
     const { parameters } = pose, { view, background } = this, key = JSON.stringify([Array.from(parameters), base, view, background]);
     if (key !== this.#shown?.key) this.#changed = now;
-    const width = now - this.#changed < STILL_AFTER ? this.#width.moving : this.#width.still;
+    const wanted = now - this.#changed < STILL_AFTER ? this.#width.moving : this.#width.still;
+    const width = Math.max(1, Math.min(wanted, Math.floor(MOST_SIDE * base.aspect)));
     if (key === this.#shown?.key && width === this.#shown.width) return; // nothing has changed
     const frame = this.#frame({ parameters, base, view }, width);
     this.#shown = { ...frame, base, view, key, taken: this.#source.taken };
@@ -263,7 +272,8 @@ export class AvatarView extends EventTarget {
   /** What the worker draws. */
   #frame({ parameters, base, view }, width) {
     const height = Math.max(1, Math.round(width / base.aspect)), background = this.background ?? this.header.background;
-    return { type: "frame", parameters, camera: orbit(base, view, width), width, height, background };
+    const camera = orbit(base, view, width), head = base.head ?? camera.rotation;
+    return { type: "frame", parameters, camera, head, width, height, background };
   }
 
   #current(now) {
@@ -297,6 +307,10 @@ export class AvatarView extends EventTarget {
 
   #fail(sentence) {
     this.#reject(sentence);
+    this.#tellFailed(sentence);
+  }
+
+  #tellFailed(sentence) {
     this.dispatchEvent(new CustomEvent("failed", { detail: sentence }));
   }
 

@@ -65,13 +65,23 @@ export function hasRealGpu(canvas = document.createElement("canvas")) {
 }
 
 export class WebglRenderer {
-  /** Throws Error where WebGL2 is missing. */
-  constructor(canvas) {
+  /** `restored` is called when the browser gives back a context that it had taken. Throws Error where WebGL2 is missing. */
+  constructor(canvas, restored = () => {}) {
     const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true, alpha: false });
     if (!gl) throw new Error("it is switched off or missing");
     this.gl = gl;
     this.canvas = canvas;
     this.#build();
+    canvas.addEventListener("webglcontextlost", (e) => e.preventDefault()); // else it does not come back
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.#build();
+      restored();
+    });
+  }
+
+  /** Browsers keep a few contexts only. */
+  close() {
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 
   #build() {

@@ -15,13 +15,13 @@ self.onmessage = async ({ data }) => {
     }
   } catch (error) {
     const sentence = error instanceof AvatarError ? error.message : `The avatar cannot be drawn (${error.message}).`;
-    self.postMessage({ type: "failed", sentence });
+    self.postMessage({ type: "failed", sentence, wants: data.wants });
   }
 };
 
-function draw({ parameters, camera, width, height, background, wants }) {
+function draw({ parameters, camera, head, width, height, background, wants }) {
   const begin = performance.now();
-  core.pose(parameters, camera.rotation);
+  core.pose(parameters, head);
   const values = (wants === "gaussians" ? core.pack(camera, width, height) : core.draw(camera, width, height, background)).slice();
   self.postMessage({ type: wants, values, milliseconds: performance.now() - begin }, [values.buffer]);
 }

@@ -94,5 +94,5 @@ def test_the_printed_configuration_is_one_to_type() -> None:
 
 
 @pytest.mark.parametrize("option", ["--print-config", "--dry-run"])
-def test_a_printed_configuration_is_not_taken_for_a_runs(option: str) -> None:
-    assert f"{option} is for a new run" in avatar("train", "runs/me", "--resume", option, status=1)
+def test_a_printed_configuration_is_not_taken_for_a_runs(option: str, tmp_path: Path) -> None:
+    assert f"{option} is for a new run" in avatar("train", tmp_path, "--resume", option, status=1)

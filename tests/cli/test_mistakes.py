@@ -52,7 +52,8 @@ MISTAKES = {
     ),
     "eval of no run": (["eval", "{tmp}"], "is not a run folder: it has no run.json"),
     "reenactment of no avatar": (["reenact", "{tmp}", "--driver", "{data}"], "is neither a run nor an avatar file"),
-    "reenactment of a missing avatar": (["reenact", "{tmp}/x", "--driver", "{data}"], "there is no avatar file"),
+    "reenactment of a missing avatar": (["reenact", "{tmp}/x", "{data}"], "x: there is no such file or folder"),
+    "a missing run beside another": (["compare", "{run}", "{tmp}/x"], "x: there is no such file or folder"),
     "eval with another head": (["eval", "{run}", "--head", "{other}/head_model"], "trained with another head model"),
     "unknown protocol": (["eval", "{run}", "--protocol", "paper"], "paper"),
     "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody: there is no such file or folder"),
@@ -62,8 +63,8 @@ MISTAKES = {
     ),
     "a folder and another --folder": (["train", "{data}", "--folder", "{twin}"], "twin are two folders"),
     "a drive file read as a folder": (
-        ["reenact", "{run}", "{tmp}/motion.csv", "--fps", "50"],
-        "--fps is for tracked folders, and {tmp}/motion.csv is a drive file",
+        ["reenact", "{run}", "{motion}", "--fps", "50"],
+        "--fps is for tracked folders, and {motion} is a drive file",
     ),
     "a cluster's address for this machine": (
         ["sweep", "--out", "{tmp}/sweep", "--address", "head:1"],
@@ -102,6 +103,8 @@ def test_a_mistake_gets_one_sentence_and_a_status(
     bare = tmp_path / "bare"
     if "{bare}" in "".join(arguments):  # a tracked folder without a head model
         (bare / "imgs").mkdir(parents=True)
+    if "{motion}" in arguments:
+        (tmp_path / "motion.csv").touch()
     places = {
         "tmp": tmp_path,
         "bare": bare,
@@ -109,6 +112,7 @@ def test_a_mistake_gets_one_sentence_and_a_status(
         "run": trained,
         "other": other_head,
         "twin": twin,
+        "motion": tmp_path / "motion.csv",
     }
     monkeypatch.setattr("urllib.request.urlopen", _no_network)
     output = avatar(*(a.format(**places) for a in arguments), status=1)

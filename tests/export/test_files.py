@@ -21,9 +21,10 @@ from lively import lively_avatar, lively_run, psnr
 from splat_file import read_splats
 
 from avatar.export.bake_texture import bake_texture
-from avatar.export.glb import encode_glb, offsets
+from avatar.export.glb import _end, encode_glb, offsets
 from avatar.export.movie import limits_of, path_camera
 from avatar.export.ply import FIELDS, encode_ply
+from avatar.motion.controls import expression_controls
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera
@@ -164,6 +165,18 @@ def test_a_meshs_target_moves_one_joint_and_leaves_the_others(trained: TrainedAv
     of_open, of_shut = (offsets(trained, one)["left lid"] for one in (params, shut))
     assert float(of_open.abs().max()) > 1e-4
     torch.testing.assert_close(of_shut, of_open, atol=1e-6, rtol=0)
+
+
+def test_a_target_goes_where_its_name_says_and_as_far_from_every_frame(trained: TrainedAvatar) -> None:
+    assert _end(-2.4, 1.3) == (1.3, "") and _end(-0.8, 0.1) == (-0.8, " (reversed)") and _end(-0.16, 0.14) == (0.14, "")
+    rest, head = trained.rest_params(), trained.avatar.head
+    train = trained.recording.times(trained.recording.split.train)
+    control = expression_controls(trained.recording.tracks["expression"][train], rest.expression, head)[0]
+    frame = replace(rest, expression=rest.expression + 0.5 * control.high * control.direction)
+    name = f"{control.part}: {control.name}"
+    of_frame, of_rest = (head.vertices(one) + offsets(trained, one)[name] for one in (frame, rest))
+    assert float((head.vertices(frame) - head.vertices(rest)).abs().max()) > 1e-4
+    torch.testing.assert_close(of_frame, of_rest, atol=1e-6, rtol=0)
 
 
 def gltf_parts(data: bytes) -> tuple[dict, bytes]:

@@ -204,11 +204,15 @@ WITHOUT_FILES = """(() => {
 })()"""
 
 
+INSECURE = """delete Navigator.prototype.mediaDevices;
+Object.defineProperty(crypto, "subtle", { value: undefined });"""
+
+
 @pytest.mark.chromium
 @pytest.mark.parametrize(
     ("script", "sentence"),
     [
-        ("delete Navigator.prototype.mediaDevices", "gives a page at such an address no camera"),
+        (INSECURE, "gives a page at such an address no camera"),
         (
             "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', 'NotAllowedError'); }",
             "The camera was not allowed.",

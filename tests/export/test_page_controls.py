@@ -83,6 +83,19 @@ def test_presets_move_the_face_and_go_again(visit: Any, motion: str) -> None:
 
 
 @pytest.mark.chromium
+def test_a_preset_does_what_its_name_says_until_its_slider_is_moved(visit: Any) -> None:
+    page = visit(reduced_motion="reduce")
+    button, slider = page.get_by_role("button", name="Smile"), page.locator("input[name='Smile']")
+    low, high = (float(slider.get_attribute(end)) for end in ("min", "max"))
+    button.click()
+    until(page, f"document.querySelector(`input[name='Smile']`).value > {0.9 * high}")
+    slider.fill(str(0.5 * low))
+    assert button.get_attribute("aria-pressed") == "false"
+    page.wait_for_timeout(300)
+    assert float(slider.input_value()) == pytest.approx(0.5 * low)
+
+
+@pytest.mark.chromium
 def test_what_a_preset_has_moved_is_let_go_of_when_it_ends(visit: Any) -> None:
     page = visit(reduced_motion="reduce")
     expression = "Array.from(avatar.parameters.slice(0, avatar.header.sizes.expressions)).join()"
@@ -155,6 +168,19 @@ def test_eyes_follow_the_pointer_until_a_key_is_pressed(visit: Any) -> None:
     low = page.evaluate("avatar.header.joints.look_left[0]")
     assert page.evaluate(gaze) > 0.9 * low or low > -0.06, "the pointer is let go of"
     assert visit(reduced_motion="reduce").locator("#gaze").is_checked() is False
+
+
+@pytest.mark.chromium
+def test_eyes_follow_the_pointer_again_after_a_reset(visit: Any) -> None:
+    page = visit()
+    gaze = "avatar.parameters[avatar.header.sizes.expressions + 6 + 2]"
+    box = page.locator("#canvas").bounding_box()
+    page.mouse.move(box["x"] + 0.98 * box["width"], box["y"] + 0.45 * box["height"])
+    page.wait_for_timeout(1000)
+    followed = page.evaluate(gaze)
+    page.locator("#reset").press("Enter")
+    page.wait_for_timeout(1000)
+    assert page.evaluate(gaze) == pytest.approx(followed, abs=1e-3)
 
 
 @pytest.mark.chromium

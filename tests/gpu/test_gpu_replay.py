@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from camera_rig_folder import write_single
 from interpreter import DEVICE
 from small_runs import new_avatar, open_small, small_config
 from splat.scenes import SCENES
@@ -19,6 +20,7 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton is not installed")
 
 from avatar.compute.cuda_graph import Replay, own_stream
+from avatar.data.source import Source
 from avatar.losses.lpips_network import Lpips
 from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
 from avatar.splat import splat
@@ -29,6 +31,7 @@ from avatar.train.loss import choose_perceptual
 from avatar.train.step_runner import Kind, StepRunner
 from avatar.train.trainer import train
 from avatar.types import Gaussians
+from data_prep.prepare.open_subject import open_subject
 
 # Degrees of the colours change at steps 3 and 6, the third term comes in at step 4, and checkpoints in between.
 TINY = (
@@ -46,7 +49,11 @@ def trained(
 ) -> tuple[Checkpoint, StepRunner, list[float]]:
     """The last checkpoint, what made the steps, and the loss of each."""
     config = small_config(*overrides)
-    _, subject, assets = open_small(folder, config)
+    if (folder / "head_model").exists():
+        _, subject, assets = open_small(folder, config)
+    else:
+        source = Source(folder, folder.parent / "head_model")
+        subject, assets = open_subject(source, config.data.test_frames, lambda _: None)
     losses: list[float] = []
     makers: list[StepRunner] = []
 
@@ -110,6 +117,18 @@ def test_steps_with_lpips_of_the_heads_box_are_replayed(
     assert_same(found, expected)
 
 
+def test_cameras_of_one_size_are_replayed_with_their_own_lenses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_single(tmp_path)
+    few = (*TINY, "trainer.iterations=12", "trainer.checkpoint_every=12")
+    expected, _, losses = trained(folder, tmp_path / "launched", monkeypatch, *few, warm=99, degree_every=99)
+    found, replaying, same = trained(folder, tmp_path / "replayed", monkeypatch, *few, warm=1, degree_every=99)
+    assert len({kind.lens for kind in replaying._captured}) == 2 and replaying.replayed > 4
+    assert same == losses
+    assert_same(found, expected)
+
+
 def test_the_kind_that_was_used_longest_ago_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     captured: list[object] = []
 
@@ -122,7 +141,8 @@ def test_the_kind_that_was_used_longest_ago_makes_room(monkeypatch: pytest.Monke
     monkeypatch.setattr(step_runner_module, "WARM", 0)
     runner: Any = StepRunner.__new__(StepRunner)
     vars(runner).update(_captured=OrderedDict(), _launched=Counter(), _pool=None)
-    often, *seldom = (Kind((40, 40), 0, None, (side, side)) for side in (32, 40, 48))
+    lens = (40.0, 40.0, 20.0, 20.0)
+    often, *seldom = (Kind((40, 40), 0, None, (side, side), lens) for side in (32, 40, 48))
     for kind in (often, seldom[0], often, seldom[1], often):
         assert runner._ready(kind, 0, SimpleNamespace(tensors=dict), lambda *_: None) in captured
     assert len(captured) == 3 and list(runner._captured) == [seldom[1], often]

@@ -18,7 +18,11 @@ def lively_run(folder: Path, run: Path, *overrides: str) -> Path:
 
 def lively_avatar(folder: Path, run: Path, *overrides: str, seed: int = 3) -> TrainedAvatar:
     """Colours, opacities, sizes, turns and offsets of every Gaussian differ, and the offsets from frame to frame."""
-    trained = load_avatar(lively_run(folder, run, *overrides), folder / "head_model")
+    return enlivened(load_avatar(lively_run(folder, run, *overrides), folder / "head_model"), seed)
+
+
+def enlivened(trained: TrainedAvatar, seed: int = 3) -> TrainedAvatar:
+    """`trained`, changed in place."""
     generator = torch.Generator().manual_seed(seed)
     spread = {
         "quats": 0.3,

@@ -8,6 +8,7 @@ import pytest
 import torch
 from splat.scenes import BACKENDS, POSE, Scene, camera, random_gaussians, render
 
+from avatar.splat import _check_camera
 from avatar.types import Gaussians
 
 SCENE = Scene(random_gaussians(10), camera(20, 20))
@@ -126,6 +127,15 @@ def test_options_out_of_range(option: str, value: float) -> None:
 def test_impossible_cameras(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"camera.{field} must be .* got {value}"):
         render(replace(SCENE, camera=replace(SCENE.camera, **{field: value})))
+
+
+def test_a_picture_of_more_values_than_a_gpu_counts() -> None:
+    side = 26_755
+    for sides in ((side, side), (32_768, 21_846)):
+        wide = replace(SCENE.camera, width=sides[0], height=sides[1])
+        with pytest.raises(ValueError, match=f"camera has {sides[0]}x{sides[1]} pixels; a GPU draws at most 715827882"):
+            _check_camera(wide, SCENE.gaussians.means.device, "gpu")
+        _check_camera(wide, SCENE.gaussians.means.device, "cpu")
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])

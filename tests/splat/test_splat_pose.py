@@ -45,6 +45,15 @@ def test_what_requires_a_gradient_changes_no_bit(backend: str) -> None:
             assert torch.equal(gradient, expected[name]), name
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_pose_that_inference_mode_has_drawn_is_trained_with(backend: str) -> None:
+    scene = Scene(SCENE.gaussians, camera(WIDTH, HEIGHT, centre=(0.31, 0.62)))  # which nothing else has drawn
+    with torch.inference_mode():
+        render(scene, backend)
+    image, found = gradients_in(scene, backend, ("means",))
+    assert not image.is_inference() and found["means"].any()
+
+
 def test_a_pose_without_a_gradient_costs_the_compiled_core_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
     backward = cpu._core.splat_backward

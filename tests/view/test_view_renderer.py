@@ -10,7 +10,7 @@ import pytest
 import torch
 from lively import lively_avatar
 
-from avatar.motion.controls import posed
+from avatar.motion.controls import joint_values, posed
 from avatar.motion.orbit import orbited
 from avatar.runs.motion_clip import own_clip
 from avatar.runs.trained_avatar import TrainedAvatar
@@ -50,6 +50,13 @@ def test_controls_add_and_joints_replace(renderer: ViewRenderer, trained: Traine
     assert moved.eyelids[0] == 0.7 and moved.eyelids[1] == frame.eyelids[1]
     assert torch.equal(moved.eyes, frame.eyes) and torch.equal(moved.neck, frame.neck)
     assert renderer.params(frame, Setting(joints={"jaw": 0.0})).jaw.equal(frame.jaw)
+
+
+def test_one_axis_of_a_joint_leaves_the_other_to_the_motion(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
+    frame = posed(trained.recording.params(9), None, {"look_down": 0.1, "look_left": -0.2, "lean": 0.05, "turn": 0.1})
+    moved = joint_values([renderer.params(frame, Setting(joints={"look_left": 0.15, "lean": -0.1}))])
+    found = {name: round(float(moved[name]), 2) for name in ("look_down", "look_left", "lean", "turn")}
+    assert found == {"look_down": 0.1, "look_left": 0.15, "lean": -0.1, "turn": 0.1}
 
 
 def test_the_camera_stays_where_the_avatar_is_known(renderer: ViewRenderer) -> None:

@@ -40,8 +40,10 @@ void rasterize_mesh(const float* screen, const std::int32_t* faces, std::int64_t
                 const double cx = px + 0.5, cy = py + 0.5;
                 const double b0 = ((x[1] - cx) * (y[2] - cy) - (x[2] - cx) * (y[1] - cy)) * inv_area;
                 const double b1 = ((x[2] - cx) * (y[0] - cy) - (x[0] - cx) * (y[2] - cy)) * inv_area;
-                const double b2 = 1.0 - b0 - b1;
-                if (b0 < 0.0 || b1 < 0.0 || b2 < 0.0) continue;
+                const double b2 = std::max(1.0 - b0 - b1, 0.0);
+                // By its sign, not by that of b2: the rounding of b2 leaves holes between two triangles.
+                const double e2 = ((x[0] - cx) * (y[1] - cy) - (x[1] - cx) * (y[0] - cy)) * inv_area;
+                if (b0 < 0.0 || b1 < 0.0 || e2 < 0.0) continue;
                 const double w0 = b0 * inv_z[0], w1 = b1 * inv_z[1], w2 = b2 * inv_z[2];
                 const double z = 1.0 / (w0 + w1 + w2);
                 const std::int64_t p = static_cast<std::int64_t>(py) * width + px;
