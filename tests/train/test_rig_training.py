@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -17,6 +19,7 @@ from avatar.gaussianheadavatar import model as gaussianheadavatar
 from avatar.pipeline.open_inputs import open_run
 from avatar.runs.avatar_file import read_avatar_file
 from avatar.runs.checkpoint import newest_checkpoint
+from avatar.train.step_runner import Kind
 
 OPTIONS = (*SMALL, "trainer.perceptual=dssim", "data.size=48")
 
@@ -44,6 +47,14 @@ def test_a_resumed_run_ends_with_the_same_bits(place: Path, tmp_path: Path) -> N
     assert resumed.step == whole.step == 12
     assert all(torch.equal(value, resumed.tensors[name]) for name, value in whole.tensors.items())
     assert whole.tensors["pose_corrections.moves"].shape == (4, 5)  # of times, not of pictures
+
+
+def test_steps_of_cameras_with_different_lenses_are_not_replayed_by_one_graph(place: Path) -> None:
+    recording = open_run(place / "whole", say=lambda _: None).subject.recording
+    cameras = [recording.camera(i) for i in recording.split.train]
+    inputs: Any = [SimpleNamespace(frame=SimpleNamespace(camera=c), crop_rows=None, crop_columns=None) for c in cameras]
+    kinds = {Kind.of(0, one, None) for one in inputs}
+    assert len(kinds) == len({c.cx for c in cameras}) == 2 and len({kind.size for kind in kinds}) == 1
 
 
 def test_the_avatar_file_holds_the_rig(place: Path) -> None:
