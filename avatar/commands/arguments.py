@@ -15,7 +15,8 @@ from avatar.commands.parser import build_parser
 from avatar.errors import UserError
 from avatar.files.read import is_there
 
-INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver")  # paths that are read; create has its own list
+# Paths that are read; create has a list of its own.
+INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver")
 KEY = re.compile(r"[+~]*[A-Za-z_][\w.]*")  # Hydra's own signs are no part of our keys, and refused as such
 
 

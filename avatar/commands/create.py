@@ -24,7 +24,7 @@ from avatar.config import Config, load_config
 from avatar.data.split import split_frames
 from avatar.errors import UserError
 from avatar.export.web_page import write_page
-from avatar.files.names import RUN_FOLDER, SUBJECT_FOLDER
+from avatar.files.names import RUN_FOLDER, SUBJECT_FOLDER, typed
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import head_for_video, progress_bar, tracking_lacks
@@ -88,8 +88,8 @@ def run_create(arguments: Namespace) -> int:
     print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {paths.page}, the avatar in a browser.")
     print(f"  {paths.subject / 'overlay'}   the tracked mesh on the video")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
-    print(f"Next         avatar view {paths.run}")
-    print(f"             avatar reenact {paths.run} ANOTHER.mp4")
+    print(f"Next         avatar view {typed(paths.run)}")
+    print(f"             avatar reenact {typed(paths.run)} ANOTHER.mp4")
     if arguments.open:
         show(paths.page)
     return OK
@@ -174,7 +174,7 @@ def judge_tracking(info: TrackingInfo, subject: Path, anyway: bool) -> None:
     print(
         f"{', '.join(counts)} of {len(judged)} figures; look at {subject / 'overlay'}: does the mesh lie on the face?"
     )
-    print(f"Frames, masks and light: avatar check {subject} shows warnings, which do not stop the training")
+    print(f"Frames, masks and light: avatar check {typed(subject)} shows warnings, which do not stop the training")
     figures = [
         f"{figure['name'].replace('  of', 'landmark error of')}: {figure['value']:.4g} {figure['unit']}".rstrip()
         + (f" -> {figure['advice']}" if figure["advice"] else "")

@@ -12,7 +12,7 @@ from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
 from avatar.export.web_page import write_page
-from avatar.files.names import RUN_FOLDER
+from avatar.files.names import RUN_FOLDER, typed
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import can_track, progress_bar
@@ -62,7 +62,7 @@ def run_demo(arguments: Namespace) -> int:
     )
     print(f"  {video}   another person's motion on the avatar")
     print(f"  {run / 'previews'}   how it got better during training")
-    print(f"  avatar eval {run}   prints all its figures, avatar view {run} moves it by hand")
+    print(f"  avatar eval {typed(run)}   prints all its figures, avatar view {typed(run)} moves it by hand")
     print(f"\nOpen this first: {page.path}, the avatar in a browser")
     return OK
 

@@ -8,6 +8,7 @@ from avatar.commands.demo import find_subject_head
 from avatar.commands.outputs import check_outputs
 from avatar.demo import make_camera_folder, make_head_model, make_subject, make_video
 from avatar.errors import UserError
+from avatar.files.names import typed
 from avatar.files.video import VIDEO_SUFFIXES
 from avatar.pipeline import OK
 
@@ -26,7 +27,7 @@ def run_demo_data(arguments: Namespace) -> int:
             raise UserError("--cameras films a sequence of each motion: leave out --motion")
         frames, size = _or(arguments.frames, 100), _or(arguments.size, 256)
         union = make_camera_folder(arguments.out, arguments.cameras, frames, size, arguments.seed)
-        print(f"Next   avatar train {union}")
+        print(f"Next   avatar train {typed(union)}")
         return OK
     frames, motion = _or(arguments.frames, 600), arguments.motion or "speech"
     if is_video:
@@ -34,10 +35,10 @@ def run_demo_data(arguments: Namespace) -> int:
         if not (head := find_subject_head(arguments.out)).exists():
             make_head_model(head)
             print(f"Head   {head}")
-        print(f"Next   avatar create {arguments.out} --head {head}")
+        print(f"Next   avatar create {typed(arguments.out)} --head {typed(head)}")
         return OK
     make_subject(arguments.out, frames, _or(arguments.size, 256), arguments.seed, motion)
-    print(f"Next   avatar train {arguments.out}")
+    print(f"Next   avatar train {typed(arguments.out)}")
     return OK
 
 

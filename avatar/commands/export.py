@@ -19,6 +19,7 @@ from avatar.export.movie import write_movie
 from avatar.export.ply import encode_ply
 from avatar.export.web_page import write_page, write_web_avatar
 from avatar.files.atomic import write_atomically
+from avatar.files.names import typed
 from avatar.files.numbered import numbered, remove_longer
 from avatar.files.video import ALPHA_SUFFIXES, VIDEO_SUFFIXES
 from avatar.pipeline import OK
@@ -176,7 +177,7 @@ def write_avatar_format(trained: TrainedAvatar, out: Path, arguments: Namespace)
     if licence:
         print(f"Licence  {licence}")
     else:
-        print(f"Next     avatar reenact {out} DRIVER --head HEAD; it needs the head model it was trained with")
+        print(f"Next     avatar reenact {typed(out)} DRIVER --head HEAD; it needs the head model it was trained with")
 
 
 SUFFIXES = {

@@ -13,6 +13,7 @@ from pathlib import Path
 from avatar.commands.outputs import check_file, check_outputs
 from avatar.compute.interruption import interruption
 from avatar.errors import UserError
+from avatar.files.names import typed
 from avatar.files.video import video_writer
 from avatar.pipeline import OK
 from data_prep.live.picture_sources import FILMED, Newest, open_source
@@ -68,7 +69,7 @@ def run_record(arguments: Namespace) -> int:
                     film.end()
     screen.say(f"Film     {out}")
     report(screen, film, seen, wrong)
-    screen.say(f"Next     avatar create {out} --head flame/")
+    screen.say(f"Next     avatar create {typed(out)} --head flame/")
     return OK
 
 

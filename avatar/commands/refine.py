@@ -6,6 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.files.names import typed
 from avatar.pipeline import OK
 from avatar.pipeline.open_inputs import open_run
 from avatar.pipeline.refine_run import REFINED_FOLDER, refine_run
@@ -18,5 +19,5 @@ def run_refine(arguments: Namespace) -> int:
     check_outputs([target], [Path(run.subject.manifest.source)])
     status = refine_run(run, target, arguments.device or "auto")
     if status == OK:
-        print(f"Next         avatar train {target} --out ANOTHER_RUN")
+        print(f"Next         avatar train {typed(target)} --out ANOTHER_RUN")
     return status

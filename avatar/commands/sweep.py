@@ -10,6 +10,7 @@ from pathlib import Path
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
 from avatar.evaluation.compare_tables import FORMATS, text, write_tables
+from avatar.files.names import typed
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.sweep.engines import EngineOptions, make_engine
 from avatar.sweep.results import fold_results
@@ -42,7 +43,7 @@ def run_sweep(arguments: Namespace) -> int:
         with closing(engine):
             states = run_jobs(folder, spec, engine, Progress(arguments.workers))
     except KeyboardInterrupt:
-        print(f"\nInterrupted; what was done is kept. Go on with: avatar sweep --out {folder}")
+        print(f"\nInterrupted; what was done is kept. Go on with: avatar sweep --out {typed(folder)}")
         return INTERRUPTED
     write_sweep_tables(folder, spec)
     failed = [state for state in states.values() if state.status == "failed"]

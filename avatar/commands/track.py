@@ -7,6 +7,7 @@ from pathlib import Path
 
 from avatar.commands.outputs import check_folder_output, check_outputs
 from avatar.errors import UserError
+from avatar.files.names import typed
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import head_for_video, progress_bar
@@ -35,7 +36,7 @@ def run_track(arguments: Namespace) -> int:
     )
     track(video, arguments.out, head, load_head_assets(head), choices, progress=progress_bar)
     print(f"Look at  {arguments.out / 'overlay'}")
-    print(f"Next     avatar train {arguments.out}")
+    print(f"Next     avatar train {typed(arguments.out)}")
     return OK
 
 
@@ -50,5 +51,5 @@ def _track_rig(arguments: Namespace, head: Path, span: Span) -> int:
         arguments.videos, arguments.out, head, load_head_assets(head), arguments.size, span, progress=progress_bar
     )
     print(f"Look at  {arguments.out / 'front' / 'overlay'}")
-    print(f"Next     avatar train {arguments.out} --head {head}")
+    print(f"Next     avatar train {typed(arguments.out)} --head {typed(head)}")
     return OK

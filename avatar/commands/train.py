@@ -16,7 +16,7 @@ from avatar.config_values import shown
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.files.lock import locked
-from avatar.files.names import ROUNDS_FOLDER, display_name, safe_name
+from avatar.files.names import ROUNDS_FOLDER, display_name, safe_name, typed
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import cached_tracking, head_for_video, is_video
 from avatar.pipeline.dry_run import estimate_training
@@ -45,7 +45,9 @@ def run_train(arguments: Namespace) -> int:
 
     def train() -> int:
         status = train_as_asked(run, arguments)
-        print(f"Next         avatar eval {run}" if status == OK else "Add --resume to the same command to go on.")
+        print(
+            f"Next         avatar eval {typed(run)}" if status == OK else "Add --resume to the same command to go on."
+        )
         return status
 
     return train_in_view(run, arguments.head, train) if arguments.view else train()
@@ -163,7 +165,9 @@ def moved_plan_source(run: Path, source: Source, arguments: Namespace) -> Source
     if folder is not None and folder.resolve() != source.folder and source.folder.is_dir():
         raise UserError(f"{run} began on {source.folder}, not on {folder}: leave it out to resume")
     if folder is None and not source.folder.is_dir():
-        raise UserError(f"{source.folder}, on which {run} began, is gone: avatar train NEW_PLACE --resume --out {run}")
+        raise UserError(
+            f"{source.folder}, on which {run} began, is gone: avatar train NEW_PLACE --resume --out {typed(run)}"
+        )
     source = source if folder is None else at_new_place(source, folder.resolve())
     return source if head is None else replace(source, head=head)
 

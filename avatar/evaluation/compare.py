@@ -23,6 +23,7 @@ from avatar.evaluation.evaluate import RESULTS_FORMAT
 from avatar.evaluation.previous_results import MAX_TABLE_BYTES
 from avatar.evaluation.protocol import NAME
 from avatar.evaluation.tracking_source import Drive, Part, is_marked, legend, parts
+from avatar.files.names import typed
 from avatar.files.read import MissingFile, read_bytes, read_json
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "perceptual", "protocols", "tracking"}  # of results.json
@@ -165,7 +166,7 @@ def read_evaluation(label: str, run: Path) -> Evaluation:
     try:
         results = read_json(path)
     except MissingFile:
-        raise UserError(f"{run} was not evaluated (there is no {path}): run avatar eval {run} first") from None
+        raise UserError(f"{run} was not evaluated (there is no {path}): run avatar eval {typed(run)} first") from None
     except UserError as error:
         raise UserError(f"{error}; evaluate the run again") from None
     if not isinstance(results, dict) or results.get("format") != RESULTS_FORMAT:
@@ -176,7 +177,7 @@ def read_evaluation(label: str, run: Path) -> Evaluation:
     if not isinstance(names, dict) or not all(NAME.fullmatch(name) for name in names):  # they name folders
         raise UserError(f"{path} is damaged (the names of its protocols); evaluate the run again")
     if wrong := _misfit(results, FORM):
-        raise UserError(f"{path} is damaged ({wrong.lstrip('.')}): run avatar eval {run} again")
+        raise UserError(f"{path} is damaged ({wrong.lstrip('.')}): run avatar eval {typed(run)} again")
     return Evaluation(label, path.parent, results)
 
 

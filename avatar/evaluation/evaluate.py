@@ -40,6 +40,7 @@ from avatar.evaluation.results import FrameResult, summarise
 from avatar.evaluation.tracking_source import Drive, describe_tracking, drives, parts, renders_of, tracking_notes
 from avatar.evaluation.training_coverage import conditions
 from avatar.files.atomic import write_atomically
+from avatar.files.names import typed
 from avatar.files.video import SHARP, video_writer
 from avatar.losses.lpips_network import Lpips, Net
 from avatar.render import Renderer
@@ -139,7 +140,7 @@ def evaluate(
         said.append(
             f"Removed  {', '.join(removed)}: measured before, of another step, other data or by another program"
         )
-    say("\n".join([*said, f"Next     avatar report {run.path}"]))
+    say("\n".join([*said, f"Next     avatar report {typed(run.path)}"]))
     return path
 
 

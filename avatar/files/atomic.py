@@ -42,8 +42,15 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise UserError(f"{path} cannot be written ({error.strerror}); what was there before is untouched") from None
 
 
+def refuse_current(target: Path) -> None:
+    """Raise UserError for `.`: a folder that is written whole gets its name at the end."""
+    if not target.name:
+        raise UserError(f"{target} is the folder that this runs in, which is not replaced; choose another --out")
+
+
 def check_target(target: Path) -> None:
     """Raise UserError where a new folder may not be written: nothing is overwritten."""
+    refuse_current(target)
     if target.is_symlink() or (target.exists() and not target.is_dir()):
         raise UserError(f"{target} exists already and is not a folder; choose another --out")
     if target.is_dir() and any(target.iterdir()):

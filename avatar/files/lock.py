@@ -39,7 +39,8 @@ def locked(folder: Path, otherwise: str = "choose another --out") -> Iterator[No
         yield
     finally:
         with suppress(OSError):
-            path.unlink()
+            if _is_same(file, path):  # else the folder has another name, and this one may be another process's
+                path.unlink()
         os.close(file)
         if is_new:
             with suppress(OSError):  # it is not empty

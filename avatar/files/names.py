@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,11 @@ def safe_name(text: str) -> str:
     letters = "".join(letter if letter.isprintable() and letter not in _FORBIDDEN else "_" for letter in text)
     short = letters.lstrip(_NOT_AT_THE_ENDS).encode()[:MAX_NAME_BYTES].decode(errors="ignore")
     return short.rstrip(_NOT_AT_THE_ENDS) or "unnamed"
+
+
+def typed(path: Path) -> str:
+    """A path as it is typed in a command that is printed."""
+    return shlex.quote(str(path))
 
 
 def shortened(name: str) -> str:

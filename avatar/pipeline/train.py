@@ -16,6 +16,7 @@ from avatar.data.source import Source
 from avatar.data.split import check_divided
 from avatar.data.subject import Subject
 from avatar.files.lock import locked
+from avatar.files.names import typed
 from avatar.files.read import shown_size
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets
@@ -135,7 +136,7 @@ def finish_training(
             "the others are decoded again at each turn"
         )
     if config.trainer.checkpoint_every < config.trainer.iterations:
-        print(f"Watch        avatar view {run} (from step {config.trainer.checkpoint_every} on)")
+        print(f"Watch        avatar view {typed(run)} (from step {config.trainer.checkpoint_every} on)")
     begin = time.monotonic()
     done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
     first = checkpoint.step if checkpoint else 0

@@ -18,6 +18,7 @@ from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.files.video import error_map, padded, side_by_side
 from avatar.gaussians.base_model import Avatar
+from avatar.pose_refinement.fitted_pictures import fitted_pictures
 from avatar.pose_refinement.refine_subject import Refined
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
@@ -29,15 +30,14 @@ SHEET_FRAMES = 4  # evenly spread over the held-out ones, besides those that gai
 
 def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> str:
     """A line for each frame: how well the head fitted before and after (dB), and how far it was turned and shifted. With
-    several cameras a line for each time, with the name of its first picture."""
+    several cameras a line for each time, with the name of the first picture that it was fitted to."""
     turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     recording = subject.recording
     parts = {row: part for part, rows in _rows_of_parts(recording).items() for row in rows}
-    for index in recording.moments(range(len(recording))):
-        row = recording.time(index)
+    for row, (index, *_) in enumerate(fitted_pictures(recording)):
         figures = (refined.before[row], refined.after[row], math.degrees(turns[row]), 1e3 * shifts[row])
         writer.writerow((row, recording.names[index], parts.get(row, ""), *(f"{figure:.4f}" for figure in figures)))
     return text.getvalue()

@@ -92,9 +92,10 @@ def refine_subject(
                 figures.append(found.figures)
                 bar.update(1)
                 bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
-                if len(moves) % SAVE_EVERY == 0 or interrupted():
+                stops = interrupted()  # asked once: what is saved for it is done, too
+                if len(moves) % SAVE_EVERY == 0 or stops:
                     write_progress(progress, key, moves, figures)
-                if interrupted():
+                if stops:
                     return None
         write_progress(progress, key, moves, figures)
         first = torch.linalg.cholesky(matrices[0])

@@ -13,7 +13,7 @@ from avatar.errors import check_installed
 from avatar.evaluation.compare import read_evaluation
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
 from avatar.files.atomic import write_atomically
-from avatar.files.names import RUN_FOLDER, display_name, display_path
+from avatar.files.names import RUN_FOLDER, display_name, display_path, typed
 from avatar.files.read import is_there, read_bytes
 from avatar.html import Markup, data_table, document, element, figure_of, fold, join, plot, section, tiles
 from avatar.html.document import Content
@@ -162,7 +162,7 @@ def _figure(column: str, value: float | None) -> str:
 
 def _figures(run: Run, results: Mapping[str, Any] | None) -> list[Markup]:
     if results is None:
-        return [element("p", f"Not measured yet: avatar eval {run.path}", class_="soft")]
+        return [element("p", f"Not measured yet: avatar eval {typed(run.path)}", class_="soft")]
     shown = []
     if results.get("step") != run.step:
         text = f"Measured at step {results.get('step')}, while the newest checkpoint is of step {run.step}."

@@ -23,6 +23,7 @@ from torch import Tensor
 from avatar.data.tensor_file import read_metadata, read_tensors
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
+from avatar.files.names import typed
 from avatar.tensors import describe_non_finite
 
 CHECKPOINT_FORMAT = 3
@@ -85,7 +86,7 @@ def newest_checkpoint(run: Path) -> Checkpoint:
     """The last checkpoint of a run; UserError when there is none: an untrained model is never used silently."""
     files = list_checkpoints(run / "checkpoints")
     if not files:
-        raise UserError(f"{run} holds no checkpoint; train first (avatar train SUBJECT --out {run})")
+        raise UserError(f"{run} holds no checkpoint; train first (avatar train SUBJECT --out {typed(run)})")
     return load_checkpoint(files[-1])
 
 

@@ -53,10 +53,11 @@ def checked_size(size: int | None) -> int | None:
     return None if size is None else int(size)
 
 
-def check_turn(yaw: float, pitch: float, zoom: float) -> None:
-    """Raises UserError, naming the value, where they are not degrees, degrees and a factor above 0."""
-    for name, value in (("yaw", yaw), ("pitch", pitch), ("zoom", zoom)):
-        if not isinstance(value, numbers.Real) or not math.isfinite(value):
+def check_pose(zoom: float, **others: float) -> None:
+    """Raises UserError, naming the value, for a factor that is not above 0 and for others that are no finite numbers."""
+    for name, value in {**others, "zoom": zoom}.items():
+        is_number = isinstance(value, numbers.Real) or getattr(value, "ndim", None) == 0
+        if not is_number or not math.isfinite(value):
             raise UserError(f"{name} is {value!r}, not a finite number")
     if zoom <= 0:
         raise UserError(f"zoom is {zoom}: give a factor above 0")

@@ -24,7 +24,7 @@ from avatar.motion.orbit import orbited
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_avatar_file
-from avatar.runs.inputs import check_turn, checked_camera, checked_params, checked_size
+from avatar.runs.inputs import check_pose, checked_camera, checked_params, checked_size
 from avatar.splat import checked_drawings
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
 
@@ -112,9 +112,9 @@ class TrainedAvatar:
         turned by `yaw` and `pitch` degrees.
 
         Raises UserError, with the names that there are, for another name and for a joint that moves no vertex of the head
-        model; for a size, turn or zoom of no picture; and as `render`.
+        model; for values that are no numbers; for a size or zoom of no picture; and as `render`.
         """
-        check_turn(yaw, pitch, zoom)
+        check_pose(zoom, yaw=yaw, pitch=pitch, **values)
         train = self.recording.times(self.recording.split.train)
         rest = self.rest_params()
         expressions = self.recording.tracks["expression"][train]

@@ -107,7 +107,8 @@ def train(
                 step += 1
                 progress.note(step, outcome)
                 saves = step % trainer.checkpoint_every == 0 or step == trainer.iterations
-                if saves or interrupted():
+                stops = interrupted()  # asked once: what is saved for it is done, too
+                if saves or stops:
                     progress.flush()
                 if saves:
                     # What cannot be drawn is not saved.
@@ -115,7 +116,7 @@ def train(
                     save(step)
                     saved = step
                     log.preview(step, *pair)
-                if interrupted():
+                if stops:
                     break
         except NonFiniteStep as nonfinite:
             index = next(frame_order(subject.split.train, trainer.seed, nonfinite.step, trainer.iterations))

@@ -109,7 +109,7 @@ def write_folder(
         _link_pictures(building, subject)
         head = _head_model(building, subject)
         given = (subject.given or subject.recording).tracks
-        info = _info(subject, str(target / HEAD_MODEL) if head else subject.manifest.head_path)
+        info = _info(subject, str((target / HEAD_MODEL).resolve()) if head else subject.manifest.head_path)
         avatar_track.write_tracking(building, info, _frame_tracks(subject, given))
         (building / avatar_track.TRACKS_FILE).rename(building / GIVEN_FILE)
         avatar_track.write_tracking(building, info, _frame_tracks(subject, tracks))

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.detect import Face
@@ -79,7 +80,7 @@ class FrameFit:
         seen = Landmarks(face.points[None], face.scores[None], np.ones(1, bool), self._size, NOMINAL_FPS)
         try:
             start = self._start(seen)
-        except cv2.error:  # points that no camera sees so
+        except (cv2.error, UserError):  # points that no camera sees so
             self._before = []
             return None
         term = replace(

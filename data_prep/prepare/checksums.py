@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from avatar.errors import UserError
+from avatar.files.lock import LOCK_FILE
 from avatar.files.read import read_text
 from avatar.files.third_party import sha256_of
 
 CONTENTS_FILE = "contents.sha256"  # in the format of sha256sum
+_OTHERS = {CONTENTS_FILE, LOCK_FILE}  # which are not hashed
 _MAX_BYTES = 2**26  # of it: half a million files
 
 
@@ -36,5 +38,5 @@ def find_damage(folder: Path) -> str | None:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != CONTENTS_FILE)
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in _OTHERS)
     return {path.relative_to(folder).as_posix(): path for path in found}

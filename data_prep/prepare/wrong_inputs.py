@@ -9,6 +9,7 @@ from typing import Any
 from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE
 from avatar.errors import UserError
+from avatar.files.names import typed
 from avatar.head.find import candidates
 from data_prep.formats import avatar_track, nersemble, nha
 from data_prep.formats.transforms import read_json
@@ -47,7 +48,7 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"{folder} is no tracked folder: it holds {listed}; give {one}")
     if any(path.suffix.lower() in (*IMAGE_SUFFIXES, *OTHER_PICTURES) for path in folder.iterdir()):
         raise UserError(
-            f"{folder} holds pictures and no tracking; avatar track {folder} makes a tracked folder of them"
+            f"{folder} holds pictures and no tracking; avatar track {typed(folder)} makes a tracked folder of them"
         )
     if candidates(folder):
         raise UserError(f"{folder} is a head model; give the tracked folder, and this one with --head")

@@ -50,7 +50,10 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
     expected = None
     if footage.duration is not None and footage.rate:
         seconds = min(footage.duration, span.end or footage.duration) - span.start
-        expected = min(MAX_PICTURES, max(1, round(seconds * footage.rate / stride(footage.rate))))
+        expected = max(1, round(seconds * footage.rate / stride(footage.rate)))
+        if footage.is_joined and expected > MAX_PICTURES:
+            raise UserError(f"the recordings have {expected} times together; give fewer; {MAX_PICTURES} are tracked")
+        expected = min(MAX_PICTURES, expected)
     with FaceDetector() as detector:
         for picture in progress(footage.read(view, span, notes.append), expected, "looking for the face"):
             if len(times) == MAX_PICTURES:

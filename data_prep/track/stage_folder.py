@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.errors import UserError
+from avatar.files.atomic import refuse_current
 from avatar.files.lock import LOCK_FILE, locked
 from avatar.files.names import shortened
 from avatar.files.read import read_json
@@ -69,9 +70,9 @@ class StageFolder:
                 (self.path / name).rename(self.path / other)
             for record in self.path.rglob(RECORD):
                 record.unlink()
-            (self.path / LOCK_FILE).unlink(missing_ok=True)
             seal(self.path)
             self.path.rename(target)
+            (target / LOCK_FILE).unlink(missing_ok=True)  # not before: another process would begin
         except OSError as error:
             raise UserError(
                 f"{target} cannot be written ({error.strerror or error}); the same command tries again"
@@ -81,6 +82,7 @@ class StageFolder:
 @contextlib.contextmanager
 def growing(target: Path) -> Iterator[StageFolder]:
     """The stages of `target`, for one process at a time. Raises UserError where nothing can be written."""
+    refuse_current(target)
     folder = target.with_name(f".{shortened(target.name)}.partial")
     with locked(folder):
         try:

@@ -135,7 +135,7 @@ def test_an_interrupted_refinement_goes_on(run: Path, tmp_path: Path, monkeypatc
     @contextmanager
     def soon():
         count = iter(range(100))
-        yield lambda: next(count) >= 4
+        yield lambda: next(count) >= 2
 
     target = tmp_path / "refined"
     with monkeypatch.context() as patch:

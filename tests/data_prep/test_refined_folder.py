@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -54,14 +55,15 @@ def history(subject: Subject, run: str = "/runs/first") -> Refinement:
 
 @pytest.fixture(scope="module")
 def written(subject: Subject, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    target = tmp_path_factory.mktemp("out") / "someone"
+    target = Path(os.path.relpath(tmp_path_factory.mktemp("out") / "someone"))
     write_folder(target, subject, better(subject), history(subject), {"refinement.csv": b"frame\n"})
-    return target
+    return target.resolve()
 
 
 def test_it_is_read_back_with_both_trackings(written: Path, subject: Subject) -> None:
     again = opened(written)
     assert again.name == "someone" and again.manifest.format == "avatar-track"
+    assert read_info(written).head_path == str((written / "head_model").resolve())
     assert again.recording.names == subject.recording.names and again.recording.fps == subject.recording.fps
     assert again.split == subject.split and again.manifest.refinement == history(subject)
     assert again.given is not None

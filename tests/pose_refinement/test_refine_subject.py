@@ -135,7 +135,7 @@ def test_the_number_of_threads_does_not_matter(
 def stopping_after(frames: int, seen: list[int]) -> Iterator[Callable[[], bool]]:
     def asked() -> bool:
         seen.append(1)
-        return len(seen) >= 2 * frames - 1  # asked twice for each frame
+        return len(seen) >= frames
 
     yield asked
 

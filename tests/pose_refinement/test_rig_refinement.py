@@ -161,6 +161,11 @@ def test_the_record_of_a_rig_has_a_line_for_each_time(avatar: Avatar, wrong: Cli
         ["4", "00004_0", "test"],
         ["5", "00005_0", "test"],
     ]
+    split = wrong.recording.split
+    seen = tuple(i for i in split.train if wrong.recording.view(i) != 0)
+    without = replace(wrong, recording=replace(wrong.recording, split=split._replace(train=seen)))
+    lines = frames_csv(cast(Subject, without), result, centre).splitlines()[1:]
+    assert [line.split(",")[1] for line in lines[3:]] == ["00003_1", "00004_1", "00005_1"], "fitted pictures are named"
     said = summary(subject, result, centre)
     assert f"{result.after[4:].mean():.2f} dB" in next(line for line in said if line.startswith("held-out"))
     after = replace(wrong.recording, tracks=result.tracks)

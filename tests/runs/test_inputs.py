@@ -94,7 +94,18 @@ def test_the_cameras_width_is_a_whole_number_of_pixels(anna: TrainedAvatar) -> N
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"size": 0}, {"zoom": 0}, {"zoom": -1.0}, {"zoom": NAN}, {"yaw": INF}, {"pitch": "up"}]
+    "wrong",
+    [
+        {"size": 0},
+        {"zoom": 0},
+        {"zoom": -1.0},
+        {"zoom": NAN},
+        {"yaw": INF},
+        {"pitch": "up"},
+        {"jaw": None},
+        {"jaw": "0.2"},
+        {"left_lid": np.array([0.2])},
+    ],
 )
 def test_a_pose_that_is_no_picture_names_the_value(wrong: dict[str, Any], anna: TrainedAvatar) -> None:
     with pytest.raises(UserError, match=f"^{next(iter(wrong))} is "):

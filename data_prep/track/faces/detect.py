@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -173,14 +174,18 @@ def _load() -> tuple[Any, Any]:
     return mediapipe, landmarker
 
 
+_QUIET = threading.RLock()  # all threads have one standard error
+
+
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """MediaPipe's libraries write remarks of their own to the standard error's file, past Python."""
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+    with _QUIET:
+        kept = os.dup(2)
+        try:
+            with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+                os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)

@@ -135,5 +135,5 @@ def make_priors(
     if not statistical:
         low[expression], high[expression] = BOX
     named_negative = (mean[:, expression] < 0).any(0)  # mapped to with a negative weight: goes both ways
-    low[expression] = torch.where(named_negative, -BOX[1], low[expression])
+    low[expression] = torch.where(named_negative, low[expression].clamp(max=-BOX[1]), low[expression])
     return Priors(mean, deviation.pow(-2), low, high)

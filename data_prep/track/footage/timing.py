@@ -44,6 +44,8 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
         drift = (T - 1) * abs(slope * fps - 1)
         return Timing(fps if drift <= _DRIFT else 1 / slope, np.arange(T), ())
     usual = forward[(forward > 0.8 * median) & (forward < 1.2 * median)]
+    if len(usual) == 0:  # the median lies between two distances that are as common: the shorter one
+        usual = np.sort(forward)[len(forward) // 2 - 1 :][:1]
     fps = _common(float(1.0 / usual.mean()), _SNAP_VARIABLE)
     places = np.maximum.accumulate(times - times[0]) * fps  # a time that runs backwards stays where it was
     numbers = np.rint(places).astype(np.int64)

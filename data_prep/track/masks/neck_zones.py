@@ -35,7 +35,7 @@ def zones_of(
     height, width = matte.shape
     small_screen = screen * np.array([SIDE / width, SIDE / height, 1.0])
     body = silhouette(small_screen, faces, SIDE, SIDE)
-    level, aside = _about_axis(small_screen[:, :2], ring)
+    level, aside = _about_axis(screen[:, :2], ring, width, height)
     return Zones(
         image=cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA),
         person=cv2.resize(matte, (SIDE, SIDE), interpolation=cv2.INTER_AREA) > 127,
@@ -47,11 +47,14 @@ def zones_of(
     )
 
 
-def _about_axis(points: np.ndarray, ring: np.ndarray) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
-    """Every pixel's height above the ring along the head's axis, and its distance from it."""
+def _about_axis(
+    points: np.ndarray, ring: np.ndarray, width: int, height: int
+) -> tuple[Float[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
+    """Every pixel's height above the ring along the head's axis, and its distance from it, in the image's own pixels: those
+    of SIDE may be wider than high."""
     base = points[ring].mean(0)
     axis = points.mean(0) - base
     axis = axis / max(float(axis @ axis), 1e-9)
     rows, columns = np.mgrid[0:SIDE, 0:SIDE] + 0.5
-    x, y = columns - base[0], rows - base[1]
+    x, y = columns * (width / SIDE) - base[0], rows * (height / SIDE) - base[1]
     return x * axis[0] + y * axis[1], np.abs(x * axis[1] - y * axis[0])

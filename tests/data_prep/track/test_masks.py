@@ -71,6 +71,21 @@ def test_the_head_without_its_clothes(seed: int, shift: int) -> None:
         assert head_mask(picture.image, picture.alpha, elsewhere).overlap == 0.0
 
 
+@pytest.mark.parametrize(("width", "height"), [(512, 512), (550, 802), (1280, 720)])
+def test_heights_are_along_the_heads_axis_whatever_the_picture(width: int, height: int) -> None:
+    model = renderer_of(1).performer.model
+    template, faces = model.assets.template.numpy(), model.faces.numpy()
+    ring, roll = neck_ring(template, faces), np.radians(20)
+    flat = (template[:, :2] - template[:, :2].mean(0)) * [1, -1] * 0.5 * min(width, height) / np.ptp(template[:, 1])
+    turned = flat @ np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]) + [width / 2, height / 2]
+    screen = np.column_stack((turned, 1 - 0.1 * template[:, 2]))
+    image = np.zeros((height, width, 3), np.uint8)
+    zones = zones_of(image, image[..., 0], screen, faces, ring)
+    gy, gx = (float(slope.mean()) for slope in np.gradient(zones.level))
+    axis = turned.mean(0) - turned[ring].mean(0)
+    assert np.arctan2(gx / width, -gy / height) == pytest.approx(np.arctan2(axis[0], -axis[1]), abs=1e-6)
+
+
 def test_masks_repeat() -> None:
     renderer = renderer_of(1)
     performance = perform(1, 2, "speech")

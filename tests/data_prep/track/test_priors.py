@@ -51,6 +51,13 @@ def test_blendshapes_stay_in_their_box(statistical: bool) -> None:
     assert torch.isinf(found.low[: LIDS.start]).all()
 
 
+@pytest.mark.parametrize("statistical", [False, True])
+def test_a_negative_weight_only_widens(statistical: bool) -> None:
+    names = ExpressionNames((), {"mouthsmileleft": {"0": 2.0, "1": -2.5}})
+    low = make_priors(seen(mouthSmileLeft=0.9), names, torch.arange(EXPRESSIONS), statistical).low[FIRST:]
+    assert low[:3].tolist() == ([-torch.inf] * 3 if statistical else [BOX[0], -BOX[1], BOX[0]])
+
+
 def test_an_iris_counts_as_far_as_its_eye_is_open() -> None:
     landmarks = np.array([4, LEFT_IRIS, RIGHT_IRIS])
     winking = seen(eyeBlinkLeft=CLOSED_SCORE, eyeBlinkRight=CLOSED_SCORE / 2)

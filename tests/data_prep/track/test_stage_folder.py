@@ -11,8 +11,10 @@ import pytest
 from heads import grid_head
 
 from avatar.errors import UserError
+from avatar.files.atomic import check_target
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_track import FrameTrack
+from data_prep.prepare.checksums import CONTENTS_FILE, write_contents
 from data_prep.progress import silent
 from data_prep.track import tracking_stages
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
@@ -162,6 +164,29 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     refused = pytest.raises(UserError, match="is being written by process")
     with growing(tmp_path / "out"), refused, growing(tmp_path / "out"):
         pass
+
+
+def test_nobody_else_begins_while_a_folder_is_sealed(tmp_path: Path) -> None:
+    sealed: list[Path] = []
+
+    def seal(folder: Path) -> None:
+        with pytest.raises(UserError, match="is being written by process"), growing(tmp_path / "out"):
+            pass
+        write_contents(folder)
+        sealed.append(folder)
+
+    with growing(tmp_path / "out") as stages:
+        stages.run("one", {}, lambda folder: {})
+        stages.finish(tmp_path / "out", (), seal=seal)
+    assert sealed and {path.name for path in (tmp_path / "out").iterdir()} == {"one", CONTENTS_FILE}
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_folder_that_a_command_runs_in_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for begin in (lambda: growing(Path()).__enter__(), lambda: check_target(Path())):
+        with pytest.raises(UserError, match="is the folder that this runs in"):
+            begin()
 
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:

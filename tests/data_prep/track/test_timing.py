@@ -53,6 +53,12 @@ def test_a_variable_rate_leaves_gaps_and_drops_between() -> None:
     )
 
 
+def test_two_distances_that_are_as_common_lose_no_picture() -> None:
+    times = np.cumsum([0, *(1 / 30, 4 / 30) * 10])
+    timing = regular_timing(times)
+    assert timing.fps == 30.0 and timing.numbers.tolist() == np.rint(times * 30).tolist()
+
+
 def test_times_that_run_backwards() -> None:
     times = np.arange(40) / 25
     times[20] = times[3]
