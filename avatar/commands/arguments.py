@@ -15,8 +15,8 @@ from avatar.commands.parser import build_parser
 from avatar.errors import UserError
 from avatar.files.read import is_there
 
-# Paths that are read; create has a list of its own.
-INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver")
+INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver")  # paths that are read
+LISTS_MISTAKES = ("check", "create")  # these commands say everything that is wrong at once
 KEY = re.compile(r"[+~]*[A-Za-z_][\w.]*")  # Hydra's own signs are no part of our keys, and refused as such
 
 
@@ -52,6 +52,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def refuse_missing(arguments: argparse.Namespace) -> None:
     """Raises UserError for an input that nothing has the name of: before the command is imported, which takes seconds."""
+    if arguments.command in LISTS_MISTAKES:
+        return
     for value in (getattr(arguments, name, None) for name in INPUTS):
         for path in value if isinstance(value, list) else [value]:
             if isinstance(path, Path) and not is_there(path):
