@@ -50,7 +50,13 @@ def test_random_heads_mix_jaw_expression_and_lids_of_different_frames_and_leave_
     assert float(torch.corrcoef(drawn.T).triu(1).abs().max()) < 0.4
 
 
-@pytest.mark.parametrize("name", ["gaussianheadavatar", "gaussianheadavatar_hyper", "gaussianheadavatar_ndgs"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gaussianheadavatar_hyper",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("gaussianheadavatar", "gaussianheadavatar_ndgs")),
+    ],
+)
 def test_gaussians_near_the_face_start_with_the_meshs_motion_at_expressions_of_no_frame(
     name: str, tracked_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

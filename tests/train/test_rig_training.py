@@ -123,6 +123,7 @@ def test_the_network_gets_the_same_turn_whichever_camera_looks(place: Path) -> N
         torch.testing.assert_close(other.means, seen[0].means, atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_run_with_zoom_resumes_with_the_same_bits(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
