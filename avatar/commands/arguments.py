@@ -57,7 +57,7 @@ def refuse_missing(arguments: argparse.Namespace) -> None:
     for value in (getattr(arguments, name, None) for name in INPUTS):
         for path in value if isinstance(value, list) else [value]:
             if isinstance(path, Path) and not is_there(path):
-                raise UserError(f"{path}: there is no such file or folder")
+                raise UserError(f"{path} does not exist")
 
 
 def nearest(word: str, known: Iterable[str] | Mapping[str, object]) -> str:

@@ -25,7 +25,7 @@ def check_folder(folder: Path) -> None:
     if folder.is_file():
         raise UserError(f"{folder} is a file; if it is a video, avatar track makes a tracked folder of it")
     if not folder.exists():
-        raise UserError(f"{folder}: there is no such file or folder")
+        raise UserError(f"{folder} does not exist")
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder; give the tracked video folder (docs/data.md)")
     if (folder / _RUN_FILE).is_file():

@@ -52,7 +52,7 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
         seconds = min(footage.duration, span.end or footage.duration) - span.start
         expected = max(1, round(seconds * footage.rate / stride(footage.rate)))
         if footage.is_joined and expected > MAX_PICTURES:
-            raise UserError(f"the recordings have {expected} times together; give fewer; {MAX_PICTURES} are tracked")
+            raise UserError(f"the recordings have {expected} times together; give at most {MAX_PICTURES}")
         expected = min(MAX_PICTURES, expected)
     with FaceDetector() as detector:
         for picture in progress(footage.read(view, span, notes.append), expected, "looking for the face"):

@@ -23,10 +23,10 @@ def _no_network(*_: object, **__: object) -> None:
 
 
 MISTAKES = {
-    "no such folder": (["train", "{tmp}/nothing"], "nothing: there is no such file or folder"),
-    "no such video": (["train", "{tmp}/nothing.mp4"], "nothing.mp4: there is no such file or folder"),
-    "no such folder to prepare": (["prepare", "{tmp}/nothing"], "nothing: there is no such file or folder"),
-    "no such video as driver": (["reenact", "{run}", "{tmp}/x.mp4"], "x.mp4: there is no such file or folder"),
+    "no such folder": (["train", "{tmp}/nothing"], "nothing does not exist"),
+    "no such video": (["train", "{tmp}/nothing.mp4"], "nothing.mp4 does not exist"),
+    "no such folder to prepare": (["prepare", "{tmp}/nothing"], "nothing does not exist"),
+    "no such video as driver": (["reenact", "{run}", "{tmp}/x.mp4"], "x.mp4 does not exist"),
     "no such sweep": (["sweep", "{tmp}/x.yaml"], "x.yaml does not exist"),
     "a folder of runs": (["view", "{run}/.."], "holds {run}/../run"),
     "eval of a folder of runs": (["eval", "{run}/.."], "holds {run}/../run"),
@@ -52,11 +52,11 @@ MISTAKES = {
     ),
     "eval of no run": (["eval", "{tmp}"], "is not a run folder: it has no run.json"),
     "reenactment of no avatar": (["reenact", "{tmp}", "--driver", "{data}"], "is neither a run nor an avatar file"),
-    "reenactment of a missing avatar": (["reenact", "{tmp}/x", "{data}"], "x: there is no such file or folder"),
-    "a missing run beside another": (["compare", "{run}", "{tmp}/x"], "x: there is no such file or folder"),
+    "reenactment of a missing avatar": (["reenact", "{tmp}/x", "{data}"], "x does not exist"),
+    "a missing run beside another": (["compare", "{run}", "{tmp}/x"], "x does not exist"),
     "eval with another head": (["eval", "{run}", "--head", "{other}/head_model"], "trained with another head model"),
     "unknown protocol": (["eval", "{run}", "--protocol", "paper"], "paper"),
-    "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody: there is no such file or folder"),
+    "driver gone": (["reenact", "{run}", "--driver", "{tmp}/nobody"], "nobody does not exist"),
     "driver of another head": (
         ["reenact", "{run}", "--driver", "{other}", "--frame-offset", "1"],
         "was tracked with another head model",

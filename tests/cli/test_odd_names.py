@@ -37,7 +37,7 @@ def test_an_error_about_a_name_that_no_terminal_shows_is_a_sentence(place: Path)
     words = [sys.executable, "-m", "avatar.cli", "compare", str(place / "none"), str(place / "none")]
     environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
     done = subprocess.run(words, env=environment, capture_output=True, check=False)
-    assert done.returncode == 1 and b"there is no such file" in done.stderr and b"Traceback" not in done.stderr
+    assert done.returncode == 1 and b"does not exist" in done.stderr and b"Traceback" not in done.stderr
 
 
 def test_evaluating_and_comparing(place: Path) -> None:
