@@ -80,12 +80,11 @@ def reenact(
     moved, source, goal = transfer_motion(
         drive.params, trained.statistics, choices.transfer, driver_head, strength=choices.strength, rest=rest
     )
-    neutral = {
-        drive.name: frame_name(source, drive.names),
-        trained.name: frame_name(goal, training_names(trained)),
-    }
+    neutral = {"driver": frame_name(source, drive.names), "avatar": frame_name(goal, training_names(trained))}
     if all(neutral.values()):
-        say("Neutral expression: " + ", ".join(f"frame {frame} of {name}" for name, frame in neutral.items()))
+        say(
+            f"Neutral expression: frame {neutral['driver']} of {drive.name}, frame {neutral['avatar']} of {trained.name}"
+        )
     if choices.driver_neutral is None:
         say_open_lips(source, driver_head, drive.name, "--driver-neutral", say)
     if choices.neutral is None:

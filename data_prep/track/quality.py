@@ -90,6 +90,7 @@ def grade_tracking(
         ),
         *_of_outline(outline),
         *_torso(own.get("torso")),
+        *_covered(own.get("covered"), len(fit.tracks)),
         Figure("largest identity coefficient", own["identity"], "", 4.0, 8.0, "give the focal length with --focal"),
     ]  # fmt: skip
     figures += [Figure(name, value, unit) for name, value, unit in own.get("photometric", ())]
@@ -116,6 +117,13 @@ def _torso(share: float | None) -> list[Figure]:
     # Never poor: a torso that is not followed stays with the head.
     advice = "keep the shoulders in the picture, and hands away from the collar"
     return [] if share is None else [Figure("frames whose torso was followed", 100 * share, "%", 90, 0, advice, True)]
+
+
+def _covered(numbers: Sequence[int] | None, frames: int) -> list[Figure]:
+    if numbers is None:  # frames that do not fit to each other show nothing of the kind
+        return []
+    advice = "keep hands off the face; --start and --end choose a part of the video"
+    return [Figure("frames whose face is covered", 100 * len(numbers) / frames, "%", 2, 10, advice)]
 
 
 def coverage(fit: Fit, landmarks: Landmarks) -> list[Figure]:

@@ -53,6 +53,7 @@ SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
 )
 TURNED = "the pictures are turned by {} degrees clockwise, {}"
+COVERED = "something, such as a hand, is before the face at {} s"
 WITHOUT = "the mattes leave out most of the face in frames {}"
 LYING, GIVEN = "since the head lies in them (--rotate 0 leaves them)", "as --rotate says"
 
@@ -116,6 +117,10 @@ def track(
             say(f"note: {note}")
         notes = (*footage.notes, *(mattes.notes if mattes else ()), *look.notes, *outline_notes)
         fit = work.fit(landmarks, _camera(focal, view, footage, choices), head_path, [frames_key, matte_key])
+        if covered := fit.figures.get("covered"):
+            rate, begins = look.landmarks.fps, look.begins
+            notes = (*notes, COVERED.format(describe_numbers(covered, name=lambda n: f"{begins + n / rate:.1f}")))
+            say(f"note: {notes[-1]}")
         overlaps, outline = work.masks(landmarks, fit)
         fit = work.torso(fit)
         work.overlay(fit, look)

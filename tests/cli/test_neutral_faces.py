@@ -39,7 +39,7 @@ def test_neutral_faces_can_be_chosen_without_the_training_video(trained: Path, d
     output = avatar("reenact", file, *options, "--neutral", 3, "--driver-neutral", "00005", "--out", tmp_path / "a.mp4")
     assert "Neutral expression: frame 00005 of driver, frame 00003 of someone" in output
     recorded = json.loads((tmp_path / "a.choices.json").read_text())
-    assert recorded["neutral_frames"] == {"driver": "00005", "someone": "00003"}
+    assert recorded["neutral_frames"] == {"driver": "00005", "avatar": "00003"}
     assert (recorded["choices"]["neutral"], recorded["choices"]["driver_neutral"]) == ("3", "00005")
     avatar("reenact", file, *options, "--neutral", 3, "--driver-neutral", 6, "--out", tmp_path / "b.mp4")
     avatar("reenact", file, *options, "--neutral", 4, "--driver-neutral", 5, "--out", tmp_path / "c.mp4")

@@ -17,6 +17,7 @@ from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding, o
 from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.chunks import side_by_side
+from data_prep.track.fit.covered import COVERED_SHARE
 from data_prep.track.fit.frame_poses import Motion, six_d
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.photometric_fit import fit_pictures
@@ -49,6 +50,7 @@ def fit_tracks(
     if by_pictures.is_taken:
         # The pictures' fit leaves the landmarks' noise behind, so their error grades the fit to them alone.
         own["photometric"].append(["  landmark error after that", own["errors"]["all"], "% eyes"])
+        own["covered"] = by_landmarks.frames[by_pictures.covered > COVERED_SHARE].tolist()
         own["errors"] = judged(by_landmarks.motion)[1]["errors"]
     return Fit(tracks, own)
 

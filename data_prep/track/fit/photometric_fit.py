@@ -21,6 +21,7 @@ from data_prep.progress import Progress
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.fit.camera import Pinhole, to_camera
 from data_prep.track.fit.chunks import over_chunks
+from data_prep.track.fit.covered import covered_shares
 from data_prep.track.fit.crops import BlurredCrops, Crops, Images, Mattes, cut_out
 from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import POINT_SHARE, LandmarkFit, eye_distance
@@ -42,6 +43,7 @@ HELD_OUT = 5  # one point of so many
 # vertices, without what is the same in all frames, fell to 0.39 to 0.53 of what it was, at gains from 2.0 to 3.3 dB.
 LEAST_GAIN = 1.0
 _FRAMES_AT_ONCE = 16
+_AT_ORIGIN = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class PhotometricFit:
     motion: Motion  # of the pictures' fit where that is taken, else of the landmarks'
     before: float  # PSNR of the held-out points against their mean texture, dB: of the landmarks' fit
     after: float  # of the fit to the pictures
+    covered: Float[Tensor, " T"]  # share of the face before which something is, by the fit to the pictures
 
     @property
     def is_taken(self) -> bool:
@@ -96,7 +99,9 @@ def fit_pictures(
     assert blurred is not None
     before = _psnr(held.values(blurred, start.motion), first[:, is_held], held.basis)
     after = _psnr(held.values(blurred, motion), weights[:, is_held], held.basis)
-    done = PhotometricFit(motion, before, after)
+    places = points.positions(start.identity, at_rest(*_AT_ORIGIN, len(start.expressions)))[0]
+    covered = covered_shares(skin.values(blurred, motion), weights, skin.basis, places)
+    done = PhotometricFit(motion, before, after, covered)
     return done if done.is_taken else replace(done, motion=start.motion)
 
 
@@ -196,8 +201,7 @@ def _trust(residuals: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]) -> Fl
 
 def _near_lips(assets: HeadAssets, start: LandmarkFit, points: SurfacePoints) -> Bool[Tensor, " N"]:
     """Points that fit badly because the mouth has yet to move, and must have their say in it."""
-    pose = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
-    rest = at_rest(*pose, len(start.expressions))
+    rest = at_rest(*_AT_ORIGIN, len(start.expressions))
     skin, landmarks = (at.positions(start.identity, rest)[0] for at in (points, start.term.points))
     lips = landmarks[torch.from_numpy(np.isin(start.term.landmarks, groups.LIPS))]
     if not len(lips):

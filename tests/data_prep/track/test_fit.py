@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,9 +18,10 @@ from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.prepare.projection import project_head
 from data_prep.progress import silent
-from data_prep.track.faces.landmark_groups import LIPS
+from data_prep.track.faces.landmark_groups import LIPS, NOSE
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.camera import to_camera
+from data_prep.track.fit.covered import COVERED_SHARE
 from data_prep.track.fit.fit_clip import as_tracks
 from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import LandmarkFit, eye_distance, fit_landmarks
@@ -90,6 +92,26 @@ def test_pictures_that_say_nothing_are_not_believed(scene: Fitted) -> None:
     noise = pictures_of(scene, lambda image: rng.integers(0, 256, image.shape).astype(np.uint8))
     done = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, *noise, silent)
     assert not done.is_taken and done.motion is scene.fit.motion
+
+
+def test_hands_before_the_face_are_found_and_moving_lips_are_none(scene: Fitted) -> None:
+    """Four fingers of the skin's colour lie over cheek and mouth in five frames of sixteen."""
+    covered = [2, 3, 4, 11, 12]
+    images, mattes = pictures_of(scene)
+    hands = [images(row).copy() for row in range(FRAMES)]
+    for row in covered:
+        points, eyes = scene.seen.landmarks.points[row, :, :2], scene.seen.eyes
+        x, y = points[list(LIPS)].mean(0)
+        skin = hands[row][int(points[list(NOSE), 1].mean()), int(points[list(NOSE), 0].mean())]
+        for finger in range(4):
+            tip = int(x + (0.25 * finger - 0.6) * eyes), int(y - (0.7 - 0.1 * abs(finger - 1.5)) * eyes)
+            root = int(tip[0] - 0.3 * eyes), int(y + 0.9 * eyes)
+            for width, share in ((0.24, 0.5), (0.2, 0.9)):  # with a dark edge
+                cv2.line(hands[row], root, tip, (share * skin).tolist(), int(width * eyes), cv2.LINE_AA)
+    found = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, hands.__getitem__, mattes, silent)
+    assert (found.covered > COVERED_SHARE).nonzero().flatten().tolist() == covered
+    bare = fit_pictures(scene.seen.assets, scene.fit, scene.seen.camera, images, mattes, silent)
+    assert (bare.covered <= COVERED_SHARE).all()
 
 
 def test_mattes_without_the_face_are_refused_and_no_figure_is_made_of_nothing(scene: Fitted) -> None:
