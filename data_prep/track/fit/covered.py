@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.sparse import csr_matrix
@@ -28,12 +29,13 @@ def covered_shares(
 
     `values` are grey, `weights` from 0 (not seen) to 1, `basis` that of `lit_texture`, `places` of the resting head.
     """
-    nearest = KDTree(places.numpy()).query(places.numpy(), k=min(_NEIGHBOURS, len(places)))[1]
-    rows = torch.arange(len(places)).repeat_interleave(nearest.shape[1])
-    around = csr_matrix((torch.ones(len(rows)).double().numpy(), (rows.numpy(), nearest.ravel())))
+    k = min(_NEIGHBOURS, len(places))
+    _, nearest = KDTree(places.numpy()).query(places.numpy(), k=k)
+    rows = np.arange(len(places)).repeat(k)
+    around = csr_matrix((np.full(len(rows), 1 / k), (rows, np.ravel(nearest))))
 
     def mean_around(numbers: Float[Tensor, "T N"]) -> Float[Tensor, "T N"]:
-        return torch.from_numpy((around @ numbers.T.numpy()).T) / nearest.shape[1]
+        return torch.from_numpy((around @ numbers.T.numpy()).T)
 
     seen = mean_around(weights)
     is_seen = seen > 1 / 3
