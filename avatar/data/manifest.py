@@ -20,7 +20,7 @@ from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.read import MissingFile, read_json
 
-MANIFEST_VERSION = 8
+MANIFEST_VERSION = 9
 MANIFEST_FILE, TRACKS_FILE = "manifest.json", "tracks.safetensors"
 GIVEN = "given."  # before the names of the tracks as they were before their refinement
 MASKS = ("alpha", "head", "mouth")  # keys of `Manifest.labels`

@@ -12,7 +12,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from avatar.errors import UserError
-from data_prep.formats.frame_files import FrameFiles, KindNames, find_numbered, find_tracking, transparent
+from data_prep.formats.frame_files import (
+    FrameFiles,
+    KindNames,
+    find_numbered,
+    find_shifted_masks,
+    find_tracking,
+    transparent,
+)
 from data_prep.formats.metrical_tracker import read_tracking
 from data_prep.formats.tracked_folder import TrackedFolder, matte_notes
 
@@ -28,7 +35,7 @@ def recognise(folder: Path) -> bool:
 
 
 def open_folder(folder: Path) -> TrackedFolder:
-    """Raises UserError for missing or unnumbered files, and where the numbers of images and tracking are shifted."""
+    """Raises UserError for missing or unnumbered files, and where the numbers of tracking or mattes are shifted."""
     images, mattes = find_numbered(folder / "images"), find_numbered(folder / "image_mask")
     if not images:
         raise UserError(f"{folder / 'images'} has no frames: 00000.png, 00001.png ...; copy them again")
@@ -41,6 +48,7 @@ def open_folder(folder: Path) -> TrackedFolder:
         names=NAMES,
     )
     _refuse_shifted(files)
+    find_shifted_masks(files)
     division, notes = _division(sorted(images.keys() & files.tracking.keys()), bool(mattes))
     return TrackedFolder(
         NAME,

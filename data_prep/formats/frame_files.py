@@ -130,7 +130,8 @@ def find_frame_files(
     """List `folder` (imgs/, alpha/, parsing/, checkpoint/) and the tracking folder, if that is another one.
 
     Raises UserError when there is no folder. Calls `complain`, which raises too by default, when images or tracking are
-    missing, a file has no number or two have the same one; if it returns, the listing goes on without that file.
+    missing, a file has no number, two have the same one, or masks are numbered otherwise; if it returns, the listing goes
+    on without that file.
     """
     folder = Path(folder)
     if folder.is_file():
@@ -140,7 +141,7 @@ def find_frame_files(
     images = find_numbered(folder / "imgs", complain)
     if not images and not _others(folder / "imgs"):
         complain(f"{folder} has no frames: put them in {folder / 'imgs'} as 00001.jpg, 00002.jpg ... (or .png)")
-    return FrameFiles(
+    files = FrameFiles(
         folder=folder,
         images=images,
         alphas=find_numbered(folder / "alpha", complain) or transparent(images),
@@ -148,6 +149,22 @@ def find_frame_files(
         mouth_masks=find_numbered(folder / "parsing", complain, "_mouth"),
         tracking=find_tracking(folder, tracking, complain),
     )
+    find_shifted_masks(files, complain)
+    return files
+
+
+def find_shifted_masks(files: FrameFiles, complain: Callable[[str], object] = refuse) -> None:
+    """Calls `complain` where masks begin and end earlier than the images, or later: a program numbered them anew, and equal
+    numbers are hardly of one frame."""
+    for kind, masks in ((ALPHA, files.alphas), (HEAD, files.head_masks), (MOUTH, files.mouth_masks)):
+        if not files.images or not masks:
+            continue
+        (first, last), (first_mask, last_mask) = ((min(n), max(n)) for n in (files.images, masks))
+        if (first - first_mask) * (last - last_mask) > 0:
+            complain(
+                f"{files.folder}: {files.title(kind)} has the numbers {first_mask:05d} to {last_mask:05d} and "
+                f"{files.title(IMAGE)} {first:05d} to {last:05d}, but a mask has the number of its image; rename the masks"
+            )
 
 
 def transparent(images: Mapping[int, Path]) -> dict[int, Path]:

@@ -15,7 +15,9 @@ from data_prep.formats.identity import MAX_CHANGE, compare_identities
 
 ROTATION_TOLERANCE = 1e-2  # float16 and rounding; larger errors are not a rotation
 Item = TypeVar("Item")
-INTRINSICS_NOTE, INTRINSICS_ERROR = 1e-3, 5e-2  # relative change of fx, fy, cx, cy within a clip
+FOCAL_ERROR = 5e-2  # relative change of fx and fy within a clip
+CENTRE_ERROR = 1e-2  # of the picture's sides, change of cx and cy: by so much the head is elsewhere in the picture
+INTRINSICS_NOTE = 0.02  # of these
 
 
 @dataclass(frozen=True)
@@ -187,6 +189,7 @@ def _check_camera(
 ) -> None:
     first_number, first = next(iter(frames.items()))
     worst, worst_number = 0.0, first_number
+    most = np.array([*FOCAL_ERROR * first.intrinsics[:2], *(CENTRE_ERROR * side for side in first.size)])
     for number, frame in frames.items():
         if frame.size != first.size:
             complain(
@@ -194,7 +197,7 @@ def _check_camera(
                 f"on {first.size[0]}x{first.size[1]}; track the whole video at one size"
             )
             break
-        change = float(np.abs(frame.intrinsics - first.intrinsics).max() / first.intrinsics[:2].max())
+        change = float(np.abs((frame.intrinsics - first.intrinsics) / most).max())
         if change > worst:
             worst, worst_number = change, number
     if worst > INTRINSICS_NOTE:
@@ -204,7 +207,7 @@ def _check_camera(
         )
         focals = [frame.intrinsics[0] for frame in frames.values()]
         both += f"; fx goes from {min(focals):.2f} to {max(focals):.2f}"
-        if worst > INTRINSICS_ERROR:
+        if worst > 1:
             complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
         else:
             flaws.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")

@@ -7,8 +7,9 @@
     FOLDER/refinement.csv      of each frame: how well it fitted before and after, and how far it moved
     FOLDER/refinement.png      some frames: as they are, with the tracking before and after
 
-Pictures and masks are hard links to those of the subject, or copies where there can be none. With several cameras,
-tracking.npz has a row for each time, with the head's pose before the first of them, and pictures are numbered from 0.
+Pictures and masks are hard links to those of the subject, or copies where there can be none; label images and pictures
+that are their own mattes are written out as masks. With several cameras, tracking.npz has a row for each time, with the
+head's pose before the first of them, and pictures are numbered from 0.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from torch import Tensor
 
-from avatar.data.manifest import Manifest
+from avatar.data.images import read_matte
+from avatar.data.manifest import MASKS, Manifest
 from avatar.data.recording import Recording
 from avatar.data.refinement import Refinement
 from avatar.data.subject import Subject
@@ -141,13 +144,20 @@ def _link_pictures(building: Path, subject: Subject) -> None:
         HEAD: subject.folder if manifest.head_masks == "derived" else source,
         MOUTH: subject.folder if manifest.mouth_masks == "derived" else source,
     }
+    labels: dict[str, int | None] = dict(zip((MATTE, HEAD, MOUTH), map(manifest.labels.get, MASKS), strict=True))
     for number, record in zip(frame_numbers(subject), manifest.frames, strict=True):
         kinds = {FRAMES: record.image, MATTE: record.alpha, HEAD: record.head_mask, MOUTH: record.mouth_mask}
         for kind, path in kinds.items():
             if path is None:
                 continue
             (building / kind).mkdir(exist_ok=True)
-            _link(roots.get(kind, source) / path, building / kind / f"{number:05d}{Path(path).suffix}")
+            file, label = roots.get(kind, source) / path, labels.get(kind)
+            if label is None and not (kind == MATTE and path == record.image):
+                _link(file, building / kind / f"{number:05d}{Path(path).suffix}")
+                continue
+            # Labels and pictures that are their own mattes are no masks of this layout.
+            mask = read_matte(file, source / record.image, label)
+            (building / kind / f"{number:05d}.png").write_bytes(cv2.imencode(".png", mask)[1].tobytes())
     landmarks = source / avatar_track.LANDMARKS_FILE
     if manifest.format == avatar_track.NAME and landmarks.is_file():
         _link(landmarks, building / avatar_track.LANDMARKS_FILE)

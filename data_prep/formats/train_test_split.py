@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from avatar.data.split import Split, split_frames
@@ -24,14 +24,19 @@ def split_frames_of(
     test_cameras  names between commas, or "none"; None: as the folder says
     Raises UserError where there are too few frames, and for cameras that there are not.
     """
-    division, shots = tracked.division, tracked.shots
+    shots, notes = tracked.shots, []
+    parts = [tracked.division.get(number) for number in numbers]
+    if test_frames is None and "train" not in parts and {"val", "test"} <= set(parts):
+        # As of the camera that VHAP's listings validate with, when it is the only one: what they test stays held out.
+        parts = ["train" if part == "val" else part for part in parts]
+        notes.append("the folder names no training frames: those of validation are trained on")
     if shots:
-        return _divide_shots(division, [shots[number] for number in numbers], numbers, test_frames, test_cameras)
+        split, more = _divide_shots(parts, [shots[number] for number in numbers], test_frames, test_cameras)
+        return split, [*notes, *more]
     if test_cameras not in (None, NO_CAMERA):
         raise UserError(f"data.test_cameras={test_cameras}: the frames are all of one camera")
     if len(numbers) == 1 and test_frames is None:
         return Split((0,), ()), ["there is a single frame: it can drive an avatar, and none can be trained on it"]
-    parts = [division.get(number) for number in numbers]
     listed = Split(*(tuple(i for i, part in enumerate(parts) if part == name) for name in ("train", "test")))
     if not any(parts) or test_frames is not None:
         return split_frames(len(numbers), test_frames), []
@@ -42,17 +47,12 @@ def split_frames_of(
         ]
     left = len(parts) - len(listed.train) - len(listed.test)
     unused = f" ({left} of validation are not used)" if left else ""
-    return listed, [f"the folder's own division into training and test frames is kept{unused}"]
+    return listed, [*notes, f"the folder's own division into training and test frames is kept{unused}"]
 
 
 def _divide_shots(
-    division: Mapping[int, str | None],
-    shots: Sequence[Shot],
-    numbers: Sequence[int],
-    test_frames: int | None,
-    test_cameras: str | None,
+    parts: Sequence[str | None], shots: Sequence[Shot], test_frames: int | None, test_cameras: str | None
 ) -> tuple[Split, list[str]]:
-    parts = [division.get(number) for number in numbers]
     held_out = named_cameras(test_cameras, {shot.camera for shot in shots})
     times = sorted({shot.time for shot in shots})
     if len(times) == 1:
@@ -65,7 +65,9 @@ def _divide_shots(
     tested = {shot.time for shot, part in zip(shots, parts, strict=True) if part == "test" and shot.camera in trained}
     notes, unused = [], set()
     if is_own and (tested or ("test" in parts and held_out)):
-        unused = set(times) - tested - {shot.time for shot, part in zip(shots, parts, strict=True) if part != "val"}
+        # A folder of refined tracking names no part for what was of validation.
+        used_times = {shot.time for shot, part in zip(shots, parts, strict=True) if part not in ("val", None)}
+        unused = set(times) - tested - used_times
         left = f" ({len(unused)} of validation are not used)" if unused else ""
         notes.append(f"the folder's own division into training and test times is kept{left}")
     else:

@@ -190,8 +190,6 @@ def _shots(listed: dict[int, ListedFrame], parameters: dict[int, Path]) -> dict[
 
     Raises UserError for two frames of one camera at one time.
     """
-    if len({_camera(frame) for frame in listed.values()}) == 1:
-        return {}
     times, seen = _times(parameters), {}
     shots: dict[int, Shot] = {}
     for number, frame in listed.items():
@@ -199,12 +197,12 @@ def _shots(listed: dict[int, ListedFrame], parameters: dict[int, Path]) -> dict[
         shot = Shot(_camera(frame), times[path])
         if shot in seen:
             raise UserError(
-                f"{frame.listing}: frames {listed[seen[shot]].position} and {frame.position} are both of camera "
+                f"{frame.listing}: {listed[seen[shot]].image.name} and {frame.image.name} are both of camera "
                 f"{shot.camera} with {path.name}; each needs a camera_id or camera_index, or a parameter file, of its own"
             )
         seen[shot] = number
         shots[number] = shot
-    return shots
+    return shots if len({shot.camera for shot in seen}) > 1 else {}
 
 
 def _times(parameters: dict[int, Path]) -> dict[Path, int]:

@@ -30,6 +30,8 @@ RASTER_WIDTH = 256  # pixels; the features are sub-pixel, more resolution does n
 MIN_COMMON_FRAMES = 6
 MIN_FRAMES = MIN_COMMON_FRAMES + 1  # so that a neighbouring offset can be compared
 MIN_T = 3.0  # paired differences, best against every other offset
+LEAST_PART = 10  # sampled frames at an end of the clip that are asked for an offset of their own
+MIN_CHANGE_T = 2.5  # standard errors; in 20 clips without a gap it was 0.7 at most, in four with one 2.8 to 5.3
 GIVE_OFFSET = "give --frame-offset (1 where images are numbered from 1 and tracking from 0)"
 _RIDGE = 4.0  # pseudo-frames that say "no pose-dependent misfit"
 _CLIP = 9.0  # squared, in units of the best offset's own misfit: one bad mask must not decide
@@ -97,18 +99,23 @@ def detect_offset(
         for n in sampled
     }
     residuals = _mask_residuals(predicted, observed, candidates)
-    best, runner_up, t = _decide(_misfits(residuals))
+    misfits = _misfits(residuals)
+    best, runner_up, t = _decide(misfits)
     moving: Residuals = {}
     if t < MIN_T:
         found = motion_residuals(head, tracks, first.intrinsics, images, candidates, sampled, (width, height))
         moving = {offset: rows for offset, rows in found.items() if len(rows) >= MIN_COMMON_FRAMES}
-        best, runner_up, t = _decide(_misfits(_joined(residuals, moving)))
+        misfits = _misfits(_joined(residuals, moving))
+        best, runner_up, t = _decide(misfits)
     estimate = OffsetEstimate(best, t, runner_up, len(sampled), bool(moving))
     is_edge = not {best - 1, best + 1} <= set(candidates)
-    if t < MIN_T or is_edge:
-        if not ignore_misfit:
-            pairs = [(n + best, n) for n in tracks if n + best in images]
-            check_sample(head, tracks, files, pairs).refuse()  # the likelier reason
+    is_clear = t >= MIN_T and not is_edge
+    if not is_clear and not ignore_misfit:
+        pairs = [(n + best, n) for n in tracks if n + best in images]
+        check_sample(head, tracks, files, pairs).refuse()  # the likelier reason
+    if not ignore_misfit:
+        _refuse_change(misfits, best)
+    if not is_clear:
         raise UserError(
             f"the offset between images and tracking is not clear (best is {estimate.sentence()}); look at the frames and "
             f"{GIVE_OFFSET}"
@@ -248,6 +255,26 @@ def _decide(misfit: Mapping[int, Mapping[int, float]]) -> tuple[int, int, float]
         if t < smallest:
             runner_up, smallest = offset, t
     return best, runner_up, min(smallest, _CERTAIN) if np.isfinite(smallest) else 0.0
+
+
+def _refuse_change(misfit: Mapping[int, Mapping[int, float]], best: int) -> None:
+    """Raise UserError where another offset than the best fits one end of the clip better."""
+    most, found = MIN_CHANGE_T, ""
+    for offset in misfit.keys() - {best}:
+        common = sorted(misfit[best].keys() & misfit[offset].keys())
+        gain = np.array([misfit[best][n] - misfit[offset][n] for n in common])
+        for at in range(LEAST_PART, len(common) - LEAST_PART + 1):
+            for part, where in (
+                (gain[:at], f"up to frame {common[at - 1]}"),
+                (gain[at:], f"from frame {common[at]} on"),
+            ):
+                if (t := _standard_errors(part)) > most:
+                    most, found = t, f"{offset} {where} of the tracking, by {t:.1f} standard errors"
+    if found:
+        raise UserError(
+            f"the offset between images and tracking changes within the clip: {best} fits all in all, but {found}; one of "
+            "them lacks frames: extract the images and track them again, or give --frame-offset to go on regardless"
+        )
 
 
 def _standard_errors(gain: np.ndarray) -> float:

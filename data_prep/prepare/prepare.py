@@ -130,9 +130,11 @@ def prepare(
     ]
     for note in notes:
         say(f"note: {note}")
+    names = files.frame_names()
     if pairing.left_out:
         total = len(pairing.pairs) + len(pairing.left_out)
-        say(f"warning: left out {len(pairing.left_out)} of {total} frames: {describe_reasons(pairing.left_out)}")
+        reasons = describe_reasons(pairing.left_out, names.__getitem__)
+        say(f"warning: left out {len(pairing.left_out)} of {total} frames: {reasons}")
     used = [tracks.frames[number] for _, number in pairing.pairs]
     shots = [tracked.shots[image] for image, _ in pairing.pairs if tracked.shots]
     found = find_rig(shots, used) if shots else None
@@ -142,7 +144,6 @@ def prepare(
         rows = [given_tracks.frames[number] for _, number in pairing.pairs]
         given = _stack_tracks(rows) if found is None else _stack_tracks(*heads_before(found.rig, rows))
         arrays |= {f"{GIVEN}{name}": array for name, array in given.items()}
-    names = files.frame_names()
     head_kind = "source" if files.head_masks else "derived" if files.parsing else "none"
     mouth_kind = "source" if files.mouth_masks else "derived" if files.parsing or has_lips else "none"
     manifest = Manifest(

@@ -53,7 +53,7 @@ SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
 )
 TURNED = "the pictures are turned by {} degrees clockwise, {}"
-COVERED = "something, such as a hand, is before the face at {} s"
+COVERED = "the face looks unlike itself, as with a hand before it, at {} s"
 WITHOUT = "the mattes leave out most of the face in frames {}"
 LYING, GIVEN = "since the head lies in them (--rotate 0 leaves them)", "as --rotate says"
 

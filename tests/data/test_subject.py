@@ -79,7 +79,7 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "manifest a list": (lambda f: (f / "manifest.json").write_text("[1]"), r"has manifest version None"),
     "another version": (
         lambda f: edit_manifest(f, version=99),
-        r"version 99, and this program reads 8; prepare it again",
+        r"version 99, and this program reads 9; prepare it again",
     ),
     "a key missing": (lambda f: edit_manifest(f, width=None), r"damaged \(width is missing\)"),
     "a wrong type": (lambda f: edit_manifest(f, width="64"), r"damaged \(width is not a whole number\)"),

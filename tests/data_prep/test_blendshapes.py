@@ -90,10 +90,11 @@ def test_a_missing_picture_is_left_out(copy: Path, tmp_path: Path) -> None:
     assert "note: images skips the numbers 00007" in said
 
 
-def test_masks_of_other_numbers_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", [1, 100])
+def test_masks_of_other_numbers_are_refused(by: int, tmp_path: Path) -> None:
     folder = write_blendshapes(tmp_path / "x", image_mask=True)
-    renumber(folder, "image_mask", 100)
-    with pytest.raises(UserError, match="24 of 24 images .*it has no alpha"):
+    renumber(folder, "image_mask", by)
+    with pytest.raises(UserError, match=rf"image_mask has the numbers {by:05d} to .* and images 00000 to 00023, but"):
         prepare_folder(folder, tmp_path / "out")
 
 

@@ -18,6 +18,7 @@ from camera_rig_folder import (
     from_front,
     lens,
     opened,
+    write_listings,
     write_single,
     write_union,
 )
@@ -130,6 +131,21 @@ def test_cameras_are_chosen(single: Path, tmp_path: Path) -> None:
         opened(single, tmp_path / "all", test_cameras="07,08,12")
 
 
+def test_what_a_validation_camera_tests_is_held_out_where_it_is_the_only_one(single: Path, tmp_path: Path) -> None:
+    """Half of the times are tested, more than of a short clip without a division."""
+    folder = edited(single, tmp_path / "copy", lambda _: None)
+    every = [entry for file in folder.glob("*.json") for entry in json.loads(file.read_text())["frames"]]
+    parts: dict[str | None, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
+    for entry in every:
+        early = "val" if entry["camera_id"] == "08" else "train"
+        parts["test" if entry["timestep_index"] > 2 else early].append(entry)
+    write_listings(folder, parts)
+    subject, said = opened(folder, tmp_path / "out", cameras="08")
+    assert subject.split == ((0, 1, 2), (3, 4, 5))
+    assert "note: the folder names no training frames: those of validation are trained on" in said
+    assert opened(folder, tmp_path / "asked", cameras="08", test_frames=1)[0].split.test == (5,)
+
+
 def test_a_union_joins_sequences_of_other_worlds(tmp_path: Path) -> None:
     folder = write_union(tmp_path)
     subject, _ = opened(folder, tmp_path / "out")
@@ -168,6 +184,10 @@ def alone(entry: dict[str, Any]) -> bool:
     return (entry["camera_id"] == "12") == (entry["timestep_index"] < 2)
 
 
+def nameless(entry: dict[str, Any]) -> None:
+    del entry["camera_id"], entry["camera_index"]
+
+
 def outside(entry: dict[str, Any]) -> None:
     entry["file_path"] = f"../other/{entry['file_path']}"
 
@@ -176,6 +196,10 @@ HOSTILE = {
     "a camera that is calibrated 5 degrees off": (turned(5.0), "camera 12: .*does not lie on the masks.*calibration"),
     "a camera that moves": (moving, "camera 12 moves against camera 08, by up to"),
     "two pictures of one camera and time": (same_camera, "are both of camera 08 with 00000.npz"),
+    "pictures of cameras that are not named": (
+        nameless,
+        "00000_0.* are both of camera None with 00000.npz; each needs",
+    ),
     "a camera without a common time": (alone, "camera 12 has no picture of a time that camera 08 has one of"),
     "paths beside a folder that is no union": (outside, "leaves .*; give a folder that holds its own frames"),
 }
@@ -195,7 +219,7 @@ def test_a_missing_picture_is_left_out(single: Path, tmp_path: Path) -> None:
     (folder / "images" / "00001_12.png").unlink()
     subject, said = opened(folder, tmp_path / "out", max_left_out=0.1)
     assert "00001_12" not in subject.recording.names
-    assert any("left out 1 of 18" in line for line in said)
+    assert any("left out 1 of 18 frames: 00001_12 (" in line for line in said)
 
 
 def test_a_black_camera_is_refused(single: Path, tmp_path: Path) -> None:

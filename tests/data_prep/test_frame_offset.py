@@ -101,6 +101,22 @@ def test_a_random_pairing_is_not_taken_for_an_offset(tmp_path: Path) -> None:
             detect(folder, folder / "head_model")
 
 
+@pytest.mark.parametrize(
+    ("lost", "sentence"),
+    [(41, "1 fits all in all, but 0 from frame .*"), (20, "0 fits all in all, but 1 up to frame .*")],
+)
+def test_a_picture_that_is_lost_within_the_clip_is_noticed(lost: int, sentence: str, tmp_path: Path) -> None:
+    """All pictures after it have a number less, as an extraction numbers them that drops one."""
+    folder = write_tracked_folder(tmp_path / "subject", frames=60)
+    files, tracks, model = read(folder, folder / "head_model")
+    kinds = {
+        kind: {number - (number > lost): path for number, path in getattr(files, kind).items() if number != lost}
+        for kind in ("images", "alphas", "head_masks", "mouth_masks")
+    }
+    with pytest.raises(UserError, match=f"changes within the clip: {sentence}; one of them lacks frames"):
+        detect_offset(model, tracks, replace(files, **kinds))
+
+
 @pytest.mark.parametrize("frames", [1, 6])
 def test_too_few_frames_are_called_that(frames: int, tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "subject", frames=frames)

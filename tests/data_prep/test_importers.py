@@ -192,8 +192,11 @@ def test_an_offset_contradicts_a_listing(tracked: Path, tmp_path: Path) -> None:
 
 
 def test_vhap_imavatar_and_insta_lack_a_number_between_two_folders_of_images(tmp_path: Path) -> None:
-    entry = {"flame_param_path": "1.npz", "mesh_path": "1.obj"}
-    frames = [{"file_path": f"{folder}/{n}.png", **entry} for folder in "ab" for n in (1, 2)]
+    frames = [
+        {"file_path": f"{folder}/{n}.png", "flame_param_path": f"{folder}/{n}.npz", "mesh_path": "1.obj"}
+        for folder in "ab"
+        for n in (1, 2)
+    ]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     (tmp_path / "1.obj").touch()
     listed = read_listings(tmp_path)

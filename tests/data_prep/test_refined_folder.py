@@ -8,9 +8,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from nha_folder import write_nha
 from tracked_folder import write_tracked_folder
 
 from avatar.data.refinement import Refinement, Round
@@ -141,6 +143,31 @@ def test_masks_that_were_made_come_along(tmp_path: Path) -> None:
     again = opened(tmp_path / "refined")
     assert again.manifest.mouth_masks == "source"
     assert torch.equal(again.frame(4).mouth_mask, own.frame(4).mouth_mask)
+
+
+def test_labels_become_masks(tmp_path: Path) -> None:
+    """NHA's have several that are the person: without the layout they would be faint mattes."""
+    own = opened(write_nha(tmp_path / "person"))
+    write_folder(tmp_path / "refined", own, better(own), history(own), {})
+    again = opened(tmp_path / "refined")
+    for name in ("alpha", "head_mask", "mouth_mask"):
+        assert torch.equal(getattr(again.frame(4), name), getattr(own.frame(4), name))
+
+
+def test_pictures_that_are_their_own_mattes_stay_so_where_one_is_opaque(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "someone", frames=20, size=48, suffix=".png")
+    for path in sorted((folder / "imgs").iterdir()):
+        matte = cv2.imread(str(folder / "alpha" / path.name), cv2.IMREAD_GRAYSCALE)
+        picture = cv2.imread(str(path))
+        assert matte is not None and picture is not None
+        assert cv2.imwrite(str(path), np.dstack((picture, np.full_like(matte, 255) if "05" in path.name else matte)))
+    shutil.rmtree(folder / "alpha")
+    own = open_subject(Source(folder, folder / "head_model", frame_offset=1), None, lambda _: None)[0]
+    write_folder(tmp_path / "refined", own, better(own), history(own), {})
+    again = opened(tmp_path / "refined")
+    for index in (3, 4):
+        assert torch.equal(again.frame(index).alpha, own.frame(index).alpha)
+    assert own.frame(4).alpha.min() == 1
 
 
 def test_a_second_round_keeps_what_the_tracker_left(written: Path, subject: Subject, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from camera_rig_folder import write_single, write_union
+from camera_rig_folder import edited, write_listings, write_single, write_union
 
 from avatar.data.refinement import Refinement, Round
 from avatar.data.source import Source
@@ -79,6 +79,17 @@ def test_a_refined_rig_is_read_back_with_both_trackings(layout: str, request: py
         ours, theirs = again.frame(index), subject.frame(index)
         for name in ("image", "alpha", "head_mask", "mouth_mask"):
             assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+
+
+def test_times_of_validation_alone_are_not_trained_on_after_refinement(tmp_path: Path) -> None:
+    folder = edited(write_single(tmp_path), tmp_path / "copy", lambda _: None)
+    every = [entry for file in folder.glob("*.json") for entry in json.loads(file.read_text())["frames"]]
+    parts = {"train": (0, 1, 2), "val": (3,), "test": (4, 5)}
+    write_listings(folder, {part: [e for e in every if e["timestep_index"] in own] for part, own in parts.items()})
+    subject, written = written_of(folder, tmp_path / "refined")
+    again = opened(written, tmp_path / "head_model")
+    assert again.split == subject.split
+    assert {again.recording.time(i) for i in again.split.train} == {0, 1, 2}
 
 
 def test_a_second_round_of_a_rig_keeps_numbers_and_what_the_tracker_left(

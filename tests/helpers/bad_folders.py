@@ -18,8 +18,10 @@ from folder_damage import (
     hostile,
     masks_of_three_labels,
     matching,
+    move_centre,
     nan_in,
     remove,
+    renumbered,
     resize,
     set_K,
     shift_masks,
@@ -49,6 +51,14 @@ CASES: dict[str, tuple[Edit, str]] = {
     "number twice, two formats": (
         lambda f: cv2.imwrite(str(f / "imgs/00002.png"), np.zeros((64, 64, 3), np.uint8)),
         r"00002\.jpg and .*00002\.png are both frame 2",
+    ),
+    "mattes numbered anew": (
+        every(lambda n: renumbered("alpha", n), range(1, 25)),
+        r"alpha has the numbers 00000 to 00023 and imgs 00001 to 00024, but a mask has the number of its image; rename",
+    ),
+    "all masks numbered anew": (
+        every(lambda n: lambda f: [renumbered(kind, n)(f) for kind in ("alpha", "parsing")], range(1, 25)),
+        r"alpha has the numbers 00000 to 00023 and imgs 00001 to 00024, but a mask has the number of its image; rename",
     ),
     "no checkpoint": (
         lambda f: shutil.rmtree(f / "checkpoint"),
@@ -158,6 +168,10 @@ CASES: dict[str, tuple[Edit, str]] = {
     "K changes": (
         edit_frame(9, opencv__K=set_K(1.2)),
         r"intrinsics change within the clip: 00000\.frame has fx fy cx cy = 179\.20 .* and 00009\.frame has fx",
+    ),
+    "a picture that is cut elsewhere": (
+        edit_frame(9, opencv__K=move_centre(1.0)),
+        r"intrinsics change within the clip: 00000\.frame has .* 32\.00 32\.00 and 00009\.frame has .* 33\.00 33\.00; ",
     ),
     "image size missing": (every(lambda n: edit_frame(n, img_size=None), TWO), r"img_size is not \(width, height\)"),
     "image sizes mixed": (

@@ -120,3 +120,17 @@ def hostile(folder: Path) -> None:
 
 def set_K(factor: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda K: K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]], K.dtype)
+
+
+def move_centre(pixels: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda K: K + np.array([[0, 0, pixels], [0, 0, pixels], [0, 0, 0]], K.dtype)
+
+
+def renumbered(kind: str, number: int) -> Edit:
+    """The files of image `number` get the number before it."""
+
+    def edit(folder: Path) -> None:
+        for path in matching(folder, f"{kind}/{number:05d}*"):
+            path.rename(path.with_name(path.name.replace(f"{number:05d}", f"{number - 1:05d}")))
+
+    return edit
