@@ -247,7 +247,7 @@ def describe_numbers(numbers: list[int], limit: int = 12, name: Callable[[int], 
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    shown = [name(a) if a == b else f"{name(a)}-{name(b)}" for a, b in runs[:limit]]
+    shown = [name(a) if name(a) == name(b) else f"{name(a)}-{name(b)}" for a, b in runs[:limit]]
     return ", ".join(shown) + (f" and {len(runs) - limit} more" if len(runs) > limit else "")
 
 

@@ -8,6 +8,7 @@ takes no part; what these gain decides whether the result is taken.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,7 @@ from data_prep.track.fit.texture import light_basis, lit_texture
 EYES_IN_CROPS = 110.0  # pixels between the eyes, at most
 BLURS = (3.0, 1.2)  # per cent of the distance between the eyes
 NEAR_LIPS = 0.25  # distances between the eyes
+INNER_FACE = 0.5  # likewise, from any feature: hair that falls otherwise as the head tilts lies farther outside
 ROUNDS, ITERATIONS = 6, 1  # textures for each blur, and steps for each texture: it lags behind the motion
 COARSE_SHARE = 2  # of the fitted points one of so many counts at the first blur, where neighbours say the same
 LANDMARK_SHARE, FEATURE_SHARE = 0.05, 0.2  # of the landmarks' weights that stay; of lips, lids and distances
@@ -43,7 +45,6 @@ HELD_OUT = 5  # one point of so many
 # vertices, without what is the same in all frames, fell to 0.39 to 0.53 of what it was, at gains from 2.0 to 3.3 dB.
 LEAST_GAIN = 1.0
 _FRAMES_AT_ONCE = 16
-_AT_ORIGIN = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ def fit_pictures(
     skin = _Skin(assets, corners, barycentric, camera, crops, start)
     held, compared_at = skin.subset(is_held), dict.fromkeys(BLURS, ~is_held)
     compared_at[BLURS[0]] = ~is_held & (number % COARSE_SHARE == 0)
-    on_mouth = _near_lips(assets, start, points)
+    # Points that fit badly because the mouth has yet to move, and must have their say in it.
+    on_mouth = _near(assets, start, points, groups.LIPS, NEAR_LIPS)
     terms = (_quieter(start.term), start.priors, start.smoothness)
     first = skin.weights(motion)
     for chosen in (is_held, ~is_held):
@@ -99,8 +101,9 @@ def fit_pictures(
     assert blurred is not None
     before = _psnr(held.values(blurred, start.motion), first[:, is_held], held.basis)
     after = _psnr(held.values(blurred, motion), weights[:, is_held], held.basis)
-    places = points.positions(start.identity, at_rest(*_AT_ORIGIN, len(start.expressions)))[0]
-    covered = covered_shares(skin.values(blurred, motion), weights, skin.basis, places)
+    is_inner = _near(assets, start, points, groups.FEATURES, INNER_FACE)
+    values, places = skin.values(blurred, motion)[:, is_inner], _at_rest(points, start)[is_inner]
+    covered = covered_shares(values, weights[:, is_inner], skin.basis[is_inner], places)
     done = PhotometricFit(motion, before, after, covered)
     return done if done.is_taken else replace(done, motion=start.motion)
 
@@ -199,11 +202,17 @@ def _trust(residuals: Float[Tensor, "T N"], weights: Float[Tensor, "T N"]) -> Fl
     return (own[weights.sum(0) > 0].median() / own.clamp(min=1e-12)).clamp(max=1.0)
 
 
-def _near_lips(assets: HeadAssets, start: LandmarkFit, points: SurfacePoints) -> Bool[Tensor, " N"]:
-    """Points that fit badly because the mouth has yet to move, and must have their say in it."""
-    rest = at_rest(*_AT_ORIGIN, len(start.expressions))
-    skin, landmarks = (at.positions(start.identity, rest)[0] for at in (points, start.term.points))
-    lips = landmarks[torch.from_numpy(np.isin(start.term.landmarks, groups.LIPS))]
-    if not len(lips):
+def _near(
+    assets: HeadAssets, start: LandmarkFit, points: SurfacePoints, landmarks: Sequence[int], reach: float
+) -> Bool[Tensor, " N"]:
+    """Points within `reach` distances between the eyes of any of these landmarks, at rest."""
+    places = _at_rest(start.term.points, start)[torch.from_numpy(np.isin(start.term.landmarks, landmarks))]
+    skin = _at_rest(points, start)
+    if not len(places):
         return torch.zeros(len(skin), dtype=torch.bool)
-    return torch.cdist(skin, lips).amin(1) < NEAR_LIPS * eye_distance(assets)
+    return torch.cdist(skin, places).amin(1) < reach * eye_distance(assets)
+
+
+def _at_rest(points: SurfacePoints, start: LandmarkFit) -> Float[Tensor, "N 3"]:
+    pose = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
+    return points.positions(start.identity, at_rest(*pose, len(start.expressions)))[0]

@@ -141,10 +141,10 @@ def test_points_at_the_mouth_are_told(scene: Fitted) -> None:
     pose = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
     rest = at_rest(*pose, len(fit.expressions))
     apart = torch.cdist(vertices.positions(fit.identity, rest)[0], lips.positions(fit.identity, rest)[0]).amin(1)
-    near = photometric_fit._near_lips(assets, fit, vertices)
+    near = photometric_fit._near(assets, fit, vertices, LIPS, 0.25)
     assert near.any() and torch.equal(near, apart < 0.25 * eye_distance(assets))
     without = replace(fit, term=replace(fit.term, landmarks=np.zeros_like(fit.term.landmarks) + 4))
-    assert not photometric_fit._near_lips(assets, without, vertices).any()
+    assert not photometric_fit._near(assets, without, vertices, LIPS, 0.25).any()
 
 
 def test_one_bad_point_does_not_decide_what_is_taken() -> None:
