@@ -25,6 +25,7 @@ from avatar.evaluation.protocol import NAME
 from avatar.evaluation.tracking_source import Drive, Part, is_marked, legend, parts
 from avatar.files.names import typed
 from avatar.files.read import MissingFile, read_bytes, read_json
+from avatar.runs.checkpoint import newest_step
 
 NEEDED = {"data_hash", "head_fingerprint", "image_size", "perceptual", "protocols", "tracking"}  # of results.json
 # What is read of results.json, where it is there: "*" is every other key, a list has its one form throughout.
@@ -58,6 +59,8 @@ _ALWAYS = {
     *("block_frames", "bootstrap", "choices", "driven_by", "frames_sha256", "lpips", "means"),
     *("measured_frames_trained_on", "rounds", "tracker", "weights_sha256"),
 }
+# Of results.json: what has to agree, and what it is called.
+SAME = (("data_hash", "data"), ("head_fingerprint", "head model"), ("image_size", "image size"))
 NOT_COMPARED = ("summary", "source")  # words about a protocol; every other choice has to agree
 
 
@@ -140,7 +143,7 @@ def compare_runs(runs: Sequence[Path], protocols: Sequence[str] | None = None) -
     evaluations = [read_evaluation(label, path) for label, path in zip(labels, runs, strict=True)]
     for other in evaluations[1:]:
         check_same(evaluations[0], other)
-    notes: list[str] = []
+    notes = [note for evaluation in evaluations for note in trained_since(evaluation)]
     comparisons = []
     for name in common_protocols(evaluations, protocols, notes):
         for drive in evaluations[0].parts(name):
@@ -197,24 +200,29 @@ def _misfit(value: Any, form: Any, where: str = "") -> str:
 
 def check_same(first: Evaluation, other: Evaluation) -> None:
     """Figures of other data, another head model or another image size say nothing about which avatar is better."""
-    for key, what in (
-        ("data_hash", "other data"),
-        ("head_fingerprint", "another head model"),
-        ("image_size", "another image size"),
-    ):
+    for key, what in SAME:
         ours, theirs = first.results[key], other.results[key]
         if ours != theirs:
             shown = [
                 str(value)[:12] if isinstance(value, str) else "x".join(map(str, value)) for value in (theirs, ours)
             ]
-            raise UserError(f"{other.label} was evaluated on {what} than {first.label} ({shown[0]}, not {shown[1]})")
+            another = f"other {what}" if key == "data_hash" else f"another {what}"
+            raise UserError(f"{other.label} was evaluated on {another} than {first.label} ({shown[0]}, not {shown[1]})")
+
+
+def trained_since(evaluation: Evaluation) -> list[str]:
+    """A note where the run has gone on since it was measured."""
+    step, newest = evaluation.results.get("step"), newest_step(evaluation.folder.parent)
+    if step is None or newest in (None, step):
+        return []
+    return [f"{evaluation.label} was measured at step {step}, and its newest checkpoint is of step {newest}"]
 
 
 def common_protocols(evaluations: Sequence[Evaluation], wanted: Sequence[str] | None, notes: list[str]) -> list[str]:
     """Names of the protocols that all runs have with the same choices; those that are left out go into `notes`."""
     first, *others = evaluations
     chosen = []
-    for name in wanted or first.results["protocols"]:
+    for name in dict.fromkeys(wanted or first.results["protocols"]):
         lacking = [each.label for each in evaluations if name not in each.results["protocols"]]
         differing = {
             key
@@ -244,7 +252,7 @@ def compare_protocol(
     if not frames:
         notes.append(f"{name} was measured on frames of which none is in all runs")
         return None
-    if missing := max(len(table) for table in tables) - len(frames):
+    if missing := len(set().union(*tables)) - len(frames):
         notes.append(
             f"{name}: {len(frames)} frames are in all runs, {missing} more in some; only the common ones count"
         )

@@ -95,7 +95,7 @@ def evaluate(
         by_drive: dict[Drive, list[FrameResult]] = {drive: found[protocol.name] for drive, found in results.items()}
         entry = summarise(protocol, by_drive, networks[protocol.lpips_net], subject.recording.fps, seen)
         for drive, part in parts(entry).items():
-            rows = frames_csv(protocol.columns, by_drive[drive], seen).encode()
+            rows = frames_csv(protocol.columns, by_drive[drive], seen).encode(errors="backslashreplace")
             write_atomically(folder / protocol.name / part.table, rows)
             part.figures["frames_sha256"] = hashlib.sha256(rows).hexdigest()
         entries[protocol.name] = entry

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 from collections.abc import Collection, Mapping
 from contextlib import suppress
@@ -56,7 +57,7 @@ def read_frames(place: Path, entry: dict[str, Any]) -> dict[Drive, list[FrameRes
     """The tables of frames in RUN/eval/PROTOCOL."""
     found: dict[Drive, list[FrameResult]] = {}
     for drive, part in parts(entry).items():
-        rows = csv.DictReader(read_text(place / part.table, MAX_TABLE_BYTES).splitlines())
+        rows = csv.DictReader(io.StringIO(read_text(place / part.table, MAX_TABLE_BYTES)))
         found[drive] = [
             FrameResult(
                 int(row["frame"]),

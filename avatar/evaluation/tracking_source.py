@@ -101,7 +101,7 @@ def legend(trackings: Sequence[Mapping[str, Any]]) -> list[str]:
         f"{LABELS['refined']}: {one['refined']}; no figures of unseen frames" for one in trackings if one["rounds"]
     ]
     marked = [OF_MARK] if any(map(is_marked, trackings)) else []
-    return [f"tracked: as {trackers} left it; {OF_TRACKERS}", *refined[:1], *marked]
+    return [f"tracked: as {trackers} left it; {OF_TRACKERS}", *dict.fromkeys(refined), *marked]
 
 
 def tracking_notes(tracking: Mapping[str, Any]) -> list[str]:

@@ -85,7 +85,7 @@ def verify_part(folder: Path, choices: Mapping[str, Any], part: Part) -> tuple[D
     content = _again(lambda: read_bytes(table, MAX_TABLE_BYTES))
     if hashlib.sha256(content).hexdigest() != part.figures["frames_sha256"]:
         raise UserError(f"{table} is not the table that results.json was made from; evaluate again")
-    rows = list(csv.DictReader(content.decode().splitlines()))
+    rows = list(csv.DictReader(io.StringIO(content.decode())))
     place = {_place(row): int(row["frame"]) for row in rows}
     seen: list[Figures] = []
     worst = Difference(0.0, "psnr", f"frame {rows[0]['name']}")

@@ -189,6 +189,7 @@ def error_map(
 
 def _caption(text: str, height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
     strip = np.full((height, width, 3), PAPER, np.uint8)
+    text = text.encode(errors="backslashreplace").decode()  # half a surrogate pair in a file's name crashes OpenCV
     font, thickness = cv2.FONT_HERSHEY_SIMPLEX, 1
     (text_width, text_height), _ = cv2.getTextSize(text, font, 1.0, thickness)
     scale = min(0.5 * height / text_height, 0.92 * width / max(text_width, 1))

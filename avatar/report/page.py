@@ -92,10 +92,11 @@ def _main_figures(results: Mapping[str, Any] | None) -> list[Markup]:
         shown = {column: value for column in MAIN if (value := means.get(f"{column}{what}")) is not None}
         if not shown:
             continue
-        network = entry["lpips"].get("network")
+        network, scale = entry["lpips"].get("network"), entry.get("choices", {}).get("lpips_scale", 1.0)
         figures = {column: f"{column} {network}" if column == "lpips" else column for column in shown}
         words: dict[str, Word | None] = {
-            column: word_of(figure, shown[column]) if what else None for column, figure in figures.items()
+            column: word_of(figure, shown[column]) if what and (column != "lpips" or scale == 1.0) else None
+            for column, figure in figures.items()
         }
         labels = {
             f"{MAIN[column][0]}, {MAIN[column][1]} is better": _judged(_figure(column, value), words[column])

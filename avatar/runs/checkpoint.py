@@ -90,6 +90,12 @@ def newest_checkpoint(run: Path) -> Checkpoint:
     return load_checkpoint(files[-1])
 
 
+def newest_step(run: Path) -> int | None:
+    """Of the last checkpoint of a run, without reading it; None when there is none."""
+    names = [_NAME.fullmatch(path.name) for path in list_checkpoints(run / "checkpoints")[-1:]]
+    return next((int(name[1]) for name in names if name), None)
+
+
 def module_tensors(module: torch.nn.Module) -> dict[str, Tensor]:
     """The parameters of a module under the names that checkpoints give them."""
     return {f"{_MODEL}{name}": value for name, value in module.state_dict().items()}

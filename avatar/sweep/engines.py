@@ -147,14 +147,18 @@ class RayCluster:
             os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         check_installed("--engine ray", "ray", "ray")
         ray: Any = import_module("ray")
-        options: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if own else {}
+        # Its own cluster has the processors of so many jobs: Ray would wait for ever for what it has not.
+        cpus = (workers or workers_that_fit(resources)) * resources.threads
+        options: dict[str, Any] = {"num_cpus": cpus, "include_dashboard": False} if own else {}
         try:
             ray.init(address=address, log_to_driver=False, logging_level="error", **options)
         except (ConnectionError, RuntimeError, ValueError) as error:
             place = f"at {address}" if address else "on this machine"
             raise UserError(f"no Ray cluster answers {place} ({str(error).splitlines()[0]})") from None
         self._ray = ray
-        needs: dict[str, Any] = {"num_cpus": resources.threads, "memory": int(resources.memory_gb * 2**30)}
+        needs: dict[str, Any] = {"num_cpus": resources.threads}
+        if not own:  # how many jobs its own memory holds is counted above
+            needs["memory"] = int(resources.memory_gb * 2**30)
         if gpus:
             needs["num_gpus"] = gpus  # Ray shows a worker its own, and no others
         # What is tried again is decided in one place, from the job's files.

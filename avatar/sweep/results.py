@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,7 +11,15 @@ from scipy import stats
 
 from avatar.errors import UserError
 from avatar.evaluation.bootstrap import LEVEL, Interval
-from avatar.evaluation.compare import Cell, Comparison, Evaluation, ProtocolComparison, read_evaluation
+from avatar.evaluation.compare import (
+    SAME,
+    Cell,
+    Comparison,
+    Evaluation,
+    ProtocolComparison,
+    common_protocols,
+    read_evaluation,
+)
 from avatar.evaluation.tracking_source import Drive, is_marked, legend
 from avatar.sweep.spec import Job, Spec
 
@@ -29,6 +36,8 @@ def fold_results(folder: Path, spec: Spec) -> Comparison:
     evaluations = read_evaluations(folder, spec.jobs, notes)
     evaluated = {job.variant for job, _ in evaluations}
     variants = [variant for variant in dict.fromkeys(job.variant for job in spec.jobs) if variant in evaluated]
+    variants = measured_like_the_first(evaluations, variants, notes)
+    evaluations = [one for one in evaluations if one[0].variant in variants]
     protocols = list(dict.fromkeys(name for _, each in evaluations for name in each.results["protocols"]))
     comparisons = []
     drives: tuple[Drive, ...] = ("tracked", "refined")
@@ -38,12 +47,13 @@ def fold_results(folder: Path, spec: Spec) -> Comparison:
             if compared is not None:
                 comparisons.append(compared)
     if not comparisons:
-        raise UserError(f"no subject and seed in {folder} is measured for all {len(variants)} variants yet")
+        why = "".join(f"; {note}" for note in dict.fromkeys(notes))
+        raise UserError(f"no subject and seed in {folder} is measured for all {len(variants)} variants yet{why}")
     by_variant = {
         variant: [each.results for job, each in evaluations if job.variant == variant] for variant in variants
     }
     return Comparison(
-        variants,
+        [" ".join(variant.split()) for variant in variants],  # a line break would end LaTeX's comment
         [any(is_marked(results["tracking"]) for results in own) for own in by_variant.values()],
         [" and ".join(sorted({results["perceptual"] for results in own})) for own in by_variant.values()],
         comparisons,
@@ -71,32 +81,88 @@ def compare_variants(
     notes: list[str],
 ) -> ProtocolComparison | None:
     """None where no (subject, seed) pair is there for all variants, driven so. What is left out goes into `notes`."""
-    means: dict[str, dict[tuple[str, int], Mapping[str, float]]] = {variant: {} for variant in variants}
-    networks: dict[tuple[str, int], set[str | None]] = defaultdict(set)
-    for job, evaluation in evaluations:
-        if protocol in evaluation.results["protocols"] and (part := evaluation.parts(protocol).get(drive)):
-            means[job.variant][job.subject, job.seed] = part.figures["means"]
-            networks[job.subject, job.seed].add(evaluation.results["protocols"][protocol]["lpips"]["weights_sha256"])
-    pairs = sorted(set.intersection(*(set(found) for found in means.values()))) if means else []
+    measured = [one for one in evaluations if protocol in one[1].results["protocols"]]
+    if not common_protocols([evaluation for _, evaluation in measured], [protocol], notes):
+        return None
+    found: dict[str, dict[tuple[str, int], Evaluation]] = {variant: {} for variant in variants}
+    for job, evaluation in measured:
+        if drive in evaluation.parts(protocol):
+            found[job.variant][job.subject, job.seed] = evaluation
+    pairs = sorted(set.intersection(*map(set, found.values()))) if found else []
+    pairs = comparable({pair: [found[variant][pair] for variant in variants] for pair in pairs}, protocol, notes)
     if not pairs:
         return None
+    means: dict[str, dict[tuple[str, int], Mapping[str, float | None]]] = {
+        variant: {pair: found[variant][pair].parts(protocol)[drive].figures["means"] for pair in pairs}
+        for variant in variants
+    }
+    entries = [found[variant][pair].results["protocols"][protocol] for variant in variants for pair in pairs]
     figures = [
         name for name in means[variants[0]][pairs[0]] if all(name in means[v][p] for v in variants for p in pairs)
     ]
-    if len(set().union(*(networks[pair] for pair in pairs))) > 1:
+    if len({entry["lpips"]["weights_sha256"] for entry in entries}) > 1:
         figures = [name for name in figures if not name.startswith("lpips")]
         notes.append(f"{protocol}: LPIPS is left out, because the jobs were measured with different networks")
     rows: dict[str, list[Cell]] = {}
+    lacking = []
     for figure in figures:
         values = [np.array([_number(means[variant][pair][figure]) for pair in pairs]) for variant in variants]
-        if np.isfinite(values).all():
-            first = values[0]
-            rows[figure] = [Cell(float(first.mean()), None, None)] + [
-                Cell(float(own.mean()), float((own - first).mean()), interval(own - first)) for own in values[1:]
-            ]
+        if not np.isfinite(values).all():
+            lacking.append(figure)
+            continue
+        first = values[0]
+        rows[figure] = [Cell(float(first.mean()), None, None)] + [
+            Cell(float(own.mean()), float((own - first).mean()), interval(own - first)) for own in values[1:]
+        ]
+    if lacking:
+        notes.append(f"{protocol}: left out, because some jobs have no such figure: {', '.join(lacking)}")
     subjects, seeds = len({subject for subject, _ in pairs}), len({seed for _, seed in pairs})
     unit = f"trainings each ({subjects} subjects, {seeds} seeds)"
     return ProtocolComparison(protocol, drive, len(pairs), unit, "Student's t over trainings", rows)
+
+
+def measured_like_the_first(
+    evaluations: Sequence[tuple[Job, Evaluation]], variants: Sequence[str], notes: list[str]
+) -> list[str]:
+    """The variants without those that were measured on something else than the first one, whatever subject and seed."""
+    first = {(job.subject, job.seed): own for job, own in evaluations if job.variant == variants[0]}
+    kept = []
+    for variant in variants:
+        same = [
+            differing((first[job.subject, job.seed], own), protocol)
+            for job, own in evaluations
+            if job.variant == variant and (job.subject, job.seed) in first
+            for protocol in own.results["protocols"].keys() & first[job.subject, job.seed].results["protocols"].keys()
+        ]
+        if same and all(same):
+            what = ", ".join(sorted(set().union(*same)))
+            notes.append(f"{variant} is left out: it was measured on different {what} than {variants[0]}")
+        else:
+            kept.append(variant)
+    return kept
+
+
+def comparable(
+    pairs: Mapping[tuple[str, int], Sequence[Evaluation]], protocol: str, notes: list[str]
+) -> list[tuple[str, int]]:
+    """Those pairs whose variants were measured on the same."""
+    odd = {pair: what for pair, evaluations in pairs.items() if (what := differing(evaluations, protocol))}
+    if odd:
+        notes.append(
+            f"{protocol}: {len(odd)} of {len(pairs)} subjects and seeds are left out, because their variants were "
+            f"measured on different {', '.join(sorted(set().union(*odd.values())))}"
+        )
+    return [pair for pair in pairs if pair not in odd]
+
+
+def differing(evaluations: Sequence[Evaluation], protocol: str) -> set[str]:
+    """Of data, head model, image size and frames those in which the evaluations differ: figures of others say nothing about
+    which variant is better."""
+    first, *others = (
+        {"frames": each.results["protocols"][protocol].get("frames"), **{what: each.results[key] for key, what in SAME}}
+        for each in evaluations
+    )
+    return {what for what in first for other in others if other[what] != first[what]}
 
 
 def interval(differences: np.ndarray) -> Interval | None:

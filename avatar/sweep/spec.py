@@ -113,6 +113,8 @@ def read_spec(path: Path) -> Spec:
         raise UserError(f"{path}: seeds holds {wrong[0]!r}, which is no number from 0 up")
     if len(set(seeds)) < len(seeds):
         raise UserError(f"{path}: seeds names one twice")
+    if any(word.partition("=")[0] == SEED_KEY for words in (common, *variants.values()) for word in words):
+        raise UserError(f"{path}: {SEED_KEY} is what seeds says; list its values there")
     protocols = _protocols(path, _words(path, "protocols", raw.get("protocols", [])))
     if len(subjects) * len(variants) * len(seeds) > MAX_JOBS:
         raise UserError(f"{path} asks for more than {MAX_JOBS:,} jobs; split it into several sweeps")
@@ -129,7 +131,7 @@ def read_spec(path: Path) -> Spec:
         for subject, (variant, overrides), seed in itertools.product(subjects, variants.items(), seeds)
     ]
     for variant, overrides in variants.items():
-        _check_overrides(path, variant, [*common, *overrides])
+        _check_overrides(path, variant, [*common, *overrides, f"{SEED_KEY}={max(seeds)}"])
     resources = Resources(
         threads=int(_number(path, raw, "threads", Resources.threads, 1, 1024)),
         memory_gb=_number(path, raw, "memory_gb", Resources.memory_gb, 0.1, 10_000),

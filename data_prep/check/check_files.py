@@ -39,7 +39,7 @@ def _unreadable(clip: Clip) -> Iterator[Finding]:
         advice = next(iter(reasons.values())).partition("; ")[2] or "write or copy it again"
         rest = f" and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
         yield Finding(
-            clip.loss_severity(len(reasons), len(clip.views)),
+            clip.picture_loss_severity(len(reasons), len(clip.views)),
             "unreadable",
             f"{len(reasons)} of {len(clip.views)} files of {clip.files.title(kind)} cannot be read: "
             f"{', '.join(shown)}{rest}",
@@ -92,7 +92,7 @@ def _mask_values(clip: Clip) -> Iterator[Finding]:
         empty = [n for n, view in clip.views.items() if view.brightest.get(kind) == 0]
         if empty:
             yield Finding(
-                clip.loss_severity(len(empty), len(clip.views)),
+                clip.picture_loss_severity(len(empty), len(clip.views)),
                 "empty-mask",
                 f"the {what} is empty in {clip.phrase(empty)}: no head was found there",
                 "segment them again, or accept that they are left out of training",
@@ -106,7 +106,7 @@ def _missing_masks(clip: Clip) -> Iterator[Finding]:
         if kind in (IMAGE, "checkpoint") or not found or not missing:
             continue
         yield Finding(
-            clip.loss_severity(len(missing), len(clip.files.images)),
+            clip.picture_loss_severity(len(missing), len(clip.files.images)),
             "missing",
             f"{clip.files.title(kind)} has no file for {len(missing)} of {len(clip.files.images)} images: "
             f"{describe_numbers(missing, name=clip.name)}",
@@ -193,7 +193,7 @@ def _entries(folder: Path) -> list[Path]:
 def lost_frames(clip: Clip) -> Iterator[Finding]:
     """An error where many small losses together are more than `prepare` accepts."""
     total, reasons = len(clip.pairs()), clip.left_out
-    if clip.loss_severity(len(reasons), total) == "error":
+    if clip.picture_loss_severity(clip.lost_pictures, total) == "error":
         yield Finding(
             "error",
             "left-out",

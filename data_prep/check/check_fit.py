@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,7 +38,8 @@ def _polarity(clip: Clip) -> Iterator[Finding]:
         return
     unread = [number for number in clip.files.images if not clip.is_whole(number)]
     problems = polarity_problems(clip.head, clip.tracking.frames, clip.files, clip.given.max_left_out, unread)
-    yield from (from_sentence("inverted-mask", problem) for problem in problems)
+    for finding in (from_sentence("inverted-mask", problem) for problem in problems):
+        yield replace(finding, severity="warning", advice=IGNORED) if clip.given.ignore_misfit else finding
 
 
 def _misfit(clip: Clip) -> Iterator[Finding]:

@@ -29,7 +29,7 @@ from data_prep.prepare.frame_offset import OffsetEstimate, detect_offset
 from data_prep.prepare.mask_overlap import Fit, MeshProjector, fit_of_masks
 from data_prep.prepare.mask_values import refuse_colours, with_labels
 from data_prep.prepare.masks import read_masks
-from data_prep.prepare.pairing import unusable
+from data_prep.prepare.pairing import REPEATS, unusable
 from data_prep.progress import Progress, silent
 
 MIN_PART = 60  # frames; with fewer in a third of the clip the offset there is not sought
@@ -47,6 +47,7 @@ class Clip:
     offset: int | None  # image number - tracking number; None where it could not be found
     offset_evidence: str  # how it was found, or why it was not
     part_offsets: tuple[int, int] | None  # of the first and the last third, where both are clear
+    cameras: int = 1  # that are chosen; the clip has one of them
     views: dict[int, View] = field(default_factory=dict)  # by image number
     fits: dict[int, Fit] = field(default_factory=dict)  # by image number
     steps: dict[int, float] = field(default_factory=dict)  # image number -> mean grey-level change since the one before
@@ -85,6 +86,16 @@ class Clip:
     def loss_severity(self, lost: int, total: int) -> Severity:
         """Frames that cannot be used are left out, up to the share above which `prepare` refuses the folder."""
         return "error" if lost > self.given.max_left_out * total else "warning"
+
+    def picture_loss_severity(self, lost: int, total: int) -> Severity:
+        """The same of pictures and masks, of which every camera has as many."""
+        return self.loss_severity(lost, total * self.cameras)
+
+    @property
+    def lost_pictures(self) -> int:
+        """How many cannot be used of the clip's; where it is the tracking's fault, with those of the other cameras."""
+        of_tracking = {*self.tracking.bad.values(), REPEATS}
+        return sum(self.cameras if reason in of_tracking else 1 for reason in self.left_out.values())
 
     @cached_property
     def left_out(self) -> dict[int, str]:
@@ -179,6 +190,7 @@ def read_clip(
         offset,
         evidence,
         None,
+        _count_cameras(given),
         views,
         steps=steps,
     )
@@ -187,6 +199,11 @@ def read_clip(
     if not source.is_paired:
         clip = _with_offset(clip, head)
     return replace(clip, fits=_measure_fits(clip, head, progress))
+
+
+def _count_cameras(given: Source) -> int:
+    whole = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
+    return max(1, len({shot.camera for shot in whole.shots.values()}))
 
 
 def _read_tracking(

@@ -23,7 +23,7 @@ from data_prep.check.clip import Clip, read_clip
 from data_prep.check.coverage import Coverage, check_coverage, measure_coverage
 from data_prep.check.findings import Finding, by_severity, count_phrase, exit_status, from_sentence
 from data_prep.prepare.pairing import describe_reasons
-from data_prep.prepare.wrong_inputs import check_folder
+from data_prep.prepare.wrong_inputs import check_folder, check_numbers
 from data_prep.progress import Progress, silent
 
 VERDICTS = ("ready to train", "can be trained on, with flaws", "training would fail or be spoilt")  # by exit status
@@ -71,6 +71,8 @@ def check_tracked_folder(
     assets = None
     try:
         check_folder(folder)
+        source = Source(folder.resolve(), folder, **options)  # its head model is what `load_head` gives
+        check_numbers(source)
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     try:
@@ -78,8 +80,7 @@ def check_tracked_folder(
     except UserError as error:
         findings.append(from_sentence("head-model", str(error)))
     try:
-        # Its head model is what `load_head` gives.
-        clip = read_clip(Source(folder.resolve(), folder, **options), assets, progress)
+        clip = read_clip(source, assets, progress)
     except UserError as error:
         return Check(folder, (from_sentence("layout", str(error)),), None, None)
     findings += [] if assets is None else check_head(assets)

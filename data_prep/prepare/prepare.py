@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from avatar.data.manifest import GIVEN, MASKS, FrameRecord, Manifest
-from avatar.data.source import DEFAULT_FPS, MAX_FPS, Source
+from avatar.data.source import DEFAULT_FPS, Source
 from avatar.errors import UserError, refuse
 from avatar.files.names import display_name, safe_name
 from avatar.head.assets import HeadAssets
@@ -35,6 +35,7 @@ from data_prep.prepare.masks import derive_masks
 from data_prep.prepare.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from data_prep.prepare.projection import lip_faces
 from data_prep.prepare.write_prepared import is_current, write_prepared
+from data_prep.prepare.wrong_inputs import check_numbers
 
 HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
 
@@ -55,10 +56,7 @@ def prepare(
     UserError with the file or frame and what to do when the folder cannot be used.
     """
     folder = Path(source.folder).resolve()
-    if source.fps is not None and not 0 < source.fps <= MAX_FPS:  # a NaN is refused too
-        raise UserError(f"--fps must be above 0 and at most {MAX_FPS:g}, not {source.fps:g}")
-    if not 0 <= source.max_left_out <= 1:
-        raise UserError(f"--max-left-out must be from 0 to 1, not {source.max_left_out:g}")
+    check_numbers(source)
     tracking = None if source.tracking is None else Path(source.tracking).resolve()
     tracked = open_tracked_folder(folder, tracking, source.data_format, cameras=source.cameras)
     files = tracked.files
@@ -92,7 +90,7 @@ def prepare(
         )
     tracks = fit_coefficients(tracks, head)
     first = next(iter(tracks.frames.values()))
-    _check_sizes(files, tracks, inspection, bool(tracked.shots))
+    check_sizes(files, tracks, inspection, bool(tracked.shots))
     model = HeadModel(head, torch.from_numpy(first.shape))
     if not source.ignore_misfit:
         for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, inspection.bad):
@@ -222,7 +220,7 @@ def _assumptions(files: FrameFiles, inspection: Inspection, has_lips: bool) -> l
     return notes
 
 
-def _check_sizes(files: FrameFiles, tracks: Tracking, inspection: Inspection, is_rig: bool) -> None:
+def check_sizes(files: FrameFiles, tracks: Tracking, inspection: Inspection, is_rig: bool) -> None:
     """Raise UserError where the tracking is not of the images' size."""
     for number, track in tracks.frames.items():
         size = inspection.sizes.get(number) if is_rig else (inspection.width, inspection.height)

@@ -8,6 +8,7 @@ from typing import Any
 
 from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE
+from avatar.data.source import MAX_FPS, Source
 from avatar.errors import UserError
 from avatar.files.names import typed
 from avatar.head.find import candidates
@@ -55,6 +56,14 @@ def check_folder(folder: Path) -> None:
     if next(folder.iterdir(), None) is None:
         raise UserError(f"{folder} is empty; docs/data.md says what belongs to a tracked folder")
     raise UserError(f"{folder} holds nothing that belongs to a tracked folder; docs/data.md says what does")
+
+
+def check_numbers(source: Source) -> None:
+    """Raises UserError for an --fps or a --max-left-out that no clip has."""
+    if source.fps is not None and not 0 < source.fps <= MAX_FPS:  # a NaN is refused too
+        raise UserError(f"--fps must be above 0 and at most {MAX_FPS:g}, not {source.fps:g}")
+    if not 0 <= source.max_left_out <= 1:
+        raise UserError(f"--max-left-out must be from 0 to 1, not {source.max_left_out:g}")
 
 
 def _looks_tracked(folder: Path) -> bool:

@@ -82,6 +82,8 @@ def test_only_frames_that_all_runs_have_count(tmp_path: Path) -> None:
     assert each.count == 20 and each.method == "blocks of 5 frames"
     assert [cell.mean for cell in each.rows["psnr"]] == pytest.approx(values[10:30].mean() + np.arange(3), abs=1e-6)
     assert comparison.notes == ["strict: 20 frames are in all runs, 20 more in some; only the common ones count"]
+    apart = compare_runs([b, c])
+    assert apart.notes == ["strict: 20 frames are in all runs, 20 more in some; only the common ones count"]
     d = write_run(tmp_path / "d", {"psnr": values[:5]}, FRAMES[:5])
     with pytest.raises(
         UserError, match="b and d cannot be compared: strict was measured on frames of which none is in"
@@ -185,6 +187,21 @@ def test_figures_that_a_run_lacks_are_left_out_with_a_note(tmp_path: Path) -> No
     (a / "eval" / "results.json").write_text(json.dumps(results))
     with pytest.raises(UserError, match=r"a/eval/strict/frames\.csv has no column 'lpips'; evaluate the run again"):
         compare_runs([a, a])
+
+
+def test_a_protocol_that_is_named_twice_is_compared_once(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, {"psnr": smooth(1)}) for name in "ab"]
+    assert [each.protocol for each in compare_runs(runs, ["strict", "strict"]).protocols] == ["strict"]
+
+
+def test_a_run_that_has_gone_on_since_it_was_measured_is_named(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {"psnr": smooth(1)}, step=12)
+    b = write_run(tmp_path / "b", {"psnr": smooth(2)}, step=12)
+    for run, steps in ((a, (8, 12)), (b, (12, 16))):
+        (run / "checkpoints").mkdir()
+        for step in steps:
+            (run / "checkpoints" / f"step_{step:08d}.safetensors").touch()
+    assert compare_runs([a, b]).notes == ["b was measured at step 12, and its newest checkpoint is of step 16"]
 
 
 def test_lpips_of_different_networks_is_not_compared(tmp_path: Path) -> None:

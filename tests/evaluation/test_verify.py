@@ -8,6 +8,7 @@ import io
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -193,3 +194,15 @@ def test_floats_are_said_not_to_be_in_the_pictures(tmp_path: Path, subject: Subj
     verify(results, ["strict"], said.append)
     assert said == ["strict: not verified, because it measures floats, which no PNG file holds (levels: float)"]
     assert "verified" not in json.loads(results.read_text())["protocols"]["strict"]
+
+
+@pytest.mark.parametrize("name", ["caf\udce9", "a\u2028b", "a\x85b", 'a,"b'])
+def test_frames_of_any_name_are_measured_verified_and_kept(name: str, tmp_path: Path, subject: Subject) -> None:
+    """Files of another encoding, and names with what other programs take for the end of a line."""
+    frames = tuple(replace(frame, name=f"{name}{frame.name}") for frame in subject.manifest.frames)
+    manifest = replace(subject.manifest, frames=frames)
+    recording = replace(subject.recording, names=tuple(frame.name for frame in frames))
+    run = make_run(tmp_path / "run", replace(subject, manifest=manifest, recording=recording))
+    verify(evaluate(run, ["hypergaussians"], write_frames=True, say=lambda _: None), say=lambda _: None)
+    results = json.loads(evaluate(run, ["flashavatar"], say=lambda _: None).read_text())
+    assert list(results["protocols"]) == ["hypergaussians", "flashavatar"]

@@ -121,6 +121,12 @@ def test_pictures_stand_side_by_side_under_captions() -> None:
         assert ink.any() and not ink[0] and not ink[-1]  # every caption is there and inside its column
 
 
+def test_a_caption_may_be_a_files_name_that_is_not_unicode() -> None:
+    picture = torch.zeros(40, 200, 3)
+    first, second = (side_by_side([picture], [caption]) for caption in ("caf\udce9_00001", "caf\\udce9_00001"))
+    assert np.array_equal(first, second)
+
+
 def test_small_pictures_stand_side_by_side_enlarged() -> None:
     image = torch.zeros(50, 40, 3)
     image[:, 20:] = 1.0

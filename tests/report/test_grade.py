@@ -41,3 +41,6 @@ def test_main_figures_have_words_where_the_head_alone_is_measured() -> None:
     assert "SSIM at least 0.90 good, 0.79 fair; LPIPS (squeeze) at most 0.03 good, 0.05 fair." in shown
     whole = {**entry, "means": {"psnr": 31.0, "lpips": 0.01}, "lpips": {"network": "alex"}}
     assert "badge" not in "".join(_main_figures({"protocols": {"mine": whole}}))
+    scaled = {**entry, "means": {**means, "lpips_head": 0.01}, "choices": {"lpips_scale": 0.05}}
+    shown = "".join(_main_figures({"protocols": {"mine": scaled}}))
+    assert "<dd>0.0100</dd>" in shown and "LPIPS (squeeze)" not in shown, "a scaled LPIPS is below every bound"

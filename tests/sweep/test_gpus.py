@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -116,6 +117,26 @@ def test_ray_is_asked_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     make_engine("ray", spec_of("cuda"), Path(), EngineOptions())
     make_engine("ray", spec_of(""), Path(), EngineOptions())
     assert [needs.get("num_gpus") for needs in asked] == [1, None]
+
+
+def test_rays_own_cluster_has_the_processors_of_its_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer than one job takes, Ray would wait for ever."""
+    begun: list[Any] = []
+    asked: list[dict[str, Any]] = []
+
+    def remote(**needs: Any) -> Any:
+        asked.append(needs)
+        return lambda function: function
+
+    fake = SimpleNamespace(init=lambda **options: begun.append(options.get("num_cpus")), remote=remote, __spec__="")
+    monkeypatch.setitem(sys.modules, "ray", fake)  # type: ignore[arg-type]
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(engines, "workers_that_fit", lambda _: 1)
+    for workers, address in ((1, None), (3, None), (None, None), (3, "head:6379")):
+        resources = Resources(threads=4, memory_gb=0.1)
+        make_engine("ray", replace(spec_of(""), resources=resources), Path(), EngineOptions(workers, address))
+    assert begun == [4, 12, 4, None]
+    assert ["memory" in needs for needs in asked] == [False, False, False, True]
 
 
 def test_slurm_is_asked_for_whole_gpus(monkeypatch: pytest.MonkeyPatch) -> None:

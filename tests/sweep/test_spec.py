@@ -82,6 +82,9 @@ MISTAKES = {
     ),
     "a value out of range": ("subjects: [a]\noverrides: [data.size=1]", "data.size=1 is out of range"),
     "seeds that are text": ("subjects: [a]\nseeds: [one]", "seeds holds 'one'"),
+    "a seed that no training takes": (f"subjects: [a]\nseeds: [0, {2**40}]", f"trainer.seed={2**40} is out of range"),
+    "a seed as a variant": ("subjects: [a]\nproduct: {trainer.seed: [1, 2]}", "trainer.seed is what seeds says"),
+    "a seed as an override": ("subjects: [a]\noverrides: [trainer.seed=1]", "trainer.seed is what seeds says"),
     "a seed twice": ("subjects: [a]\nseeds: [1, 1]", "seeds names one twice"),
     "variants and product": (
         "subjects: [a]\nvariants: [[]]\nproduct: {experiment: [demo]}",

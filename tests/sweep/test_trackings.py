@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from avatar.errors import UserError
 from avatar.evaluation.compare_tables import FORMATS
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Resources, Spec
@@ -29,6 +30,14 @@ def write_job(folder: Path, subject: str, variant: str, psnr: float, perceptual:
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(results))
     return job
+
+
+def changed(folder: Path, job: Job, entry: dict[str, Any] | None = None, **results: Any) -> None:
+    """Change what a job has measured: keys of its results, or of its protocol's entry."""
+    path = folder / "jobs" / job.name / "run" / "eval" / "results.json"
+    found = json.loads(path.read_text()) | results
+    found["protocols"]["strict"] |= entry or {}
+    path.write_text(json.dumps(found))
 
 
 def test_fitted_figures_are_a_table_of_their_own_below_the_others(tmp_path: Path) -> None:
@@ -60,6 +69,18 @@ def test_a_variant_with_a_job_that_saw_measured_frames_is_marked_and_mixed_terms
         assert "a dssim and lpips-vgg, b dssim" in shown
 
 
+def test_each_kind_of_refinement_is_explained(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, REFINED, variant, 20) for variant in "ab"]
+    tracking = {
+        "tracker": "VHAP",
+        "refined": "fitted to the pictures of cameras",
+        "rounds": [{"measured_frames_trained_on": 0}],
+    }
+    changed(tmp_path, jobs[1], tracking=tracking)
+    said = "\n".join(fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0)).tracking)
+    assert "fitted to its own picture;" in said and "fitted to the pictures of cameras;" in said
+
+
 def test_the_first_variant_of_the_file_is_compared_with_where_its_first_job_has_no_results(tmp_path: Path) -> None:
     jobs = [write_job(tmp_path, "one", "b", 21)]
     jobs += [write_job(tmp_path, "two", variant, psnr) for variant, psnr in (("a", 20), ("b", 21))]
@@ -72,12 +93,58 @@ def test_the_first_variant_of_the_file_is_compared_with_where_its_first_job_has_
 def test_lpips_of_different_networks_is_left_out_with_a_note(tmp_path: Path) -> None:
     jobs = [write_job(tmp_path, PLAIN, variant, 20) for variant in ("a", "b")]
     for job, network in zip(jobs, ("1" * 64, "2" * 64), strict=True):
-        path = tmp_path / "jobs" / job.name / "run" / "eval" / "results.json"
-        results = json.loads(path.read_text())
-        strict = results["protocols"]["strict"]
-        strict["means"] |= {"lpips": 0.1, "lpips_head": 0.1}
-        strict["lpips"]["weights_sha256"] = network
-        path.write_text(json.dumps(results))
+        means = {"psnr": 20, "lpips": 0.1, "lpips_head": 0.1}
+        changed(tmp_path, job, {"means": means, "lpips": {"weights_sha256": network}})
     comparison = fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
     assert list(comparison.protocols[0].rows) == ["psnr"]
     assert comparison.notes == ["strict: LPIPS is left out, because the jobs were measured with different networks"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "results", "what"),
+    [
+        ({}, {"image_size": [128, 128]}, "image size"),
+        ({}, {"data_hash": "c"}, "data"),
+        ({}, {"head_fingerprint": "c"}, "head model"),
+        ({"frames": ["00002"]}, {}, "frames"),
+    ],
+)
+def test_variants_that_were_measured_on_something_else_are_not_compared(
+    tmp_path: Path, entry: dict[str, Any], results: dict[str, Any], what: str
+) -> None:
+    jobs = [write_job(tmp_path, name, variant, p) for name in ("one", "two") for variant, p in (("a", 20), ("b", 21))]
+    for job in jobs:
+        changed(tmp_path, job, {"frames": ["00001", "00002"]})
+    changed(tmp_path, jobs[1], entry, **results)
+    spec = Spec(tuple(jobs), Resources(), 0)
+    comparison = fold_results(tmp_path, spec)
+    assert comparison.protocols[0].count == 1 and comparison.protocols[0].unit == "trainings each (1 subjects, 1 seeds)"
+    note = f"subjects and seeds are left out, because their variants were measured on different {what}"
+    assert comparison.notes == [f"strict: 1 of 2 {note}"]
+    changed(tmp_path, jobs[3], entry, **results)
+    comparison = fold_results(tmp_path, spec)
+    assert comparison.labels == ["a"] and comparison.protocols[0].rows["psnr"] == [(20.0, None, None)]
+    assert comparison.notes == [f"b is left out: it was measured on different {what} than a"]
+
+
+def test_a_protocol_that_was_edited_in_between_is_left_out(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, name, variant, 20) for name in ("one", "two") for variant in "ab"]
+    for job, levels in zip(jobs, ("round", "round", "truncate", "truncate"), strict=True):
+        changed(tmp_path, job, {"choices": {"levels": levels}})
+    with pytest.raises(UserError, match="strict differs between the runs in levels"):
+        fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
+
+
+def test_a_figure_that_some_jobs_lack_is_left_out_with_a_note(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, name, variant, 20) for name in ("one", "two") for variant in "ab"]
+    for job in jobs:
+        changed(tmp_path, job, {"means": {"psnr": 20, "psnr_eyes": None if job.subject == "two" else 20}})
+    comparison = fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
+    assert list(comparison.protocols[0].rows) == ["psnr"]
+    assert comparison.notes == ["strict: left out, because some jobs have no such figure: psnr_eyes"]
+
+
+def test_a_line_break_in_a_name_does_not_end_the_comment_of_latex(tmp_path: Path) -> None:
+    jobs = [write_job(tmp_path, PLAIN, variant, 20) for variant in ("a\nb", "c")]
+    comparison = fold_results(tmp_path, Spec(tuple(jobs), Resources(), 0))
+    assert comparison.labels == ["a b", "c"]

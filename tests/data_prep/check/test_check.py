@@ -245,6 +245,13 @@ def test_what_prepare_refuses_is_an_error_and_nothing_stops_the_check(case: str,
     assert {finding.severity for finding in check.findings} >= {"error"}
 
 
+def test_a_number_that_training_refuses_is_an_error(good_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for word in ("--fps=-5", "--fps=nan", "--max-left-out=-1", "--max-left-out=2"):
+        assert main(["check", str(good_folder), "--frame-offset", "1", word, "--json"]) == 2
+        (only,) = json.loads(capsys.readouterr().out)["findings"]
+        assert only["problem"].startswith(f"{word.partition('=')[0]} must be ")
+
+
 def test_all_defects_are_reported_together(folder: Path) -> None:
     for defect in ("stranger", "no face", "mask missing", "composited on white", "hole in the matte"):
         DEFECTS[defect][0](folder)

@@ -9,11 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from camera_rig_folder import SEQUENCES, write_listings, write_sequence
+from camera_rig_folder import SEQUENCES, opened, write_listings, write_sequence
 from tracked_folder import rotation
 
+from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import Check, check_tracked_folder
 
@@ -114,3 +116,108 @@ def test_pictures_that_are_not_there_do_not_stop_the_check(rig: Path, tmp_path: 
     for path in (folder / "images").glob("*_0[78].png"):
         path.unlink()
     assert checked(folder).status == 2
+
+
+@pytest.mark.parametrize("is_ignored", [False, True])
+def test_ignore_misfit_makes_a_warning_of_what_training_then_goes_on_with(
+    rig: Path, tmp_path: Path, is_ignored: bool
+) -> None:
+    turned = copied(rig, tmp_path / "turned", lambda entry: turn(entry, 8.0))
+    inverted = copied(rig, tmp_path / "inverted", lambda _: None)
+    edit_files(inverted / "fg_masks", "*", lambda pixels: 255 - pixels)
+    for folder, kind in ((turned, "camera-pose"), (inverted, "inverted-mask")):
+        check = checked(folder, ignore_misfit=is_ignored)
+        assert found(check, kind) and check.status == (1 if is_ignored else 2)
+        assert not is_ignored or opened(folder, tmp_path / f"{kind}.out", ignore_misfit=True)
+
+
+def edit_files(folder: Path, names: str, edit: Callable[[np.ndarray], np.ndarray]) -> None:
+    for path in folder.glob(f"{names}.png"):
+        assert cv2.imwrite(str(path), edit(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+
+def test_masks_that_are_label_images_tell_of_a_pose_too(rig: Path, tmp_path: Path) -> None:
+    folder = copied(rig, tmp_path / "copy", lambda entry: turn(entry, 8.0))
+    edit_files(folder / "fg_masks", "*", lambda pixels: pixels // 255)
+    (problem,) = found(checked(folder), "camera-pose")
+    assert "camera 12" in problem
+
+
+def halved(pixels: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(pixels[::2, ::2])
+
+
+OF_ANOTHER_CAMERA: dict[str, tuple[Callable[[Path], None], str, str]] = {
+    "black": (
+        lambda f: edit_files(f / "images", "*_12", np.zeros_like),
+        "camera-dark",
+        "the pictures of camera 12 are",
+    ),
+    "one size": (
+        lambda f: edit_files(f / "images", "*3_12", halved),
+        "camera",
+        "all frames of a camera must have one size",
+    ),
+    "sizes": (lambda f: edit_files(f / "images", "*_12", halved), "camera", "make the masks at the size of the images"),
+    "tracked size": (
+        lambda f: (edit_files(f / "images", "*_12", halved), edit_files(f / "fg_masks", "*_12", halved), None)[-1],
+        "camera",
+        "the tracking was made on 64x56 images",
+    ),
+    "damaged": (
+        lambda f: [path.write_bytes(b"x") for path in (f / "images").glob("0001*_12.png")].clear(),
+        "unreadable",
+        "of camera 12 cannot be used in 10 frames (00010_12, ",
+    ),
+    "masks of the front alone": (
+        lambda f: [path.unlink() for name in ("07", "12") for path in (f / "fg_masks").glob(f"*_{name}.png")].clear(),
+        "unreadable",
+        "of camera 12 cannot be used in 20 frames",
+    ),
+    "masks of the others alone": (
+        lambda f: [path.unlink() for path in (f / "fg_masks").glob("*_08.png")].clear(),
+        "unreadable",
+        "of camera 08 cannot be used in 20 frames",
+    ),
+    "no masks": (
+        lambda f: [path.unlink() for path in (f / "fg_masks").glob("0001*_12.png")].clear(),
+        "unreadable",
+        "of camera 12 cannot be used in 10 frames (00010_12, ",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", OF_ANOTHER_CAMERA)
+def test_what_training_refuses_of_any_camera_is_an_error(rig: Path, tmp_path: Path, what: str) -> None:
+    damage, kind, sentence = OF_ANOTHER_CAMERA[what]
+    folder = copied(rig, tmp_path / "copy", lambda _: None)
+    damage(folder)
+    check = checked(folder)
+    assert any(sentence in problem for problem in found(check, kind)) and check.status == 2
+    with pytest.raises(UserError):
+        opened(folder, tmp_path / "out")
+    assert "alone" in what or checked(folder, cameras="07,08").status < 2
+
+
+def test_what_one_camera_loses_is_a_share_of_all_pictures(rig: Path, tmp_path: Path) -> None:
+    """Two of twenty in front, and none of forty beside: fewer than training refuses."""
+    folder = copied(rig, tmp_path / "copy", lambda _: None)
+    for path in sorted((folder / "images").glob("*_08.png"))[3:5]:
+        path.write_bytes(b"x")
+    check = checked(folder)
+    assert [finding.severity for finding in check.findings if finding.check == "unreadable"] == ["warning"]
+    assert check.status == 1
+    assert opened(folder, tmp_path / "out")
+    assert checked(folder, cameras="front").status == 2
+    with pytest.raises(UserError):
+        opened(folder, tmp_path / "front", cameras="front")
+    for path in (folder / "flame_param").glob("0000[01].npz"):
+        path.write_bytes(b"x")
+    assert checked(folder).status == 2
+    with pytest.raises(UserError):
+        opened(folder, tmp_path / "times")
+
+
+def test_several_cameras_see_the_sides_of_a_head_that_hardly_turns(tmp_path: Path) -> None:
+    folder = write_listings(tmp_path / "EMO", {None: write_sequence(tmp_path, SEQUENCES[0])})
+    assert found(checked(folder, cameras="front"), "narrow-views") and not found(checked(folder), "narrow-views")
