@@ -73,6 +73,7 @@ class GaussianHeadAvatar(Avatar):
         super().__init__(assets, identity, config)
         vertices = self.head.neutral_vertices()
         skull = vertices[self.head.neck()[1] > 0.5]
+        skull = skull if len(skull) else vertices  # a head model whose neck does not bend
         low, high = skull.amin(dim=0), skull.amax(dim=0)
         self.unit = 0.5 * float((high - low)[1])
         face = assets.regions.get("face", torch.arange(len(vertices)))

@@ -117,7 +117,7 @@ class Networks(nn.Module):
         bounded: bool = True,
     ) -> None:
         super().__init__()
-        half, self.outputs = width // 2, outputs
+        half, self.outputs = max(width // 2, 1), outputs
         last = "tanh" if bounded else None
         of_pose = 2 * encoded_size(OCTAVES)
         self.expression = Branch(theta, features, self.outputs, last, (width,) * 5, (width,) * 2, (width,) * 3)

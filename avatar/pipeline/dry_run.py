@@ -42,8 +42,9 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     free = free_bytes(chosen)
     check_memory("training", needs, free)
     frame = subject.frame(subject.split.train[0], config.data.size)
-    cost = measure_cost(frame, assets, subject.identity, config)
-    seconds = cost.step_seconds * (cost.iterations + rounds * round_steps(cost.iterations, frames))
+    cost = measure_cost(frame, subject, assets, config)
+    seconds = cost.start_seconds * (1 + rounds)
+    seconds += cost.step_seconds * (cost.iterations + rounds * round_steps(cost.iterations, frames))
     if rounds:
         avatar = new_avatar(assets, subject, config, perceptual.name, CPU)
         background = torch.tensor(config.data.background)

@@ -136,7 +136,7 @@ def steps_in_time(
     avatar = new_avatar(assets, subject, config, term.name, CPU)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
-    step = measure_cost(frame, assets, subject.identity, config).step_seconds
+    step = measure_cost(frame, subject, assets, config).step_seconds
     able = affordable_iterations(plannable(minutes) - spent, step, refinement, rounds, frames)
     fewest = min(LEAST_STEPS, asked)
     if able < fewest:

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from avatar.config import Config, TrainerConfig
 from avatar.data.frame import Frame
+from avatar.data.subject import Subject
 from avatar.head.assets import HeadAssets
 from avatar.runs.model_registry import make_avatar
 from avatar.train.loss import TrainingLoss, choose_perceptual, perceptual_start
@@ -20,6 +19,7 @@ from avatar.train.optimizer import make_optimizer
 from avatar.train.pose_corrections import make_pose_corrections
 from avatar.train.step import TrainState
 from avatar.train.step_runner import StepRunner
+from avatar.train.trainer import initialize_from_frames
 
 MEASURED_STEPS = 3  # of each kind, after one that is not counted
 LONGEST = 10.0  # seconds of one kind after which no more are made; where the first takes as long, it is counted
@@ -29,17 +29,22 @@ LONGEST = 10.0  # seconds of one kind after which no more are made; where the fi
 class Cost:
     gaussians: int
     parameters: int
+    start_seconds: float  # until the first step
     step_seconds: float  # on this machine, the mean over the run; of each kind of step the median
     iterations: int
 
 
-def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"], config: Config) -> Cost:
-    """Train an avatar of this head on one of its frames for a few steps, and throw it away.
+def measure_cost(frame: Frame, subject: Subject, assets: HeadAssets, config: Config) -> Cost:
+    """Train an avatar of the subject on one of its frames for a few steps, and throw it away.
 
-    Raises UserError for frames that are too small to train on.
+    It starts as in training: what a step takes depends on where the Gaussians are. Raises UserError as training does before
+    its first step, and for frames that are too small to train on.
     """
     torch.manual_seed(config.trainer.seed)
-    avatar = make_avatar(assets, identity, config.model)
+    begin = time.perf_counter()
+    avatar = make_avatar(assets, subject.identity, config.model)
+    initialize_from_frames(avatar, subject, config)
+    start_seconds = time.perf_counter() - begin
     corrections = make_pose_corrections(avatar, [frame.time], config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
     size = frame.camera.width, frame.camera.height
@@ -60,6 +65,7 @@ def measure_cost(frame: Frame, assets: HeadAssets, identity: Float[Tensor, " S"]
     return Cost(
         gaussians=len(avatar),
         parameters=sum(p.numel() for p in avatar.parameters()),
+        start_seconds=start_seconds,
         step_seconds=total / config.trainer.iterations,
         iterations=config.trainer.iterations,
     )

@@ -140,7 +140,9 @@ def initialize_from_frames(avatar: Avatar, subject: Subject, config: Config) -> 
             f"trainer.initialization=surface is for model=gaussianheadavatar: the Gaussians of {config.model.name} start "
             "on the mesh; leave it out"
         )
-    chosen = evenly_spread(subject.split.train, avatar.initial_frames)
+    # Camera by camera: in order of time, a regular step can be a multiple of their number, and leave most of them out.
+    train = sorted(subject.split.train, key=subject.recording.view)
+    chosen = evenly_spread(train, avatar.initial_frames)
     frames = (subject.frame(index, config.data.size) for index in chosen)
     avatar.initialize_from(frames, start)
 

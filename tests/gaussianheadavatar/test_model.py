@@ -164,6 +164,16 @@ def test_masks_that_have_nothing_in_common_get_a_sentence(tracked_folder: Path) 
         avatar.initialize_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], "frames")
 
 
+def test_a_head_model_whose_neck_does_not_bend_is_as_long_as_all_of_it() -> None:
+    assets = grid_head()
+    stiff = replace(assets, weights=torch.eye(5)[:1].expand_as(assets.weights).contiguous())  # all on the root
+    avatar = make_avatar(stiff, torch.zeros(3), small_config("model=gaussianheadavatar").model)
+    assert isinstance(avatar, GaussianHeadAvatar)
+    heights = avatar.head.neutral_vertices()[:, 1]
+    assert avatar.unit == pytest.approx(0.5 * float(heights.max() - heights.min()))
+    assert bool(torch.isfinite(avatar(random_params(), None, torch.eye(3)).means).all())
+
+
 def test_fewer_steps_have_higher_rates() -> None:
     avatar = lively("gaussianheadavatar")
 

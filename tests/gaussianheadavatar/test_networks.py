@@ -31,6 +31,11 @@ def test_parameters_are_counted_as_published() -> None:
     assert counts == [129_568, 33_376, 310_787, 87_798, 232_200, 42_424]
 
 
+def test_the_narrowest_networks_have_hidden_layers() -> None:
+    narrow = Networks(theta=5, width=1, features=7, outputs=Outputs(3, 4, 8))
+    assert min(size for parameter in narrow.parameters() for size in parameter.shape) > 0
+
+
 @pytest.mark.parametrize("dims", [(7, 5, 4), (7, 5, 6, 4), (7, 5, 6, 5, 8, 3)])
 def test_a_network_sees_its_input_again_in_the_middle(dims: tuple[int, ...]) -> None:
     network, values = PointNetwork(dims, "tanh"), torch.randn(9, 7)

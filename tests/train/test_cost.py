@@ -8,12 +8,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from small_runs import open_small, small_config
+import torch
+from small_runs import new_avatar, open_small, small_config
 
+from avatar.errors import UserError
 from avatar.losses.photometric import dssim
 from avatar.train import cost_estimate
 from avatar.train.cost_estimate import kinds_of_steps, measure_cost
 from avatar.train.loss import PerceptualTerm, Weighted
+from avatar.train.trainer import initialize_from_frames
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 9, 10, 11, 40, 41, 53])
@@ -36,8 +39,24 @@ def test_any_frame_shows_what_training_takes(tracked_folder: Path, time: int | N
     config = small_config()
     _, subject, assets = open_small(tracked_folder, config)
     frame = replace(subject.frame(5), shared_time=time)
-    cost = measure_cost(frame, assets, subject.identity, config)
+    cost = measure_cost(frame, subject, assets, config)
     assert cost.step_seconds > 0 and cost.iterations == config.trainer.iterations
+
+
+def test_steps_are_measured_where_training_begins(tracked_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free Gaussians that have no place yet are all at one, each a metre large: drawing them takes another time."""
+    config = small_config("model=gaussianheadavatar", "trainer.perceptual=dssim", "trainer.iterations=1")
+    _, subject, assets = open_small(tracked_folder, config)
+    measured = []
+    monkeypatch.setattr(cost_estimate.StepRunner, "make", lambda steps, *_: measured.append(steps._state.avatar))
+    measure_cost(subject.frame(5), subject, assets, config)
+    trained = new_avatar(assets, subject, config)
+    initialize_from_frames(trained, subject, config)
+    for name, value in trained.state_dict().items():
+        assert torch.equal(value, measured[0].state_dict()[name]), name
+    config.trainer.initialization, config.model.name = "surface", "flashavatar"
+    with pytest.raises(UserError, match="initialization=surface is for model=gaussianheadavatar"):
+        measure_cost(subject.frame(5), subject, assets, config)
 
 
 @pytest.mark.parametrize(("durations", "mean"), [((30.0,), 30.0), ((7.0, 4.0), 4.0), ((1.0, 0.2, 0.3, 0.4), 0.3)])
@@ -53,5 +72,5 @@ def test_slow_steps_are_measured_few_times(
         clock[0] += next(steps)
 
     monkeypatch.setattr(cost_estimate.StepRunner, "make", make)
-    assert measure_cost(frame, assets, subject.identity, config).step_seconds == pytest.approx(mean)
+    assert measure_cost(frame, subject, assets, config).step_seconds == pytest.approx(mean)
     assert next(steps, None) is None, "not all of them were made"

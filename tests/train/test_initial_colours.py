@@ -2,6 +2,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from poison import poisoned
 from small_runs import new_avatar, open_small, small_config
 
 from avatar.data.frame import Frame
+from avatar.data.split import Split
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.gaussians import initial_colours
@@ -29,6 +32,23 @@ def colour_from_frames(avatar: UVAvatar, subject: Subject) -> int:
     """How many Gaussians got another colour than grey."""
     initialize_from_frames(avatar, subject, small_config("trainer.initialization=frames"))
     return int((avatar.sh_dc[:, 0] != 0).any(dim=-1).sum())
+
+
+@pytest.mark.parametrize(("cameras", "times"), [(16, 47), (16, 94), (14, 47), (16, 40), (16, 300)])
+def test_first_colours_are_taken_from_all_cameras_and_many_times(cameras: int, times: int) -> None:
+    """Every 16th picture, in order of time, is of the same camera."""
+    shown: list[int] = []
+    model: Any = SimpleNamespace(
+        has_surface=False, initial_frames=48, initialize_from=lambda frames, _: shown.extend(frames)
+    )
+    subject: Any = SimpleNamespace(
+        split=Split(tuple(range(cameras * times)), ()),
+        recording=SimpleNamespace(view=lambda picture: picture % cameras),
+        frame=lambda picture, _: picture,
+    )
+    initialize_from_frames(model, subject, small_config())
+    assert len(shown) == 48 and {picture % cameras for picture in shown} == set(range(cameras))
+    assert len({picture // cameras for picture in shown}) >= 6
 
 
 def test_a_head_of_one_colour_gives_that_colour_where_it_is_seen(tracked_folder: Path) -> None:
