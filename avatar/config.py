@@ -154,7 +154,7 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
     given = dict(override.split("=", 1) for override in overrides if override.partition("=")[0] not in _groups())
     for key, text in given.items():
         *sections, name = key.split(".")
-        reduce(dict.__getitem__, sections, values)[name] = typed_value(text)
+        reduce(dict.__getitem__, sections, values)[name] = typed_value(text, _declaration(key))
     if "trainer.iterations" in given and "trainer.max_epochs" not in given:
         values["trainer"]["max_epochs"] = None
     return config_from_dict(values)
@@ -267,8 +267,12 @@ def declared_keys(schema: type = Config, prefix: str = "") -> dict[str, str]:
 
 def check_value(key: str, value: Any, name: str) -> None:
     """Raises UserError, in which the key is called `name`, for a value that it cannot have."""
-    kind = reduce(lambda schema, part: get_type_hints(schema, include_extras=True)[part], key.split("."), Config)
-    checked_value(name, value, kind)
+    checked_value(name, value, _declaration(key))
+
+
+def _declaration(key: str) -> Any:
+    """The annotation of a key's field."""
+    return reduce(lambda schema, part: get_type_hints(schema, include_extras=True)[part], key.split("."), Config)
 
 
 def _nearest_hint(key: str, groups: Sequence[str] = ()) -> str:

@@ -11,7 +11,7 @@ from avatar.data.colours import COLOUR_WORDS, Colour, parse_colour
 from avatar.errors import UserError
 
 DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,3})?")
-_CONSTANTS = {"null": None, "~": None, "true": True, "false": False}
+_NULLS, _TRUTHS = ("null", "~"), {"true": True, "false": False}
 _KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a word", bool: "true or false"}
 
 
@@ -31,13 +31,20 @@ def config_dir() -> Path:
     raise UserError(f"the configuration files are missing from the installation ({package / 'configs'})")
 
 
-def typed_value(text: str) -> int | float | bool | str | None:
-    """What was typed after `key=`: a number, null, true, false, or else the text itself, without quotes around it."""
+def typed_value(text: str, declared: Any) -> int | float | bool | str | None:
+    """What was typed after `key=`: a number, null, true, false, or else the text itself, without quotes around it.
+
+    A key that is `declared` to take a name takes the text as it is written: camera 01 is not camera 1.
+    """
     word = text.strip()
     if len(word) >= 2 and word[0] == word[-1] and word[0] in "'\"":
         word = word[1:-1]
-    if word.lower() in _CONSTANTS:
-        return _CONSTANTS[word.lower()]
+    if word.lower() in _NULLS:
+        return None
+    if _wanted(get_args(declared)[0]) is str:
+        return word
+    if word.lower() in _TRUTHS:
+        return _TRUTHS[word.lower()]
     for kind in (int, float):
         try:
             return kind(word)
@@ -64,8 +71,7 @@ def meaning_of(declared: Any) -> str:
 
 
 def _of_type(key: str, value: Any, kind: Any) -> Any:
-    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
-    wanted = next(option for option in options if option is not types.NoneType)
+    options, wanted = _options(kind), _wanted(kind)
     if value is None and types.NoneType in options:
         return None
     if get_origin(wanted) is tuple:
@@ -84,6 +90,15 @@ def _of_type(key: str, value: Any, kind: Any) -> Any:
         return int(value)
     or_null = ", or null" if types.NoneType in options else ""
     raise UserError(f"{key}={shown(value)} is not valid: it must be {_KINDS[wanted]}{or_null}")
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    return get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+
+
+def _wanted(kind: Any) -> Any:
+    """What a key's values are of where they are not null."""
+    return next(option for option in _options(kind) if option is not types.NoneType)
 
 
 def checked_colour(key: str, value: Any) -> Colour:

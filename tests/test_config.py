@@ -225,6 +225,10 @@ def test_a_background_may_be_written_as_people_write_colours(written: str, colou
         ("data.size=null", "data.size", None),
         ("data.size=~", "data.size", None),
         ("trainer.perceptual=none", "trainer.perceptual", "none"),
+        ("data.test_cameras=01", "data.test_cameras", "01"),
+        ("data.test_cameras='1e5'", "data.test_cameras", "1e5"),
+        ("data.test_cameras=1_0", "data.test_cameras", "1_0"),
+        ("data.test_cameras=Null", "data.test_cameras", None),
     ],
 )
 def test_a_value_is_read_as_it_is_meant(override: str, key: str, value: object) -> None:

@@ -38,6 +38,10 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
         if error.reason != "surrogates not allowed":
             raise
         return failed(f"{error.object} has a name that is not UTF-8, which a library needs here: rename it")
+    except ValueError as error:
+        if not str(error).startswith("AVATAR_"):  # the kernels' word for a variable that holds nonsense
+            raise
+        return failed(str(error))
     except (MemoryError, RuntimeError) as error:
         if type(error).__name__ == "OutOfMemoryError":  # torch's for a GPU, which need not be imported yet
             return failed(

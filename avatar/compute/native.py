@@ -12,7 +12,7 @@ def thread_count() -> int:
     text = _core.environment("AVATAR_THREADS")
     if text is None:
         return torch.get_num_threads()
-    if not text.isdigit() or not 1 <= int(text) <= 1024:
+    if not (text.isascii() and text.isdigit()) or not 1 <= int(text) <= 1024:
         raise ValueError(f"AVATAR_THREADS must be a number of threads from 1 to 1024, got {text!r}")
     return int(text)
 

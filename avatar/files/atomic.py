@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from avatar.errors import UserError
 from avatar.files.names import shortened
@@ -27,18 +28,20 @@ def write_atomically(path: Path, data: bytes) -> None:
     The temporary file beside it has a name of its own in every process and call, so that two writers never mix.
     Raises UserError when the disk refuses.
     """
-    temporary = temporary_name(path)
+    temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_left_overs(path.parent)
-        with temporary.open("xb") as file:
+        temporary, file = _new_file(path)
+        with file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink()
         raise UserError(f"{path} cannot be written ({error.strerror}); what was there before is untouched") from None
 
 
@@ -91,6 +94,15 @@ def _umask() -> int:
 def temporary_name(path: Path) -> Path:
     """A name beside `path` that no other process or call uses, with the same suffix: encoders go by it."""
     return path.with_name(f".{shortened(path.stem)}.{_HOST}-{os.getpid()}-{next(_COUNTER)}.partial{path.suffix[-20:]}")
+
+
+def _new_file(path: Path) -> tuple[Path, BinaryIO]:
+    """A temporary file beside `path`, open. One of its name may be there: a container that was killed starts again with the
+    same process numbers, each of which counts anew."""
+    while True:
+        temporary = temporary_name(path)
+        with suppress(FileExistsError):
+            return temporary, temporary.open("xb")
 
 
 def is_running(pid: int) -> bool:

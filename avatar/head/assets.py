@@ -150,7 +150,10 @@ def load_head_assets(path: Path) -> HeadAssets:
         fingerprint=fingerprint_of(tensors, parents, regions, method),
         names=load_expression_names(folder, directions.shape[2] - IDENTITY_COEFFICIENTS),
         layout_method=method,
-        notes=(*notes_on_choice(path, model_file), *([LAYOUT_IS_MADE] if obj is None else [])),
+        notes=(
+            *notes_on_choice(path, model_file),
+            *([LAYOUT_IS_MADE] if obj is None else _faces_beside_map(uvs, uv_faces, obj)),
+        ),
     )
 
 
@@ -183,6 +186,14 @@ def made_layout(
         ) from None
 
 
+def _faces_beside_map(uvs: np.ndarray, uv_faces: np.ndarray, obj: Path) -> list[str]:
+    """A sentence where faces lie beside the map, such as in another tile of it; their texture is not drawn."""
+    corners = uvs[uv_faces]
+    count = int(((corners.max(axis=1) <= 0) | (corners.min(axis=1) >= 1)).any(axis=1).sum())
+    there = f"{count} of {len(uv_faces)} faces lie beside the UV map of {obj.name}, whose u and v go from 0 to 1"
+    return [f"{there}: no Gaussian lies on them"] if count else []
+
+
 def _read_arrays(file: Path) -> Mapping[str, object]:
     loaded = load_npz(file) if file.suffix.lower() == ".npz" else load_pickle(file)
     if not isinstance(loaded, dict):
@@ -201,6 +212,8 @@ def _array(
     expected = ", ".join("any" if n is None else str(n) for n in shape)
     if converted.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, converted.shape, strict=True)):
         raise UserError(f"{file}: {key} has shape {list(converted.shape)}, expected [{expected}]")
+    if integer and array.dtype.kind == "f" and (array != converted).any():
+        raise UserError(f"{file}: {key} holds values that are no whole numbers")
     if not integer and not np.isfinite(converted).all():
         raise UserError(f"{file}: {key} holds values that are not finite")
     return converted
@@ -208,11 +221,12 @@ def _array(
 
 def _read_eyelids(folder: Path, V: int) -> np.ndarray:
     eyelids = np.zeros((2, V, 3), np.float32)
-    for side, name in enumerate(("l_eyelid.npy", "r_eyelid.npy")):
-        file = folder / name
-        if not is_there(file):
-            continue
-        eyelids[side] = _array({name: load_npy(file).squeeze()}, name, file, (V, 3))
+    files = [folder / name for name in ("l_eyelid.npy", "r_eyelid.npy")]
+    missing = [file for file in files if not is_there(file)]
+    if len(missing) == 1:
+        raise UserError(f"{missing[0]} is missing beside the other eyelid: one eye would never close; put it there")
+    for side, file in enumerate(files if not missing else ()):
+        eyelids[side] = _array({file.name: load_npy(file).squeeze()}, file.name, file, (V, 3))
     return eyelids
 
 
@@ -223,7 +237,10 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
             continue
         regions = {}
         for region, indices in _read_arrays(file).items():
-            index = np.unique(_array({region: indices}, region, file, (None,), integer=True))
+            index = _array({region: indices}, region, file, (None,), integer=True)
+            if len(index) == V and np.isin(index, (0, 1)).all():  # 0 or 1 for every vertex, no indices
+                index = np.flatnonzero(index)
+            index = np.unique(index)
             if index.size and (index[0] < 0 or index[-1] >= V):
                 raise UserError(f"{file}: the region {region} names vertex {index[-1]}, but the model has {V} vertices")
             regions[str(region)] = torch.from_numpy(index)

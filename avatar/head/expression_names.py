@@ -13,6 +13,7 @@ or the list of names alone. Without an entry of "arkit", a blendshape moves the 
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -63,9 +64,12 @@ class ExpressionNames:
 
 
 def plain(name: str) -> str:
-    """A name without its style of writing: mouthSmile_L, MouthSmileLeft and mouth_smile_left are mouthsmileleft."""
-    name = re.sub(r"_L$", "left", re.sub(r"_R$", "right", name))
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+    """A name without its style of writing: mouthSmile_L, MouthSmileLeft and mouth_smile_left are mouthsmileleft.
+
+    Letters of any script count. A name without a letter or a digit stays as it is: two of these are not the same.
+    """
+    sided = re.sub(r"_L$", "left", re.sub(r"_R$", "right", name))
+    return re.sub(r"[\W_]", "", unicodedata.normalize("NFKC", sided).lower()) or name
 
 
 def load_expression_names(folder: Path, num_expressions: int) -> ExpressionNames:

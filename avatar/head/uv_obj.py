@@ -39,7 +39,7 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
                 uvs.append((float(u), float(v)))
             elif kind == "f":
                 pairs = [corner.split("/")[:2] for corner in rest.split()]
-                polygon = [(int(v) - 1, int(vt) - 1) for v, vt in pairs]
+                polygon = [(_place(int(v), positions), _place(int(vt), len(uvs))) for v, vt in pairs]
                 corners += [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
     except ValueError:
         raise UserError(
@@ -60,6 +60,11 @@ def read_uv_obj(file: Path, faces: np.ndarray, num_vertices: int) -> tuple[np.nd
     if not np.isfinite(uv_array).all() or layout[..., 1].min() < 0 or layout[..., 1].max() >= len(uv_array):
         raise UserError(f"{file}: a face names a UV outside the {len(uv_array)} vt lines, or a vt line is not finite")
     return uv_array, _in_order_of(faces, layout, file)
+
+
+def _place(number: int, count: int) -> int:
+    """0-based, from a number in a face: from 1 on, or back from the last of the `count` so far, which is -1."""
+    return count + number if -count <= number < 0 else number - 1
 
 
 def _in_order_of(faces: np.ndarray, layout: np.ndarray, file: Path) -> np.ndarray:

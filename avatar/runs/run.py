@@ -107,9 +107,11 @@ def start_run(
 
 
 def refuse_trained(path: Path) -> None:
-    """Raise UserError when the folder holds checkpoints."""
+    """Raise UserError when the folder holds checkpoints, or an avatar whose checkpoints are gone."""
     if list_checkpoints(path / "checkpoints"):
         raise UserError(f"{path} holds a run already: add --resume to go on with it, or choose another --out")
+    if is_there(path / AVATAR_FILE):
+        raise UserError(f"{path} holds an avatar already, {AVATAR_FILE}: choose another --out")
 
 
 def write_run_info(run: Path, info: Mapping[str, Any]) -> None:

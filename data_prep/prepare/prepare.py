@@ -34,10 +34,8 @@ from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.masks import derive_masks
 from data_prep.prepare.pairing import Pairing, describe_reasons, pair_frames, refuse_if_many
 from data_prep.prepare.projection import lip_faces
-from data_prep.prepare.write_prepared import is_current, write_prepared
+from data_prep.prepare.write_prepared import HEAD_FOLDER, MOUTH_FOLDER, is_current, write_prepared
 from data_prep.prepare.wrong_inputs import check_numbers
-
-HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
 
 
 def prepare(

@@ -15,13 +15,16 @@ from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, Manifest, read_mani
 from avatar.errors import UserError
 from avatar.files.atomic import whole_folder
 from avatar.files.names import safe_name
-from data_prep.prepare.checksums import find_damage, write_contents
+from data_prep.prepare.checksums import CONTENTS_FILE, find_damage, write_contents
+
+HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
+_PARTS = {MANIFEST_FILE, TRACKS_FILE, CONTENTS_FILE, HEAD_FOLDER, MOUTH_FOLDER}
 
 
 def is_current(target: Path, input_hash: str, is_chosen: bool, say: Callable[[str], object] = lambda _: None) -> bool:
     """Whether `target` was prepared from these inputs and is whole; `say` hears where it is damaged.
 
-    A chosen folder that is something else is never overwritten.
+    A chosen folder that is something else, or holds something else too, is never overwritten.
     """
     try:
         names = {path.name for path in target.iterdir()}
@@ -29,9 +32,14 @@ def is_current(target: Path, input_hash: str, is_chosen: bool, say: Callable[[st
         return False
     except NotADirectoryError:
         names = {target.name} if target.exists() else set()
+    is_prepared = MANIFEST_FILE in names and not names.isdisjoint({TRACKS_FILE, CONTENTS_FILE})
+    if is_chosen and names and not is_prepared:
+        raise UserError(f"{target} exists and is not a prepared subject; choose another --out")
+    if is_chosen and (others := sorted(names - _PARTS)):
+        raise UserError(
+            f"{target} also holds {others[0]}, which is no part of a prepared subject; choose another --out"
+        )
     if MANIFEST_FILE not in names:
-        if is_chosen and names:
-            raise UserError(f"{target} exists and is not a prepared subject; choose another --out")
         return False
     if (damage := find_damage(target)) is not None:
         say(f"the prepared subject {target} is damaged: {damage}; it is made again")

@@ -119,3 +119,14 @@ def test_an_avatar_file_larger_than_the_memory_is_refused(
     monkeypatch.setattr(memory, "available_bytes", lambda: 2.0**16)
     output = avatar("reenact", run, "--driver", tracked_folder, "--frame-offset", 1, status=1)
     assert re.search(r"opening .*avatar.safetensors needs about [0-9]+ MiB of memory, and 0 MiB are available", output)
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"), [("AVATAR_THREADS", "²"), ("AVATAR_THREADS", "two"), ("AVATAR_SIMD", "neon")]
+)
+def test_a_variable_that_holds_nonsense_is_a_sentence(
+    variable: str, value: str, wide: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, value)
+    output = avatar("train", wide, "--frame-offset", 1, "--out", tmp_path / "run", "--size", 24, *QUICK, status=1)
+    assert f"avatar: {variable} must be " in output and value in output

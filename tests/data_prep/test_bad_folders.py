@@ -78,6 +78,24 @@ def test_a_folder_that_is_something_else_is_not_overwritten(good_folder: Path, t
     assert (precious / "thesis.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize("also", ["thesis.tex", ".git"])
+def test_a_folder_that_holds_something_else_too_is_not_overwritten(
+    also: str, good_folder: Path, tmp_path: Path
+) -> None:
+    """A manifest.json belongs to many programs, and people put things into folders."""
+    other, prepared = tmp_path / "other", tmp_path / "prepared"
+    other.mkdir()
+    (other / "manifest.json").write_text('{"name": "a page"}')
+    (other / also).write_text("years of work")
+    with pytest.raises(UserError, match=r"other exists and is not a prepared subject; choose another --out"):
+        prepare_with(good_folder, other)
+    prepare_with(good_folder, prepared)
+    (prepared / also).write_text("years of work")
+    with pytest.raises(UserError, match=f"prepared also holds {also}, which is no part of a prepared subject"):
+        prepare_with(good_folder, prepared, max_left_out=0.04)
+    assert (other / also).read_text() == (prepared / also).read_text() == "years of work"
+
+
 def test_a_place_that_cannot_be_written(good_folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(

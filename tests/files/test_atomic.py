@@ -59,3 +59,19 @@ def test_left_overs_are_looked_for_once_in_a_folder(tmp_path: Path, monkeypatch:
         write_atomically(tmp_path / f"{number}.png", b"picture")
     assert listed == [tmp_path]
     assert not dead.exists() and own.exists()
+
+
+def test_what_a_dead_process_of_the_same_number_left_is_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container that is killed and starts again: its processes have the same numbers, and count from 0."""
+    from avatar.files import atomic
+
+    file = tmp_path / "run.json"
+    monkeypatch.setattr(atomic, "_COUNTER", iter((7,)))
+    left = temporary_name(file)
+    left.write_bytes(b"a part")
+    monkeypatch.setattr(atomic, "_COUNTER", iter((7, 8)))
+    write_atomically(file, b"all of it")
+    assert file.read_bytes() == b"all of it" and left.read_bytes() == b"a part"
+    assert set(tmp_path.iterdir()) == {file, left}

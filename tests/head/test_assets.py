@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,18 @@ def test_the_objs_words_may_stand_apart_by_tabs(head_dir: Path) -> None:
     assert torch.equal(found.uvs, expected.uvs) and torch.equal(found.uv_faces, expected.uv_faces)
 
 
+def test_the_objs_faces_may_count_backwards(head_dir: Path) -> None:
+    before, file = load_head_assets(head_dir).fingerprint, head_dir / "head_template.obj"
+    text = file.read_text()
+    backwards = re.sub(r"(?<= )(\d+)/(\d+)", lambda m: f"{int(m[1]) - 64}/{int(m[2]) - 64}", text)
+    assert "f -63/-63" in backwards
+    file.write_text(backwards)
+    assert load_head_assets(head_dir).fingerprint == before
+    file.write_text(backwards.replace("f -63/-63", "f -63/-64"))
+    with pytest.raises(UserError, match="names a UV outside the 63"):
+        load_head_assets(head_dir)
+
+
 def test_trimesh_reads_the_same_layout(head_dir: Path) -> None:
     assets = load_head_assets(head_dir)
     read = trimesh.load(head_dir / "head_template.obj", process=False, force="mesh")
@@ -109,6 +122,13 @@ def test_parts_that_a_model_may_lack(head_dir: Path) -> None:
     rewrite(head_dir, posedirs=None)
     assets = load_head_assets(head_dir)
     assert not assets.eyelid_dirs.any() and not assets.pose_dirs.any() and not assets.regions
+
+
+@pytest.mark.parametrize("name", ["l_eyelid.npy", "r_eyelid.npy"])
+def test_one_eyelid_without_the_other_is_refused(head_dir: Path, name: str) -> None:
+    (head_dir / name).unlink()
+    with pytest.raises(UserError, match=f"{name} is missing beside the other eyelid"):
+        load_head_assets(head_dir)
 
 
 CASES = {
@@ -207,3 +227,32 @@ def test_a_region_outside_the_model_is_named(head_dir: Path) -> None:
     np.savez(head_dir / "masks.npz", lips=np.array([1, 63]))
     with pytest.raises(UserError, match="region lips names vertex 63, but the model has 63"):
         load_head_assets(head_dir)
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.float32])
+def test_a_region_may_say_it_of_every_vertex(head_dir: Path, kind: type) -> None:
+    mask = np.zeros(63, kind)
+    mask[[5, 7, 40]] = 1
+    np.savez(head_dir / "masks.npz", lips=mask, face=np.array([1, 0]))
+    regions = load_head_assets(head_dir).regions
+    assert regions["lips"].tolist() == [5, 7, 40] and regions["face"].tolist() == [0, 1]
+
+
+def test_a_region_of_shares_is_refused(head_dir: Path) -> None:
+    np.savez(head_dir / "masks.npz", lips=np.full(63, 0.7))
+    with pytest.raises(UserError, match="lips holds values that are no whole numbers"):
+        load_head_assets(head_dir)
+
+
+def test_faces_beside_the_uv_map_are_said(head_dir: Path) -> None:
+    """As of a map in several tiles; a last corner on the edge is none."""
+    assert not load_head_assets(head_dir).notes
+    file = head_dir / "head_template.obj"
+    lines = file.read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("vt "))
+    for i in (first, first + 1, first + 9):  # the corners of the first face
+        u, v = lines[i].split()[1:3]
+        lines[i] = f"vt {float(u) + 1} {v}"
+    file.write_text("\n".join(lines))
+    (note,) = load_head_assets(head_dir).notes
+    assert note.startswith("1 of 96 faces lie beside the UV map of head_template.obj")

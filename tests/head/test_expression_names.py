@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from avatar.errors import UserError
-from avatar.head.expression_names import NAMES_FILE, load_expression_names, parse_expression_names
+from avatar.head.expression_names import NAMES_FILE, ExpressionNames, load_expression_names, parse_expression_names
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
@@ -40,3 +40,16 @@ def test_weights_that_are_no_usual_numbers_are_refused(weight: object) -> None:
     }
     with pytest.raises(UserError, match="the weight of '1' in jawOpen is"):
         parse_expression_names({"names": [], "arkit": {"jawOpen": {"1": weight}}}, 2, "file")
+
+
+def test_names_of_any_script_are_told_apart() -> None:
+    names = ExpressionNames(("微笑", "lcheln", "lächeln", "?"))
+    assert [names.index(name) for name in ("微笑", "张嘴", "Lächeln", "la\u0308cheln", "?", "#")] == [
+        0,
+        None,
+        2,
+        2,
+        3,
+        None,
+    ]
+    assert names.targets("眨眼") == {}

@@ -71,6 +71,7 @@ FORMATS: dict[str, bytes] = {
     ),
     "names with a program's prefix": csv([["Timecode", *(f"blendShapes.{name}" for name in PHONE[1:])], *FIFTY[1:]]),
     "camel case": csv([[name[0].lower() + name[1:] for name in PHONE], *FIFTY[1:]]),
+    "columns of notes in another script": csv([[*FIFTY[0], "备注", "说明"], *([*row, "0", "1"] for row in FIFTY[1:])]),
     "a text column of notes": csv([[*FIFTY[0], "Take"], *([*row, "first take"] for row in FIFTY[1:])]),
 }
 

@@ -9,7 +9,7 @@ from small_runs import run_info
 
 from avatar.errors import UserError
 from avatar.runs import run as run_module
-from avatar.runs.run import read_run_info, write_run_info
+from avatar.runs.run import read_run_info, refuse_trained, write_run_info
 
 
 def test_what_a_run_began_with_comes_back(tmp_path: Path) -> None:
@@ -50,3 +50,10 @@ def test_a_library_under_another_name_has_its_version_noted(monkeypatch: pytest.
     monkeypatch.setattr(run_module, "version", only_the_plain_one)
     assert run_module.versions()["opencv-contrib-python-headless"] == "4.0"
     assert run_module.versions()["kornia"] == "unknown"
+
+
+def test_an_avatar_without_its_checkpoints_is_not_trained_over(tmp_path: Path) -> None:
+    refuse_trained(tmp_path)
+    (tmp_path / "avatar.safetensors").touch()
+    with pytest.raises(UserError, match="holds an avatar already, avatar.safetensors: choose another --out"):
+        refuse_trained(tmp_path)
