@@ -182,7 +182,7 @@ def judge_tracking(info: TrackingInfo, subject: Path, anyway: bool) -> None:
         if figure["grade"] == "poor"
     ]
     if figures and not anyway:
-        advice = "film again by this advice (options are those of avatar track), or add --anyway to go on with this video"
+        advice = "film again by this advice (its options: avatar track), or add --anyway to go on with this video"
         raise UserError("\n  ".join(["the tracking is poor:", *figures]) + f"\n{advice}")
     for line in figures:
         print(f"  poor: {line}")
