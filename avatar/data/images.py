@@ -6,6 +6,7 @@ The foreground matte of an image is a mask file, or the image itself: then its t
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from avatar.files.read import read_bytes as read_bounded
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 OTHER_PICTURES = (".webp", ".bmp", ".tif", ".tiff", ".gif", ".heic", ".avif", ".jp2", ".ppm", ".exr", ".tga", ".jxl")
-_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8\xff", 0xDA, b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 _PALETTE = 3  # the colour type of a PNG that holds indices into a palette
@@ -150,7 +151,7 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     if not data:
         raise UserError(f"{path} is empty; write or copy it again")
     if data.startswith(_JPEG_START):
-        complete = _JPEG_END in data[-_TAIL:]
+        complete = _has_end(data)
     elif data.startswith(_PNG_START):
         complete = _PNG_END in data[-_TAIL:]
     else:
@@ -177,17 +178,30 @@ def _declared_size(data: bytes) -> tuple[int, int]:
     if data.startswith(_PNG_START):
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     largest = (0, 0)
-    at = len(_JPEG_START) - 1
-    while at + 9 <= len(data):
-        if data[at] != 0xFF:
-            at += 1  # image data, or filling between segments
-            continue
-        marker = data[at + 1]
+    for marker, at in _segments(data):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
             size = int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
             largest = max(largest, size, key=lambda wh: wh[0] * wh[1])
-        if marker == 0xDA:  # the image data begin, in which no marker but the end's means anything here
+    return largest
+
+
+def _has_end(data: bytes) -> bool:
+    """Whether a JPEG's image data end. Not all of the file need: phones append a short video, and some writers pad."""
+    begin = next((at for marker, at in _segments(data) if marker == _JPEG_SCAN), len(data))
+    return data.find(_JPEG_END, begin) >= 0
+
+
+def _segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """The markers of a JPEG's segments and where they stand, to the first image data, in which none but the end's means
+    anything."""
+    at = len(_JPEG_START) - 1
+    while at + 9 <= len(data):
+        if data[at] != 0xFF:
+            at += 1  # filling between segments
+            continue
+        marker = data[at + 1]
+        yield marker, at
+        if marker == _JPEG_SCAN:
             break
         has_length = 0xC0 <= marker <= 0xFE and not 0xD0 <= marker <= 0xD9
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big") if has_length else 1
-    return largest

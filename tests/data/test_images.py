@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from avatar.data.images import read_image, read_mask, read_matte
+from avatar.errors import UserError
 
 MATTE = np.array([[0, 1, 9, 10], [40, 128, 254, 255]], np.uint8)
 COLOUR = np.full((2, 4, 3), (10, 120, 200), np.uint8)  # blue first, as OpenCV writes
@@ -97,3 +98,19 @@ def test_an_opaque_mask_file_is_its_luminance_and_an_opaque_image_is_all_foregro
     assert (read_matte(path, path) == 255).all()
     assert cv2.imwrite(str(tmp_path / "x.jpg"), COLOUR)
     assert (read_matte(tmp_path / "x.jpg", tmp_path / "x.jpg") == 255).all()
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpegs_image_data_must_end_and_the_file_may_go_on(progressive: int, tmp_path: Path) -> None:
+    """Phones put a thumbnail with an end of its own before the picture, and a video behind it."""
+    picture, path = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8), tmp_path / "x.jpg"
+    data = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_PROGRESSIVE, progressive))[1].tobytes()
+    data = data[:2] + b"\xff\xe1\0\x06ab\xff\xd9" + data[2:]
+    path.write_bytes(data)
+    expected = read_image(path)
+    path.write_bytes(data + b"\0\0\0\x18ftypmp42" + bytes(10_000))
+    np.testing.assert_array_equal(read_image(path), expected)
+    for kept in (len(data) - 2, len(data) // 2, 12):
+        path.write_bytes(data[:kept])
+        with pytest.raises(UserError, match="is cut short; write or copy it again"):
+            read_image(path)
