@@ -187,7 +187,7 @@ def _declared_size(data: bytes) -> tuple[int, int]:
 
 def _has_end(data: bytes) -> bool:
     """Whether a JPEG's image data end. Not all of the file need: phones append a short video, and some writers pad."""
-    begin = next((at for marker, at in _segments(data) if marker == _JPEG_SCAN), len(data))
+    begin = next((at for marker, at in _segments(data) if marker == _JPEG_SCAN), 0)  # decoders refuse what has none
     return data.find(_JPEG_END, begin) >= 0
 
 
