@@ -1,9 +1,9 @@
-"""Checks of shape and finiteness that answer in one sentence, and tensors as 8-bit levels."""
+"""Checks of shape and finiteness that answer in one sentence, tensors as 8-bit levels, and rows of tensors."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 
@@ -60,3 +60,14 @@ def to_8_bit(values: Float[Tensor, "..."], truncate: bool = False) -> UInt8[Tens
     """256 levels of the values clamped to [0, 1]: the nearest one, or with `truncate` the one below."""
     scaled = values.detach().clamp(0.0, 1.0) * 255.0
     return (scaled.floor() if truncate else scaled.round()).to(torch.uint8)
+
+
+def take_rows(values: Float[Tensor, "..."], rows: Int[Tensor, "..."], dim: int = 0) -> Float[Tensor, "..."]:
+    """`values[rows]`, whose gradient has the same bits every time: `dim` becomes the dimensions of `rows`.
+
+    The gradient of a row that is taken twice is a sum. Threads of a CPU add up that of `values[rows]` in any order, threads
+    of a GPU that of `index_select`.
+    """
+    flat, dim = rows.reshape(-1), dim % values.ndim
+    taken = values.index_select(dim, flat) if values.device.type == "cpu" else values[(slice(None),) * dim + (flat,)]
+    return taken.unflatten(dim, rows.shape)

@@ -19,6 +19,15 @@ def _seeded() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """`make test` gives torch one, and users more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """The development data beside the checkout; tests that need it are skipped where it is absent."""
@@ -35,6 +44,7 @@ def _short_training() -> Iterator[None]:
         patch.setattr("avatar.train.loss.SH_INTERVAL", 3)
         patch.setattr("avatar.train.log.LOG_EVERY", 2)
         patch.setattr("avatar.gaussianheadavatar.initial_surface.STEPS", 10)
+        patch.setattr("avatar.gaussianheadavatar.model.FIT_STEPS", 20)
         patch.setattr("avatar.gaussianheadavatar.initial_gaussians.CELLS", 24)
         patch.setattr("avatar.gaussianheadavatar.initial_motion.STEPS", 10)
         patch.setattr("avatar.gaussianheadavatar.initial_motion.HEADS", 20)

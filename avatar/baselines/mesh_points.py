@@ -28,6 +28,7 @@ from torch.nn.functional import normalize
 
 from avatar.gaussians.apply_offsets import quaternion_product
 from avatar.head.normals import vertex_normals
+from avatar.tensors import take_rows
 
 MOST_CROSSINGS = 8  # of edges at once; a place that is then outside still is set on the rim of its triangle
 LEAST_HEIGHT = 1e-7  # metres, of a triangle: a degenerate one takes part as one of this height
@@ -83,13 +84,13 @@ class MeshPoints(nn.Module):
         """The points on the posed mesh, metres."""
         corners, weights = self._faces[self.face], self.barycentric()[..., None]
         normals = vertex_normals(vertices, self._faces)
-        surface, normal = ((values[corners] * weights).sum(dim=1) for values in (vertices, normals))
+        surface, normal = ((take_rows(values, corners) * weights).sum(dim=1) for values in (vertices, normals))
         return surface + self.place[:, 2:] * normalize(normal, dim=-1)
 
     def turns(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 4"]:
         """The rotation of each point's triangle from the neutral to the posed mesh, (w, x, y, z)."""
         inverse = self._inverse_frames[self.face]
-        return quaternion_product(frame_quats(vertices[self._faces[self.face]]), inverse)
+        return quaternion_product(frame_quats(take_rows(vertices, self._faces[self.face])), inverse)
 
     @torch.no_grad()
     def walk(self, carried: Sequence[Float[Tensor, "N 3"]] = ()) -> int:

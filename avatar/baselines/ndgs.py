@@ -33,6 +33,7 @@ from torch.nn.functional import normalize
 
 from avatar.baselines.covariance import triangle_size
 from avatar.model import FlashAvatar
+from avatar.tensors import take_rows
 from avatar.types import Gaussians
 
 
@@ -55,7 +56,8 @@ class NdGaussians(nn.Module):
 
     def forward(self, latents: Float[Tensor, "M n"], rows: Int[Tensor, " M"] | None = None) -> Slice:
         """`rows` are the Gaussians of the latents; None: all of them."""
-        mean, root, cross = (part if rows is None else part[..., rows] for part in (self.mean, self.root, self.cross))
+        parts = self.mean, self.root, self.cross
+        mean, root, cross = parts if rows is None else (take_rows(part, rows, -1) for part in parts)
         mean_a, mean_b = mean.split((3, self.latent_size))
         whitened = substitute(root, latents.T - mean_b)
         position = mean_a + (cross * whitened).sum(dim=1)

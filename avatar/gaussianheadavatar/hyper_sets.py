@@ -22,6 +22,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from avatar.tensors import take_rows
+
 
 class Attributes(NamedTuple):
     """What the five latents decide, in the place of the networks' own outputs."""
@@ -83,7 +85,8 @@ class HyperSet(nn.Module):
 
     def forward(self, latents: Float[Tensor, "M n"], rows: Int[Tensor, " M"] | None = None) -> Float[Tensor, "M m"]:
         """`rows` are the Gaussians of the latents; None: all of them."""
-        mean, lower, cross = (part if rows is None else part[..., rows] for part in (self.mean, self.lower, self.cross))
+        parts = self.mean, self.lower, self.cross
+        mean, lower, cross = parts if rows is None else (take_rows(part, rows, -1) for part in parts)
         mean_a, mean_b = mean[: self.attribute_size], mean[self.attribute_size :]
         return (mean_a - _Pull.apply(latents.T - mean_b, lower, cross)).T  # pyright: ignore
 

@@ -23,6 +23,7 @@ from avatar.gaussianheadavatar.marching_tetrahedra import Grid, Surface, marchin
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.head.model import HeadModel
 from avatar.splat import splat_features
+from avatar.tensors import take_rows
 from avatar.types import Camera, FeatureGaussians
 
 STEPS = 400
@@ -96,7 +97,7 @@ def flat_gaussians(
     points: Float[Tensor, "E 3"], faces: Int[Tensor, "F 3"], colours: Float[Tensor, "E 3"]
 ) -> FeatureGaussians:
     """One for each triangle, differentiable in its place and its colour, with the matte as a fourth channel."""
-    corners = points[faces]
+    corners = take_rows(points, faces)
     with torch.no_grad():
         cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal = normalize(cross, dim=1)
@@ -105,7 +106,7 @@ def flat_gaussians(
         quats = normalize(torch.stack((1.0 + z, -y, x, torch.zeros_like(z)), dim=1), dim=1)  # from the z axis to it
         size = (0.5 * cross.norm(dim=1)).sqrt()[:, None]
         scales = (size * size.new_tensor([WIDTH, WIDTH, DEPTH])).clamp(min=1e-5)
-    features = torch.cat((colours[faces].mean(dim=1), colours.new_ones(len(faces), 1)), dim=1)
+    features = torch.cat((take_rows(colours, faces).mean(dim=1), colours.new_ones(len(faces), 1)), dim=1)
     return FeatureGaussians(corners.mean(dim=1), quats, scales, colours.new_full((len(faces),), OPACITY), features)
 
 
@@ -121,7 +122,8 @@ def picture_loss(gaussians: FeatureGaussians, camera: Camera, target: Float[Tens
 def laplacian(points: Float[Tensor, "E 3"], surface: Surface) -> Float[Tensor, "E 3"]:
     """From each point to the mean of its neighbours."""
     corners = surface.faces.flatten()
-    others = points[surface.faces].sum(dim=1, keepdim=True) - points[surface.faces]
+    of_faces = take_rows(points, surface.faces)
+    others = of_faces.sum(dim=1, keepdim=True) - of_faces
     sums = torch.zeros_like(points).index_add(0, corners, others.reshape(-1, 3))
     counts = 2.0 * torch.bincount(corners, minlength=len(points))
     return sums / counts[:, None] - points

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avatar.tensors import take_rows
+
 
 class Grid(NamedTuple):
     """Points at the corners of equal cubes; a volume of values has their shape, a list of values the order of `points`."""
@@ -44,7 +46,7 @@ class Surface(NamedTuple):
 
     def of(self, values: Float[Tensor, "P D"]) -> Float[Tensor, "E D"]:
         """What grid points have, at the triangles' corners."""
-        return torch.lerp(values[self.edges[:, 0]], values[self.edges[:, 1]], self.shares[:, None])
+        return torch.lerp(*take_rows(values, self.edges).unbind(1), self.shares[:, None])
 
 
 def marching_tetrahedra(values: Float[Tensor, " P"], tets: Int[Tensor, "T 4"]) -> Surface:
@@ -61,7 +63,7 @@ def marching_tetrahedra(values: Float[Tensor, " P"], tets: Int[Tensor, "T 4"]) -
     low, high = torch.cat(triangles).sort(dim=-1).values.unbind(-1)
     keys, faces = (low * len(values) + high).unique(return_inverse=True)
     edges = torch.stack((keys // len(values), keys % len(values)), dim=1)
-    first, second = values[edges].unbind(1)
+    first, second = take_rows(values, edges).unbind(1)
     return Surface(edges, first / (first - second), faces)
 
 

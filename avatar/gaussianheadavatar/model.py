@@ -39,6 +39,7 @@ from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
 from avatar.head.model import matrix_from_6d, nearest_rotation
 from avatar.splat import splat_features
+from avatar.tensors import take_rows
 from avatar.types import Camera, FeatureGaussians, HeadParams, Rendering
 
 FEATURES = 128  # of a point, which networks for colour and shape take
@@ -165,7 +166,7 @@ class GaussianHeadAvatar(Avatar):
             given = self.condition(params), self.pose(params, None)
             with torch.enable_grad():
                 places = self.normalized(self.positions[rows])
-                blended = self.networks(places, self.features[rows], *given, near[rows])
+                blended = self.networks(places, take_rows(self.features, rows), *given, near[rows])
                 loss = (blended.colour - colours[rows]).square().mean()
                 optimizer.zero_grad()
                 loss.backward()

@@ -230,6 +230,7 @@ def test_a_black_camera_is_refused(single: Path, tmp_path: Path) -> None:
         opened(folder, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_ten_thousand_listed_pictures_that_are_not_there_are_refused(single: Path, tmp_path: Path) -> None:
     folder = edited(single, tmp_path / "copy", lambda _: None)
     content = json.loads((folder / "transforms_train.json").read_text())

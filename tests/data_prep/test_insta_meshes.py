@@ -94,7 +94,7 @@ def flame_of(number: int, head: HeadAssets) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[:2]), KINDS[2]])
 def test_the_parameters_come_back(kind: str, head: HeadAssets, tmp_path: Path) -> None:
     """Of a mesh with a pose inside, whose expression is only roughly known, and some vertices of which were moved."""
     topology, truths, listed = Topology(head, kind), [], {}

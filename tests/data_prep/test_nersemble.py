@@ -138,7 +138,9 @@ def test_frames_are_positions_where_the_video_has_more(tmp_path: Path) -> None:
     assert subject.recording.fps == RATE / 2
 
 
-@pytest.mark.parametrize("name", ["flame2023_tracking_v2.npz", "flame2023_tracking.npz"])
+@pytest.mark.parametrize(
+    "name", ["flame2023_tracking_v2.npz", pytest.param("flame2023_tracking.npz", marks=pytest.mark.slow)]
+)
 def test_angles_and_the_older_name_are_read(name: str, copy: Path, subject: Subject, tmp_path: Path) -> None:
     edit_tracking(copy, lambda values: values.pop("rotation_matrices"))
     for path in list(copy.glob("sequences/*/tracking/*.npz")):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from demo_mesh.topology import build_head_mesh
 
 from avatar.demo.mesh import load_head_mesh
 
 
+@pytest.mark.slow
 def test_the_file_holds_what_the_script_makes() -> None:
     made, stored = build_head_mesh(), load_head_mesh()
     for name, values in made._asdict().items():

@@ -119,6 +119,7 @@ def test_one_storage_named_often_counts_each_time() -> None:
         load_torch_pickle(file.getvalue())
 
 
+@pytest.mark.slow
 def test_a_deep_nest_is_made_and_thrown_away() -> None:
     assert load_pickle(b")" + b"\x85" * 2_000_000 + b"0N.") is None
 

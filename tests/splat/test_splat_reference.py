@@ -40,8 +40,10 @@ def check_gradients(scene: Scene, block: int = 16, **options: Any) -> None:
     assert torch.autograd.gradcheck(draw, leaves, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("sh_degree", [0, 3])
+@pytest.mark.parametrize(
+    ("sh_degree", "antialiased"),
+    [(0, False), (0, True), (3, True), pytest.param(3, False, marks=pytest.mark.slow)],
+)
 def test_gradcheck(sh_degree: int, antialiased: bool) -> None:
     g = random_gaussians(5, sh_degree=sh_degree, spread=0.1, size=0.1)
     g.means[4, 2] -= 2.0  # behind the camera

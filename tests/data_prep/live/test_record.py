@@ -98,6 +98,7 @@ def obedient(time: float) -> Face:
     return posed(**doing[bisect_right(ENDS, max(time, 0.0))])
 
 
+@pytest.mark.slow
 def test_prompts_advice_and_what_was_reached(filming: Callable[..., StandIn], tmp_path: Path) -> None:
     def play(time: float) -> tuple[np.ndarray, Face | None]:
         prompt = bisect_right(ENDS, max(time, 0.0))

@@ -34,7 +34,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 @pytest.mark.parametrize("shift", [0, 6])
 def test_the_head_without_its_clothes(seed: int, shift: int) -> None:
     """Also where the mesh lies 6 of 256 pixels aside, as fits do."""
