@@ -27,7 +27,7 @@ demo: setup ## make two people, train an avatar of one, evaluate it and let the 
 
 # A worker for each core, with one thread, since most tests have work for one; a worker that is done takes tests of another.
 PYTEST := OMP_NUM_THREADS=1 AVATAR_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations=25
-test: setup-dev ## run the tests but the slow ones and those that need a browser (six minutes on two cores)
+test: setup-dev ## run the tests but the slow ones and those that need a browser (five minutes on two cores)
 	$(PYTEST) -m "not slow and not chromium"
 
 test-all: setup-dev ## run all tests

@@ -46,7 +46,8 @@ class Surface(NamedTuple):
 
     def of(self, values: Float[Tensor, "P D"]) -> Float[Tensor, "E D"]:
         """What grid points have, at the triangles' corners."""
-        return torch.lerp(*take_rows(values, self.edges).unbind(1), self.shares[:, None])
+        first, second = take_rows(values, self.edges).unbind(1)
+        return torch.lerp(first, second, self.shares[:, None])
 
 
 def marching_tetrahedra(values: Float[Tensor, " P"], tets: Int[Tensor, "T 4"]) -> Surface:
