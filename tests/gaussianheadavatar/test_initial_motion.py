@@ -61,6 +61,7 @@ def test_gaussians_near_the_face_start_with_the_meshs_motion_at_expressions_of_n
     name: str, tracked_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(initial_motion, "STEPS", STEPS // 2)
+    monkeypatch.setattr(initial_motion, "POINTS", 512)
     monkeypatch.setattr(initial_motion, "HEADS", HEADS)
     config = small_config(f"model={name}", "model.mlp_width=64")
     _, subject, assets = open_small(tracked_folder, config)
