@@ -22,6 +22,9 @@ def run_check(arguments: Namespace) -> int:
         check_folder_output(arguments.out)
         check_outputs([arguments.out], [arguments.folder, arguments.head, arguments.tracking])
         check_installed("the page of --out", "plots", "matplotlib")
+        from data_prep.check.page import check_page_output, write_page
+
+        check_page_output(arguments.out)
     outcome = check_tracked_folder(
         arguments.folder,
         lambda: load_head_assets(find_head(arguments.folder, arguments.head)),
@@ -32,8 +35,6 @@ def run_check(arguments: Namespace) -> int:
     )
     print(json.dumps(outcome.to_dict(), indent=1, allow_nan=False) if arguments.json else as_text(outcome))
     if arguments.out is not None:
-        from data_prep.check.page import write_page
-
         page = write_page(outcome, arguments.out)
         print(f"Page   {page}", file=sys.stderr if arguments.json else sys.stdout)
     return outcome.status

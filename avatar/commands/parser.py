@@ -150,7 +150,12 @@ def build_parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.Argument
 
     compare = commands.add_parser("compare")
     compare.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs that avatar eval has measured")
-    compare.add_argument("--protocol", action="append", metavar="NAME", help="only this protocol; may be repeated")
+    compare.add_argument(
+        "--protocol",
+        action="append",
+        metavar="NAME",
+        help="only this protocol, by name or as FILE.yaml; may be repeated",
+    )
     compare.add_argument(
         "--format", choices=("text", "markdown", "latex", "csv"), default="text", help="what is printed"
     )

@@ -222,7 +222,8 @@ def common_protocols(evaluations: Sequence[Evaluation], wanted: Sequence[str] | 
     """Names of the protocols that all runs have with the same choices; those that are left out go into `notes`."""
     first, *others = evaluations
     chosen = []
-    for name in dict.fromkeys(wanted or first.results["protocols"]):
+    words = wanted or first.results["protocols"]
+    for name in dict.fromkeys(Path(word).stem for word in words):  # a file's name names its protocol
         lacking = [each.label for each in evaluations if name not in each.results["protocols"]]
         differing = {
             key

@@ -25,6 +25,15 @@ _MAIN = ("usable frames", "overlap of mesh and head mask (IoU), median", "lips t
 _FIT_COLUMNS = ("overlap", "inside", "overhang", "mouth", "mask_ratio", "size")
 
 
+def check_page_output(out: Path) -> None:
+    """Raise UserError where a file is there that no earlier check has written."""
+    page = out / PAGE
+    ours = page.is_file() and b"<title>Check of " in page.read_bytes()[:20_000]
+    there = next((path for path in (page, out / TABLE) if path.exists()), None)
+    if there is not None and not ours:
+        raise UserError(f"{there} is not of avatar check and would be overwritten; choose another --out")
+
+
 def write_page(check: Check, out: Path) -> Path:
     """Write OUT/index.html, which needs nothing else, and OUT/frames.csv; returns the page."""
     try:

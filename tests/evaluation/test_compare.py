@@ -191,7 +191,7 @@ def test_figures_that_a_run_lacks_are_left_out_with_a_note(tmp_path: Path) -> No
 
 def test_a_protocol_that_is_named_twice_is_compared_once(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name, {"psnr": smooth(1)}) for name in "ab"]
-    assert [each.protocol for each in compare_runs(runs, ["strict", "strict"]).protocols] == ["strict"]
+    assert [each.protocol for each in compare_runs(runs, ["strict", "my/strict.yaml"]).protocols] == ["strict"]
 
 
 def test_a_run_that_has_gone_on_since_it_was_measured_is_named(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from data_prep.check.folder import Check
-from data_prep.check.page import render_page
+from data_prep.check.page import check_page_output, render_page
 
 
 class Sources(HTMLParser):
@@ -54,6 +54,21 @@ def test_the_page_holds_pictures_and_findings_and_loads_nothing(page: Path) -> N
     assert "The tracking cannot be used in frame 00005 of checkpoint: all zero" in parsed.text
     assert str(page.parents[1]) not in parsed.text
     assert page.stat().st_size < 3e6
+
+
+@pytest.mark.parametrize("name", ["index.html", "frames.csv"])
+def test_a_file_of_somebody_else_stays(
+    name: str, tracked_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / name
+    other.write_text("mine")
+    assert main(["check", str(tracked_folder), "--out", str(tmp_path)]) == 2
+    assert f"{other} is not of avatar check" in capsys.readouterr().err
+    assert other.read_text() == "mine" and [*tmp_path.iterdir()] == [other]
+
+
+def test_an_earlier_page_is_written_again(page: Path) -> None:
+    check_page_output(page.parent)
 
 
 def test_pictures_and_main_figures_come_before_the_findings(page: Path) -> None:
