@@ -55,15 +55,15 @@ def curvature(fitter: FrameFitter, problem: Problem, level: int) -> Float[Tensor
     for picture, target in zip(before, targets, strict=True):
         error = (picture - target.picture).abs()
         roots.append(torch.where(error > HUBER_DELTA, HUBER_DELTA / error, 1.0).sqrt())
-    columns: list[list[Tensor]] = [[] for _ in targets]
-    for probe in PROBE * torch.eye(len(moves), dtype=torch.float64, device=moves.device):
+    jacobians = [picture.new_empty(len(moves), picture.numel()) for picture in before]  # transposed
+    for move, probe in enumerate(PROBE * torch.eye(len(moves), dtype=torch.float64, device=moves.device)):
         probed = pictures((moves.double() + probe).to(moves.dtype))
-        for own, picture, still, root in zip(columns, probed, before, roots, strict=True):
-            own.append(((picture - still) * root).flatten() / PROBE)
-    found = []
-    for own, target in zip(columns, targets, strict=True):
-        jacobian = torch.stack(own, dim=1)
-        found.append(OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian.T @ jacobian) / (3.0 * target.area))
+        for jacobian, picture, still, root in zip(jacobians, probed, before, roots, strict=True):
+            jacobian[move] = ((picture - still) * root).flatten() / PROBE
+    found = [
+        OBSERVATIONS / PIXEL_SIGMA**2 * (jacobian @ jacobian.T) / (3.0 * target.area)
+        for jacobian, target in zip(jacobians, targets, strict=True)
+    ]
     return torch.stack(found).sum(dim=0)
 
 
