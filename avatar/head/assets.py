@@ -231,7 +231,7 @@ def _read_eyelids(folder: Path, V: int) -> np.ndarray:
 
 
 def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
-    for name in ("FLAME_masks.pkl", "masks.npz"):
+    for name in ("FLAME_masks.pkl", "FLAME_masks/FLAME_masks.pkl", "masks.npz"):  # or as its archive unpacks
         file = folder / name
         if not is_there(file):
             continue

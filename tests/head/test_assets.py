@@ -229,6 +229,13 @@ def test_a_region_outside_the_model_is_named(head_dir: Path) -> None:
         load_head_assets(head_dir)
 
 
+def test_masks_may_lie_in_the_folder_that_their_archive_makes(head_dir: Path) -> None:
+    (head_dir / "FLAME_masks").mkdir()
+    lips = np.array([5, 7, 40])
+    (head_dir / "FLAME_masks" / "FLAME_masks.pkl").write_bytes(pickle.dumps({"lips": lips}))
+    assert load_head_assets(head_dir).regions["lips"].tolist() == lips.tolist()
+
+
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.float32])
 def test_a_region_may_say_it_of_every_vertex(head_dir: Path, kind: type) -> None:
     mask = np.zeros(63, kind)
