@@ -1,6 +1,7 @@
 // What surrounds the picture in the page: background, full screen, eyes that follow, a line to embed it, and keys.
 import { followPointer } from "./gaze.js";
 
+const escaped = (text) => text.replace(/[&<>"]/g, (letter) => `&#${letter.charCodeAt(0)};`); // for an attribute
 const STAGE = { light: "#f7f7f9", dark: "#322f2e" };
 
 /** `play` is what the space key does. Returns a function that puts the background back. */
@@ -20,7 +21,7 @@ export function connectPageDisplay(view, header, isGazeHeld, play) {
   const describe = () => {
     const place = location.protocol === "file:" ? location.pathname.split("/").pop() : location.origin + location.pathname;
     const colour = isChosen ? `&background=${encodeURIComponent(background.value)}` : "";
-    find("embed").value = `<iframe src="${place}?noui&autoplay${colour}" title="${header.name}, a synthetic head" width="480" height="480" style="border:0"></iframe>`;
+    find("embed").value = `<iframe src="${escaped(place)}?noui&autoplay${colour}" title="${escaped(header.name)}, a synthetic head" width="480" height="480" style="border:0"></iframe>`;
   };
   if (isChosen) background.value = asked.get("background");
   putBack();

@@ -204,7 +204,7 @@ export class AvatarView extends EventTarget {
   }
 
   #clampFrame(frame) {
-    return Math.min(Math.max(Math.round(frame), 0), Math.max(this.frameCount - 1, 0));
+    return Math.min(Math.max(Math.round(frame) || 0, 0), Math.max(this.frameCount - 1, 0));
   }
 
   #receive(data) {

@@ -192,6 +192,11 @@ def test_background_full_screen_and_the_picture_alone(visit: Any) -> None:
     assert torch.allclose(shown(page)[0, 0], torch.tensor([0.2, 0.4, 0.6]), atol=0.01)
     line = page.locator("#embed").input_value()
     assert line.startswith('<iframe src="someone.html?noui&autoplay&background=%23336699"')
+    name = 'Ann "&quot;" <b>'
+    page.evaluate("name => { avatar.header.name = name; }", name)
+    page.locator("#background").dispatch_event("input")
+    title = "line => new DOMParser().parseFromString(line, 'text/html').querySelector('iframe').title"
+    assert page.evaluate(title, page.locator("#embed").input_value()) == f"{name}, a synthetic head"
     page.locator("#full").click()
     until(page, "document.fullscreenElement?.id === 'stage'")
     page.keyboard.press("Escape")
