@@ -33,7 +33,8 @@ class BoundedLog(io.TextIOBase):
         self._file.write(data[-self._limit :])
 
     def close(self) -> None:
-        self._file.close()
+        if "_file" in self.__dict__:  # it could be opened
+            self._file.close()
         super().close()
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.names import display_name
+from avatar.files.read import open_file
 from avatar.html import Markup, document, element, fold, join, picture, section, tiles
 from avatar.version import __version__
 from data_prep.check.clip import Clip
@@ -27,8 +28,10 @@ _FIT_COLUMNS = ("overlap", "inside", "overhang", "mouth", "mask_ratio", "size")
 
 def check_page_output(out: Path) -> None:
     """Raise UserError where a file is there that no earlier check has written."""
-    page = out / PAGE
-    ours = page.is_file() and b"<title>Check of " in page.read_bytes()[:20_000]
+    page, ours = out / PAGE, False
+    if page.exists():
+        with open_file(page, None) as file:
+            ours = b"<title>Check of " in file.read(20_000)
     there = next((path for path in (page, out / TABLE) if path.exists()), None)
     if there is not None and not ours:
         raise UserError(f"{there} is not of avatar check and would be overwritten; choose another --out")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-import torch
 from disc import SIZE, TEST, BlobRenderer, make_run, read_png
 
 from avatar.data.split import Split
@@ -92,7 +92,7 @@ def test_results_name_every_choice(tmp_path: Path, subject: Subject) -> None:
     results = json.loads(evaluate(run, say=said.append).read_text())
     assert results["data_hash"] == "ef" * 32 and results["head_fingerprint"] == "ab" * 32 and results["step"] == 1500
     assert results["config"] == {"data": {"size": None}}
-    assert results["versions"]["torch"] == torch.__version__
+    assert results["versions"]["torch"] == version("torch")
     assert set(results["shared_choices"]) >= {"truth", "render", "regions", "psnr", "ssim", "lpips", "means"}
     for protocol in choose_protocols(None):
         entry = results["protocols"][protocol.name]
