@@ -37,9 +37,13 @@ class JoinedFootage(Footage):
 
 
 def join(parts: Sequence[Footage], starts: Sequence[float]) -> JoinedFootage:
-    """Takes of one camera. Raises UserError where they differ in size or rate."""
+    """Takes of one camera. Raises UserError where they differ in size or rate, or do not say how long they are."""
     first = parts[0]
-    for part in parts[1:]:
+    for part in parts:
+        if part.duration is None:
+            raise UserError(
+                f"{part.path} does not say how long it is, so nothing can follow it; convert it to .mp4 (H.264) first"
+            )
         if (part.width, part.height, part.rate) != (first.width, first.height, first.rate):
             raise UserError(
                 f"{part.path} has {part.width}x{part.height} pixels at {part.rate} a second, but {first.path} has "
