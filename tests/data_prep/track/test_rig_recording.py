@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rig_recording import FILMED, write_plain_gha, write_plain_raw
@@ -200,6 +201,12 @@ def twin(folder: Path, serial: str) -> None:
         (
             lambda folder: (folder / "images" / "0002" / f"image_{SERIALS[0]}.jpg").write_bytes(b"no picture"),
             "is neither a JPEG nor a PNG",
+        ),
+        (
+            lambda folder: cv2.imwrite(
+                str(folder / "images" / "0000" / f"mask_{SERIALS[0]}.jpg"), np.zeros((32, 48), np.uint8)
+            ),
+            f"0000/mask_{SERIALS[0]}.jpg is 48x32 pixels but image_{SERIALS[0]}.jpg is 64x64; make the masks",
         ),
     ],
 )
