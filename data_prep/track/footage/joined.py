@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar
 
 from avatar.errors import UserError
@@ -50,9 +51,8 @@ def join(parts: Sequence[Footage], starts: Sequence[float]) -> JoinedFootage:
                 f"{first.width}x{first.height} at {first.rate}; track recordings of different cameras by themselves"
             )
     values = common_fields(first)
-    folder = first.path.parents[2]
     values |= {
-        "path": folder / "*" / first.path.relative_to(folder / first.path.parents[1].name),
+        "path": first.path.parents[1].resolve().with_name("*") / Path(*first.path.parts[-2:]),
         "duration": starts[-1] + (parts[-1].duration or 0.0),
     }
     values |= {"notes": tuple(dict.fromkeys(note for part in parts for note in part.notes))}

@@ -51,6 +51,14 @@ def test_sequences_are_joined_by_the_cameras_that_filmed_all(raw: Path, tmp_path
     assert [round(picture.time * 25) for picture in part] == [3, 5, 6]
 
 
+def test_sequences_are_given_from_within_one(raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, _ = sequences(raw, tmp_path)
+    monkeypatch.chdir(first)
+    joined = track_rig._open([Path(), Path("../FREE")])
+    path = joined.cameras[SERIALS[0]].footage.path
+    assert joined.folder == first.parent and path == first.parent / "*" / "images" / f"cam_{SERIALS[0]}.mp4"
+
+
 def test_sequences_that_do_not_say_how_long_they_are_are_not_joined(raw: Path, tmp_path: Path) -> None:
     """A stream without a container: nothing would be read of it."""
     folders = sequences(raw, tmp_path)
