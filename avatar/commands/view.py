@@ -21,6 +21,7 @@ from torch import Tensor
 
 from avatar.commands.reenact import head_of
 from avatar.errors import UserError, check_installed
+from avatar.files.names import as_text
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file, open_run
@@ -187,7 +188,7 @@ def clips(trained: TrainedAvatar, drives: list[Path]) -> dict[str, Clip]:
     for path in drives:
         if path.suffix.lower() not in DRIVE_SUFFIXES:
             raise UserError(f"--drive takes drive files (.npz, .csv, .json), not {path}")
-        name = path.name if path.name not in found else str(path.absolute())
+        name = as_text(path.name if as_text(path.name) not in found else str(path.absolute()))
         found[name] = driven_clip(trained, open_drive_file(path, trained))
     return found
 

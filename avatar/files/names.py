@@ -22,6 +22,11 @@ def safe_name(text: str) -> str:
     return short.rstrip(_NOT_AT_THE_ENDS) or "unnamed"
 
 
+def as_text(name: str) -> str:
+    """`name` with what is not Unicode escaped: a path may hold it, and no page can show it."""
+    return name.encode(errors="backslashreplace").decode()
+
+
 def typed(path: Path) -> str:
     """A path as it is typed in a command that is printed."""
     return shlex.quote(str(path))

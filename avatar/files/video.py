@@ -18,6 +18,7 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.files.atomic import temporary_name
+from avatar.files.names import as_text
 from avatar.tensors import to_8_bit
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm")
@@ -189,7 +190,7 @@ def error_map(
 
 def _caption(text: str, height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
     strip = np.full((height, width, 3), PAPER, np.uint8)
-    text = text.encode(errors="backslashreplace").decode()  # half a surrogate pair in a file's name crashes OpenCV
+    text = as_text(text)  # half a surrogate pair in a file's name crashes OpenCV
     font, thickness = cv2.FONT_HERSHEY_SIMPLEX, 1
     (text_width, text_height), _ = cv2.getTextSize(text, font, 1.0, thickness)
     scale = min(0.5 * height / text_height, 0.92 * width / max(text_width, 1))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float64
 
+from avatar.files.names import as_text
 from avatar.view.messages import Value, one_of, pressed, switched, within
 from avatar.view.view_renderer import Setting
 
@@ -47,7 +48,7 @@ class Panel:
         """What the panel says: `lines` are Markdown of this program's own, `live` is of anybody."""
         self._status.content = "\n\n".join(lines)
         if self._live is not None:
-            self._live.value = live
+            self._live.value = as_text(live)
         player = self._viewer.player
         self._play.label = "Pause" if player.is_playing else "Play"
         if player.is_playing:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.names import safe_name
 from avatar.files.video import write_video
 from avatar.motion.orbit import Angles, seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
@@ -220,7 +221,7 @@ class Viewer:
             if may_save:
                 path = Path(folder) / "video.mp4"
                 write_video(path, frames(), clip.fps)
-                name = f"{self.renderer.trained.name}-{clip.name}.mp4"
+                name = f"{self.renderer.trained.name}-{safe_name(clip.name)}.mp4"
                 event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
 
     @contextmanager

@@ -82,7 +82,7 @@ export class FaceDriver {
     this.#forget();
   }
 
-  /** { parameters, rotation, translation } of the face at a time in seconds. */
+  /** { parameters, rotation, translation, head } of the face at a time in seconds. */
   next(face, seconds) {
     this.#newest = face;
     const scores = this.#scores.next(this.#rows.map(([name]) => face.scores[name] ?? 0), seconds);
@@ -151,6 +151,7 @@ function placed({ camera, orbit }, [roll, pitch, yaw, x, y, far]) {
   return {
     turn,
     rotation: multiply(camera.rotation, turn),
+    head: camera.head && multiply(camera.head, turn), // of an avatar of several cameras, for its network
     translation: [inside(tx, x, fx, cx, 1), inside(ty, y, fy, cy, 1 / aspect), depth],
   };
 }

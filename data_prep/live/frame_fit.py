@@ -28,7 +28,7 @@ from data_prep.track.fit.initial_pose import start_poses
 from data_prep.track.fit.landmark_fit import LandmarkFit, faded, is_rigid, point_units, weighted_landmarks
 from data_prep.track.fit.levenberg_marquardt import Term, concatenated, minimise
 from data_prep.track.fit.normal_equations import NormalEquations
-from data_prep.track.fit.priors import expected, score_targets
+from data_prep.track.fit.priors import both_ways, expected, score_targets
 from data_prep.track.fit.smoothness import NOMINAL_FPS, Smoothness, make_smoothness
 
 STEPS = 2  # of Levenberg-Marquardt; more do not bring it nearer to the fit of the whole clip
@@ -63,6 +63,7 @@ class FrameFit:
     ) -> None:
         self._assets, self._fit, self._camera, self._size = assets, fit, camera, size
         self._targets = score_targets(names, fit.expressions)
+        self._priors = both_ways(fit.priors, self._targets)  # the calibration's faces were calm
         _, self._weights = weighted_landmarks(assets, embedding)
         self._rigid = is_rigid(fit.term.landmarks)
         self._smoothness = make_smoothness(
@@ -90,7 +91,7 @@ class FrameFit:
             unit=point_units(self._assets, self._camera, start.t),
             pair_weights=self._fit.term.pair_weights[:1],
         )
-        priors = replace(self._fit.priors, mean=expected(seen, self._targets, len(self._fit.expressions)))
+        priors = replace(self._priors, mean=expected(seen, self._targets, len(self._fit.expressions)))
         terms: list[Term] = [term, priors]
         steps = STEPS if self._before else FIRST_STEPS
         if _is_quick(self._before, start, taken):

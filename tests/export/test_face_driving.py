@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -165,6 +166,25 @@ def test_the_head_turns_and_moves_as_in_the_program(trained: TrainedAvatar, tmp_
         assert pose["translation"][2] == pytest.approx(float(expected.t_cam_world[2]), abs=1e-4)
         shift = torch.tensor(pose["translation"])[:2] - front_camera(trained).t_cam_world[:2]
         torch.testing.assert_close(shift, (each.t_cam_head - rest.t_cam_head)[:2], atol=1e-4, rtol=0)
+
+
+def test_the_network_of_an_avatar_of_several_cameras_is_told_how_the_head_turns(
+    trained: TrainedAvatar, tmp_path: Path
+) -> None:
+    rest, other = (place(trained, turn, (0.0, 0.0, 0.6)) for turn in ((0.05, -0.1, 0.02), (-0.2, 0.3, 0.1)))
+    reference = axis_angle_to_rotation_matrix(torch.tensor([[0.1, -0.4, 0.2]]))[0]
+    own = replace(front_camera(trained), R_ref_cam=reference)
+    found = driven(
+        trained,
+        tmp_path,
+        head=own.head_rotation.flatten().tolist(),
+        neutral={"scores": {}, "matrix": as_landmarker(rest)},
+        faces=[{"scores": {}, "matrix": as_landmarker(other)}],
+    )
+    expected = moved_camera(own, rest, other).head_rotation
+    torch.testing.assert_close(
+        torch.tensor(found["poses"][0].get("head", [0.0] * 9)).reshape(3, 3), expected, atol=1e-4, rtol=0
+    )
 
 
 def test_the_head_stays_in_the_picture_and_in_what_training_showed(trained: TrainedAvatar, tmp_path: Path) -> None:

@@ -82,6 +82,12 @@ def _camera(times: list[Path], poses: tuple[Path, Path], serial: str, has_masks:
     footage = footage_of(files[0], files)
     masks = tuple(path.with_name(f"mask_{serial}.jpg") for path in files)
     mattes = replace(footage, files=masks, decode=_read_mask) if has_masks else None
+    height, width = read_mask(masks[0]).shape if has_masks else (footage.height, footage.width)
+    if (width, height) != (footage.width, footage.height):
+        raise UserError(
+            f"{masks[0]} is {width}x{height} pixels but {files[0].name} is {footage.width}x{footage.height}; make the "
+            "masks of these pictures"
+        )
     first, last = (read_calibration(folder / f"camera_{serial}.npz") for folder in poses)
     if any(np.abs(a - b).max() > 1e-6 * np.abs(a).max() for a, b in zip(first, last, strict=True)):
         raise UserError(f"camera {serial} moves between {poses[0]} and {poses[1]}; cameras have to stand still")

@@ -133,7 +133,7 @@ def join_recordings(recordings: Sequence[Recording]) -> Recording:
     unused = {serial for one in recordings for serial in (*one.cameras, *one.unused)} - set(serials)
     names = tuple(zip((folder.name for folder in folders), starts, strict=True))
     front = first.front if first.front in cameras else None
-    return Recording(first.folder.parent, cameras, front, tuple(sorted(unused)), names)
+    return Recording(folders[0].parent, cameras, front, tuple(sorted(unused)), names)
 
 
 def without_pictures(filmed: set[str], calibrated: set[str], calibration: Path) -> tuple[str, ...]:

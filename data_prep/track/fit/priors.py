@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -116,6 +116,15 @@ def expected(landmarks: Landmarks, targets: Sequence[ScoreTarget], expressions: 
     for name, column, weight in targets:
         mean[:, column] += weight * landmarks.score(name).astype(np.float64)
     return torch.from_numpy(mean)
+
+
+def both_ways(priors: Priors, targets: Sequence[ScoreTarget]) -> Priors:
+    """With room below zero where a score stands for less, also for one that the frames have not had."""
+    low = priors.low.clone()
+    for _, column, weight in targets:
+        if weight < 0:
+            low[column].clamp_(max=-BOX[1])
+    return replace(priors, low=low)
 
 
 def make_priors(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar
 
 from avatar.errors import UserError
@@ -37,18 +38,21 @@ class JoinedFootage(Footage):
 
 
 def join(parts: Sequence[Footage], starts: Sequence[float]) -> JoinedFootage:
-    """Takes of one camera. Raises UserError where they differ in size or rate."""
+    """Takes of one camera. Raises UserError where they differ in size or rate, or do not say how long they are."""
     first = parts[0]
-    for part in parts[1:]:
+    for part in parts:
+        if part.duration is None:
+            raise UserError(
+                f"{part.path} does not say how long it is, so nothing can follow it; convert it to .mp4 (H.264) first"
+            )
         if (part.width, part.height, part.rate) != (first.width, first.height, first.rate):
             raise UserError(
                 f"{part.path} has {part.width}x{part.height} pixels at {part.rate} a second, but {first.path} has "
                 f"{first.width}x{first.height} at {first.rate}; track recordings of different cameras by themselves"
             )
     values = common_fields(first)
-    folder = first.path.parents[2]
     values |= {
-        "path": folder / "*" / first.path.relative_to(folder / first.path.parents[1].name),
+        "path": first.path.parents[1].resolve().with_name("*") / Path(*first.path.parts[-2:]),
         "duration": starts[-1] + (parts[-1].duration or 0.0),
     }
     values |= {"notes": tuple(dict.fromkeys(note for part in parts for note in part.notes))}

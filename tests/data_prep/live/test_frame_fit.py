@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from spoken_scene import FPS, SIZE, Scene, spoken_scene
+from spoken_scene import FPS, SEED, SIZE, Scene, spoken_scene
 
+from avatar.demo.identity import sample_identity
+from avatar.demo.performance import frame_camera, frame_params, perform
+from avatar.head.model import HeadModel
 from data_prep.live.frame_fit import LOST_AFTER, FrameFit, _Fitted, _follows, _is_quick
 from data_prep.track.faces.detect import Face
-from data_prep.track.faces.landmarks import Landmarks
+from data_prep.track.faces.landmarks import BLENDSHAPES, Landmarks
 from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 from data_prep.track.fit.levenberg_marquardt import concatenated
@@ -91,6 +94,28 @@ def test_frames_hold_on_to_those_before(followed: Followed) -> None:
         return float(motion.expression.diff(n=2, dim=0).square().mean())
 
     assert unrest(together) < 0.5 * unrest(alone)
+
+
+def test_the_mouth_goes_to_the_side_that_the_calibration_has_not_seen(followed: Followed) -> None:
+    """Its one coefficient is 1 to the left and -1 to the right."""
+    scene, places = followed.scene, [BLENDSHAPES.index(name) for name in ("mouthLeft", "mouthRight")]
+    scores = scene.landmarks.scores.copy()
+    scores[:, places] = 0.02, 0.005
+    calm = part(replace(scene.landmarks, scores=scores), slice(0, CALIBRATED))
+    calibration = fit_landmarks(scene.assets, scene.names, scene.embedding, calm, scene.camera)
+    performance = perform(SEED, 40, "speech")
+    head = HeadModel(scene.assets, torch.from_numpy(sample_identity(SEED).shape))
+    params, camera = (frame_params(performance, 3), frame_camera(performance, 3, SIZE))
+    coefficient = scene.names.index("mouth_left")
+    params.expression[coefficient] = -0.9
+    seen = camera.project(head.vertices(params)).numpy()[scene.embedding.corners, :2]
+    points, own = scene.landmarks.points[3].copy(), scores[3].copy()
+    points[scene.embedding.landmarks, :2] = (seen * scene.embedding.barycentric[..., None]).sum(1)
+    own[places] = 0.0, 0.9
+    fit = replace(followed, calibration=calibration).fitter()
+    motion = [fit.next(Face(points, own), n / FPS) for n in range(6)][-1]
+    assert motion is not None
+    assert float(motion.expression[0, calibration.expressions == coefficient]) == pytest.approx(-0.9, abs=0.15)
 
 
 def test_the_longer_between_frames_the_looser(followed: Followed) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rig_recording import FILMED, write_plain_gha, write_plain_raw
@@ -202,6 +202,12 @@ def twin(folder: Path, serial: str) -> None:
             lambda folder: (folder / "images" / "0002" / f"image_{SERIALS[0]}.jpg").write_bytes(b"no picture"),
             "is neither a JPEG nor a PNG",
         ),
+        (
+            lambda folder: cv2.imwrite(
+                str(folder / "images" / "0000" / f"mask_{SERIALS[0]}.jpg"), np.zeros((32, 48), np.uint8)
+            ),
+            f"0000/mask_{SERIALS[0]}.jpg is 48x32 pixels but image_{SERIALS[0]}.jpg is 64x64; make the masks",
+        ),
     ],
 )
 def test_folders_of_gaussian_head_avatar_that_are_refused(
@@ -250,49 +256,3 @@ def test_one_camera_is_refused_at_once(raw: Path, tmp_path: Path, demo_head_mode
         (folder / "images" / f"cam_{serial}.mp4").unlink()
     with pytest.raises(UserError, match="has pictures of one calibrated camera; two at least .*: copy the others"):
         track_rig.track_rig([folder], tmp_path / "out", demo_head_model, load_head_assets(demo_head_model))
-
-
-def sequences(raw: Path, tmp_path: Path) -> tuple[Path, Path]:
-    """EXP-1 and FREE of one person, FREE without the last camera."""
-    first = changed(raw, tmp_path, lambda _: None)
-    shutil.copytree(first, free := first.parent / "FREE")
-    (free / "images" / f"cam_{SERIALS[2]}.mp4").unlink()
-    return first, free
-
-
-def test_sequences_are_joined_by_the_cameras_that_filmed_all(raw: Path, tmp_path: Path) -> None:
-    """One picture of the grid stays empty between them, in every camera alike."""
-    joined = track_rig._open(sequences(raw, tmp_path))
-    assert list(joined.cameras) == SERIALS[:2] and joined.unused == (SERIALS[2],)
-    assert joined.sequences == (("EXP-1", 0.0), ("FREE", pytest.approx(5 / 25)))
-    footage = joined.cameras[SERIALS[0]].footage
-    shown = [*footage.read(whole(64, 64), Span(), lambda _: None)]
-    assert [round(picture.time * 25) for picture in shown] == [0, 1, 2, 3, 5, 6, 7, 8]
-    assert np.abs(np.array([p.image.mean() for p in shown]) - 2 * FILMED[SERIALS[0]].greys).max() < 3
-    part = [*footage.read(whole(64, 64), Span(3 / 25, 6.5 / 25), lambda _: None)]
-    assert [round(picture.time * 25) for picture in part] == [3, 5, 6]
-
-
-def test_the_sequence_called_free_is_held_out(raw: Path, tmp_path: Path) -> None:
-    joined, said = track_rig._open(sequences(raw, tmp_path)), []
-    assert track_rig._held_out(joined, Times([1, 2, 5, 8], 0.0, 25.0), said.append) == {5, 8}
-    assert said == ["EXP-1: times 1 to 2", "FREE: times 5 to 8, held out"]
-    alone = replace(joined, sequences=(("FREE", 0.0),))
-    assert track_rig._held_out(alone, Times([5, 8], 0.0, 25.0), said.append) == set() and "held" not in said[-1]
-
-
-def test_recordings_that_do_not_belong_together_are_refused(
-    raw: Path, gha: Path, tmp_path: Path, demo_head_model: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    first, free = sequences(raw, tmp_path)
-    given = ["--out", str(tmp_path / "out"), "--head", str(demo_head_model)]
-    for folders, more, said in (
-        ((first, first), (), "different sequences beside each other"),
-        ((first, raw), (), "different sequences beside each other"),
-        ((first, gha), (), "only sequences of NeRSemble are tracked together"),
-        ((gha, first), (), "only sequences of NeRSemble are tracked together"),
-        ((first, free), ("--end", "1"), "--start and --end are of one sequence"),
-        ((first, free), ("--focal", "900"), "leave out --focal"),
-    ):
-        assert main(["track", *map(str, folders), *given, *more]) != 0 and said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
