@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from avatar.commands.arguments import parse
 from avatar.commands.held_out_figures import discard, evaluate_or_read, figures_line
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.commands.train import MAX_ROUNDS, check_rounds, config_overrides, train_as_asked
 from avatar.compute.device import free_bytes
 from avatar.compute.memory import available_bytes, check_memory, in_words
@@ -63,8 +63,7 @@ class OutputPaths(NamedTuple):
 def run_create(arguments: Namespace) -> int:
     begin, video = time.monotonic(), arguments.video
     out: Path = arguments.out or default_folder(video)
-    check_folder_output(out)
-    check_outputs([out], [video, arguments.head])
+    check_folder_output(out, [video, arguments.head])
     refuse_what_is_missing(arguments)
     paths = OutputPaths(out / SUBJECT_FOLDER, out / RUN_FOLDER, out / "avatar.html")
     if paths.run.exists() and not paths.subject.exists():

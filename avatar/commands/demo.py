@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands.held_out_figures import evaluate_or_read, figures_line
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
@@ -39,8 +39,7 @@ def run_demo(arguments: Namespace) -> int:
     """The whole program; what an interrupted one has done is not done again."""
     out: Path = arguments.out
     actor, driver, run = out / ACTOR.name, out / DRIVER.name, out / RUN_FOLDER
-    check_folder_output(out)
-    check_outputs([out, run], [])
+    check_folder_output(out, [])
     if is_begun(run) and read_run_info(run).source.folder.resolve() != actor.resolve():
         raise UserError(f"{run} is a run of another video; choose another folder for the demo")
     missing = [person for person in (ACTOR, DRIVER) if not (out / person.name).is_dir()]
