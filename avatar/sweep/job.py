@@ -18,7 +18,7 @@ from pathlib import Path
 
 from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.sweep.output import BoundedLog, end_of, old_of
+from avatar.sweep.output import BoundedLog, end_of, last_line, old_of
 from avatar.sweep.spec import Job
 from avatar.sweep.state import HEARTBEAT_SECONDS, State, read_job, read_state, worker_name, write_heartbeat, write_state
 
@@ -85,13 +85,7 @@ def logged(command: Command, words: list[str], log: Path) -> tuple[int, str]:
             except Exception:
                 traceback.print_exc()
                 status = -1
-    return status, last_line(log)
-
-
-def last_line(log: Path) -> str:
-    newest = end_of(old_of(log)) + end_of(log)
-    lines = newest.decode(errors="replace").replace("\r", "\n").strip().splitlines()
-    return lines[-1].removeprefix("avatar: ") if lines else ""
+    return status, last_line(end_of(old_of(log)) + end_of(log))
 
 
 def computed() -> int:
