@@ -124,9 +124,9 @@ def training_arguments(arguments: Namespace, paths: OutputPaths) -> Namespace:
     words = [f"--{name}={value}" for name, value in given.items() if value is not None]
     training = parse(["train", str(paths.subject.resolve()), *words])
     training.folder, training.out, training.resume = paths.subject, paths.run, begun or has_rounds
-    load_config(overrides := config_overrides(training))
+    load_config(config_overrides(training))
     if training.refine is not None and not training.resume:
-        check_rounds(paths.run, training.refine, None, overrides)
+        check_rounds(paths.run, training.refine, None)
     return training
 
 
