@@ -15,15 +15,8 @@ from torch import Tensor
 
 from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
-from avatar.motion.controls import (
-    JOINT_FIELD,
-    ExpressionControl,
-    expression_controls,
-    joint_ranges,
-    joint_values,
-    posed,
-)
-from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
+from avatar.motion.controls import JOINT_FIELD, joint_ranges, joint_values, posed
+from avatar.motion.orbit import orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import checked_drawings
 from avatar.tensors import to_8_bit
@@ -65,15 +58,9 @@ class ViewRenderer:
     ) -> None:
         """`truth(index, width)` is the picture of a frame of the avatar's own video."""
         self.trained, self.truth = trained, truth
-        recording = trained.recording
-        train = list(recording.split.train)
-        rest = trained.rest_params()
-        self.controls: list[ExpressionControl] = expression_controls(
-            recording.tracks["expression"][recording.times(train)], rest.expression, trained.avatar.head
-        )
-        self.joints = joint_ranges(recording.motion(train))
-        cameras = [recording.camera(i) for i in train]
-        self.limits: OrbitLimits = orbit_limits(trained.rest_camera(), cameras)
+        self.controls = trained.expression_controls()
+        self.joints = joint_ranges(trained.recording.motion(trained.recording.split.train))
+        self.limits = trained.orbit_limits(trained.rest_camera())
 
     def of(self, newer: TrainedAvatar) -> ViewRenderer:
         """The same for the avatar after more training on the same video, which is moved to where this one computes."""
