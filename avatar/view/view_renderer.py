@@ -24,7 +24,6 @@ from avatar.types import Camera, HeadParams, Rendering
 
 Overlay = Literal["none", "mesh", "error"]
 OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "error")
-ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 MARGIN = 10.0  # degrees by which the camera may leave what the training video shows
 ZOOM = (0.5, 4.0)
 LINES = (30, 200, 120)  # RGB of the mesh
@@ -127,7 +126,7 @@ class ViewRenderer:
             if setting.overlay == "error":  # of the recorded view, whatever the camera
                 with checked_drawings():
                     drawn = self.rendered(frame[0], own).image.cpu()
-                beside.append(to_8_bit(error_map(drawn, truth, ERROR_SCALE)).numpy())
+                beside.append(to_8_bit(error_map(drawn, truth)).numpy())
         return np.concatenate(beside, axis=1)
 
     @torch.no_grad()
