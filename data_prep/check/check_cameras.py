@@ -25,6 +25,7 @@ from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import MIN_FRAMES, detect_offset
 from data_prep.prepare.inspect_images import inspect_images
 from data_prep.prepare.mask_values import with_labels
+from data_prep.prepare.pairing import grouped
 from data_prep.prepare.prepare import check_sizes
 
 LEAVE_OUT = "leave it out with --cameras"
@@ -106,11 +107,8 @@ def _by_camera(
     source: TrackedFolder, reasons: Mapping[int, str], severity: Severity, check: str, what: str
 ) -> Iterator[Finding]:
     """A finding for each camera of which something cannot be used, with the first of the reasons."""
-    of_camera: dict[str, list[int]] = {}
-    for number in reasons:
-        of_camera.setdefault(source.shots[number].camera, []).append(number)
     names = source.files.frame_names()
-    for camera, numbers in of_camera.items():
+    for camera, numbers in grouped({number: source.shots[number].camera for number in reasons}).items():
         yield Finding(
             severity,
             check,
