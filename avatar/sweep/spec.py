@@ -99,7 +99,9 @@ def read_spec(path: Path) -> Spec:
 
     Raises UserError naming the key that is unknown, missing or wrong, and for overrides that `avatar train` would refuse.
     """
-    raw = _read_yaml(path)
+    raw = read_yaml(path, MAX_BYTES)
+    if not isinstance(raw, dict):
+        raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
     if unknown := sorted(map(str, raw.keys() - KEYS)):
         raise UserError(f"{path}: there is no key '{unknown[0]}'; a sweep has {', '.join(sorted(KEYS))}")
     subjects = [_subject(path, entry, raw.get("head")) for entry in _list(path, raw, "subjects")]
@@ -138,13 +140,6 @@ def read_spec(path: Path) -> Spec:
         gpus=_number(path, raw, "gpus", 0, 0, 64) if "gpus" in raw else None,
     )
     return Spec(tuple(jobs), resources, int(_number(path, raw, "retries", 2, 0, 100)))
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    raw = read_yaml(path, MAX_BYTES)
-    if not isinstance(raw, dict):
-        raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
-    return raw
 
 
 def _protocols(path: Path, words: list[str]) -> tuple[str, ...]:
