@@ -58,12 +58,9 @@ class Job:
     overrides: tuple[str, ...]
     protocols: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        return {**self.__dict__, "overrides": list(self.overrides), "protocols": list(self.protocols)}
-
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Job:
-        """What `to_dict` gave. Raises KeyError, TypeError or ValueError for anything else: each value becomes a word of a
+        """What `asdict` gave. Raises KeyError, TypeError or ValueError for anything else: each value becomes a word of a
         command, and no word may be read as an option."""
         job = cls(**{**raw, "overrides": tuple(raw["overrides"]), "protocols": tuple(raw["protocols"])})
         source, texts = job.source, (job.name, job.subject, job.variant)

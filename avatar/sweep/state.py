@@ -56,7 +56,7 @@ def write_sweep(folder: Path, spec: Spec) -> None:
             )
         if job.name not in known:
             write_atomically(
-                folder / "jobs" / job.name / "job.json", json.dumps(job.to_dict(), indent=1, allow_nan=False).encode()
+                folder / "jobs" / job.name / "job.json", json.dumps(asdict(job), indent=1, allow_nan=False).encode()
             )
     names = list(dict.fromkeys([*known, *(job.name for job in spec.jobs)]))
     content = {
