@@ -11,8 +11,6 @@ SWEEP/jobs/NAME/run/           the run
 from __future__ import annotations
 
 import json
-import os
-import platform
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -132,10 +130,6 @@ def heartbeat_age(folder: Path) -> float:
         return time.time() - (folder / "heartbeat").stat().st_mtime
     except FileNotFoundError:
         return float("inf")
-
-
-def worker_name() -> str:
-    return f"{platform.node()}:{os.getpid()}"
 
 
 def _read_json(path: Path, absent: str) -> Mapping[str, Any]:
