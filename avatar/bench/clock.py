@@ -19,6 +19,9 @@ class Time:
     p95: float  # the 95th percentile
     repeats: int
 
+    def __str__(self) -> str:
+        return f"{self.median:.2f} ({self.p95:.2f})"
+
 
 def paired_medians(
     functions: Mapping[Name, Callable[[], object]], repeats: int, *, warm_up: int = 1

@@ -26,12 +26,10 @@ def table(rows: Sequence[Row]) -> list[str]:
         f"{'ns each':>9} {'error':>8} {'gradients':>9}"
     ]
     for row in rows:
-        forward = f"{row.forward.median:.2f} ({row.forward.p95:.2f})"
-        backward = f"{row.backward.median:.2f} ({row.backward.p95:.2f})"
         floor = "" if row.floor is None else f"{row.floor:.2f}"
         lines.append(
-            f"{row.latent_size:3} {row.way:>16} {row.gaussians:9,} {forward:>17} {backward:>17} {total(row):8.2f} "
-            f"{floor:>6} {each(row):9,.0f} {row.offsets_error:8.1e} {row.gradient_error:9.1e}"
+            f"{row.latent_size:3} {row.way:>16} {row.gaussians:9,} {row.forward!s:>17} {row.backward!s:>17} "
+            f"{total(row):8.2f} {floor:>6} {each(row):9,.0f} {row.offsets_error:8.1e} {row.gradient_error:9.1e}"
         )
     return lines
 

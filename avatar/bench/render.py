@@ -170,11 +170,11 @@ def table(rows: Sequence[Row], avatar: dict[str, Any]) -> list[str]:
     threads = torch.get_num_threads()
     grid = f", latents on {avatar['latent_grid']}x{avatar['latent_grid']} cells" if avatar["latent_grid"] else ""
     lines: dict[str, list[str]] = {"image width": [f"{row.size} px" for row in rows]}
-    lines |= {f"{step}, 1 thread": [show(row.steps[step]) for row in rows] for step in rows[0].steps}
+    lines |= {f"{step}, 1 thread": [str(row.steps[step]) for row in rows] for step in rows[0].steps}
     lines |= {
-        "whole frame, 1 thread": [show(row.frame) for row in rows],
-        f"whole frame, {threads} threads": [show(row.latency) for row in rows],
-        "   the same unfolded": [show(row.latency_of_avatar) for row in rows],
+        "whole frame, 1 thread": [str(row.frame) for row in rows],
+        f"whole frame, {threads} threads": [str(row.latency) for row in rows],
+        "   the same unfolded": [str(row.latency_of_avatar) for row in rows],
         f"stream, {threads} frames at a time": [f"{row.stream_fps:.0f} fps" for row in rows],
         "image error, mean": [f"{row.error.image_mean:.1e}" for row in rows],
         "image error, largest": [f"{row.error.image_max:.1e}" for row in rows],
@@ -185,7 +185,3 @@ def table(rows: Sequence[Row], avatar: dict[str, Any]) -> list[str]:
         "Milliseconds, median (95th percentile). Unfolded: the avatar itself, without autograd; errors are against it.",
         *(f"{name:>30} " + " ".join(f"{cell:>16}" for cell in cells) for name, cells in lines.items()),
     ]
-
-
-def show(span: Time) -> str:
-    return f"{span.median:.2f} ({span.p95:.2f})"

@@ -12,6 +12,8 @@ from functools import cache
 
 import torch
 
+from avatar.bench.machine import limited_to
+
 MATRIX = 1024  # side of the multiplied matrices
 COPIED = 1 << 26  # bytes, far beyond the caches
 ROUNDS = 25
@@ -38,14 +40,10 @@ def roofline_ms(operations: float, moved: float, threads: int) -> float:
 
 
 def _seconds(function: Callable[[], object], threads: int) -> float:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        spans = []
+    spans = []
+    with limited_to(threads=threads):
         for _ in range(ROUNDS):
             begin = time.perf_counter()
             function()
             spans.append(time.perf_counter() - begin)
-        return min(spans)  # what else runs can only make a round slower
-    finally:
-        torch.set_num_threads(before)
+    return min(spans)  # what else runs can only make a round slower

@@ -49,8 +49,6 @@ def table(rows: Iterable[Row]) -> list[str]:
     ]
     for row in rows:
         variant, accuracy, timing = row.variant, row.accuracy, row.timing
-        forward = f"{timing.forward.median:.2f} ({timing.forward.p95:.2f})"
-        backward = f"{timing.backward.median:.2f} ({timing.backward.p95:.2f})"
         backend = f"{variant.backend} {variant.simd}".strip()
         errors = (
             f"{accuracy.image:11.1e} {accuracy.rms:9.1e} {accuracy.gradient:14.1e}"
@@ -59,7 +57,7 @@ def table(rows: Iterable[Row]) -> list[str]:
         )
         lines.append(
             f"{backend:>12} {variant.changed or 'usual':>11} {variant.count:7,} {variant.size:5} {variant.threads:7} "
-            f"{forward:>17} {backward:>17} {row.total:8.2f} {errors}"
+            f"{timing.forward!s:>17} {timing.backward!s:>17} {row.total:8.2f} {errors}"
         )
     return lines
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from avatar.bench import PARTS, Request
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.compute.device import CPU
 from avatar.config_values import check_device
 from avatar.errors import UserError, check_installed
@@ -21,8 +21,7 @@ def run_bench(arguments: Namespace) -> int:
     check_installed("a benchmark's plot", "plots", "matplotlib")
     out: Path = arguments.out
     device = bench_device(arguments.part, arguments.device)
-    check_folder_output(out)
-    check_outputs([out], [*arguments.inputs, arguments.head, arguments.tracking])
+    check_folder_output(out, [*arguments.inputs, arguments.head, arguments.tracking])
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -8,7 +8,7 @@ from argparse import Namespace
 
 from tqdm import tqdm
 
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.errors import check_installed
 from avatar.head.assets import load_head_assets
 from avatar.pipeline.open_inputs import source_options
@@ -19,8 +19,7 @@ from data_prep.prepare.open_subject import find_head
 def run_check(arguments: Namespace) -> int:
     """Exit status 0: fine, 1: warnings, 2: errors."""
     if arguments.out is not None:
-        check_folder_output(arguments.out)
-        check_outputs([arguments.out], [arguments.folder, arguments.head, arguments.tracking])
+        check_folder_output(arguments.out, [arguments.folder, arguments.head, arguments.tracking])
         check_installed("the page of --out", "plots", "matplotlib")
         from data_prep.check.page import check_page_output, write_page
 

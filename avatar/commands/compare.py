@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.evaluation.compare import compare_runs
 from avatar.evaluation.compare_tables import FORMATS, write_tables
 from avatar.pipeline import OK
@@ -13,8 +13,7 @@ from avatar.pipeline import OK
 
 def run_compare(arguments: Namespace) -> int:
     if arguments.out is not None:
-        check_folder_output(arguments.out)
-        check_outputs([arguments.out], [])
+        check_folder_output(arguments.out, [])
     comparison = compare_runs(arguments.runs, arguments.protocol)
     if arguments.out is not None:
         write_tables(arguments.out, comparison)

@@ -11,11 +11,10 @@ import time
 import webbrowser
 from argparse import Namespace
 from pathlib import Path
-from typing import NamedTuple
 
 from avatar.commands.arguments import parse
 from avatar.commands.held_out_figures import discard, evaluate_or_read, figures_line
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.commands.train import MAX_ROUNDS, check_rounds, config_overrides, train_as_asked
 from avatar.compute.device import free_bytes
 from avatar.compute.memory import available_bytes, check_memory, in_words
@@ -54,44 +53,37 @@ def default_folder(video: Path) -> Path:
     return Path(f"{video.resolve().name}-avatar" if video.is_dir() else video.stem)
 
 
-class OutputPaths(NamedTuple):
-    subject: Path
-    run: Path
-    page: Path
-
-
 def run_create(arguments: Namespace) -> int:
     begin, video = time.monotonic(), arguments.video
     out: Path = arguments.out or default_folder(video)
-    check_folder_output(out)
-    check_outputs([out], [video, arguments.head])
+    check_folder_output(out, [video, arguments.head])
     refuse_what_is_missing(arguments)
-    paths = OutputPaths(out / SUBJECT_FOLDER, out / RUN_FOLDER, out / "avatar.html")
-    if paths.run.exists() and not paths.subject.exists():
-        raise UserError(f"{paths.subject}, on which {paths.run} began, is gone: choose another --out, or remove {out}")
-    training, head = training_arguments(arguments, paths), head_for_video(video, arguments.head)
+    subject, run, page = out / SUBJECT_FOLDER, out / RUN_FOLDER, out / "avatar.html"
+    if run.exists() and not subject.exists():
+        raise UserError(f"{subject}, on which {run} began, is gone: choose another --out, or remove {out}")
+    training, head = training_arguments(arguments, subject, run), head_for_video(video, arguments.head)
     training.head, assets = head, load_head_assets(head)
     say_plan(open_footage(video), assets, training)
     print(f"Folder       {out}")
     say_stage(1, "the face is tracked")
-    info = track(video, paths.subject, head, assets, progress=progress_bar)
+    info = track(video, subject, head, assets, progress=progress_bar)
     say_stage(2, "is the tracking good enough?")
-    judge_tracking(info, paths.subject, arguments.anyway)
+    judge_tracking(info, subject, arguments.anyway)
     say_stage(3, "the avatar is trained")
-    if (status := train_as_asked(paths.run, training)) != OK:
+    if (status := train_as_asked(run, training)) != OK:
         print("Start the same command again to go on.")
         return status
     say_stage(4, "the avatar is measured, and its page written")
-    results = evaluate_or_read(paths.run)
-    write_page(open_trained(paths.run), paths.page)
+    results = evaluate_or_read(run)
+    write_page(open_trained(run), page)
     print(f"Held-out frames: {figures_line(results)}")
-    print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {paths.page}, the avatar in a browser.")
-    print(f"  {paths.subject / 'overlay'}   the tracked mesh on the video")
+    print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {page}, the avatar in a browser.")
+    print(f"  {subject / 'overlay'}   the tracked mesh on the video")
     print(f"  {results.parent / 'truth_render_error.mp4'}   held-out frames: truth, render, error")
-    print(f"Next         avatar view {typed(paths.run)}")
-    print(f"             avatar reenact {typed(paths.run)} ANOTHER.mp4")
+    print(f"Next         avatar view {typed(run)}")
+    print(f"             avatar reenact {typed(run)} ANOTHER.mp4")
     if arguments.open:
-        show(paths.page)
+        show(page)
     return OK
 
 
@@ -109,13 +101,13 @@ def refuse_what_is_missing(arguments: Namespace) -> None:
         raise UserError("\n  ".join(["this is missing, or of no use, and nothing was begun:", *missing]))
 
 
-def training_arguments(arguments: Namespace, paths: OutputPaths) -> Namespace:
+def training_arguments(arguments: Namespace, subject: Path, run: Path) -> Namespace:
     """Those of `avatar train` with the same choices; a run that has begun is resumed.
 
     Raises UserError for choices that no training takes.
     """
     given = {name: getattr(arguments, name) for name in ("size", "iterations", "device", "refine")}
-    begun, has_rounds = is_begun(paths.run), plan_file(paths.run).exists()
+    begun, has_rounds = is_begun(run), plan_file(run).exists()
     if given["refine"] is not None and not 0 <= given["refine"] <= MAX_ROUNDS:
         raise UserError(f"--refine must be from 0 to {MAX_ROUNDS}, not {given['refine']}")
     if given["refine"] is None and not begun and not has_rounds:
@@ -123,11 +115,11 @@ def training_arguments(arguments: Namespace, paths: OutputPaths) -> Namespace:
     if given["refine"] == 0 and not has_rounds:
         given["refine"] = None
     words = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    training = parse(["train", str(paths.subject.resolve()), *words])
-    training.folder, training.out, training.resume = paths.subject, paths.run, begun or has_rounds
-    load_config(overrides := config_overrides(training))
+    training = parse(["train", str(subject.resolve()), *words])
+    training.folder, training.out, training.resume = subject, run, begun or has_rounds
+    load_config(config_overrides(training))
     if training.refine is not None and not training.resume:
-        check_rounds(paths.run, training.refine, None, overrides)
+        check_rounds(run, training.refine, None)
     return training
 
 

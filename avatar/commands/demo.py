@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from avatar.commands.held_out_figures import evaluate_or_read, figures_line
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.data.source import Source
 from avatar.demo import make_head_model, make_subject, make_video
 from avatar.errors import UserError
@@ -15,7 +15,7 @@ from avatar.export.web_page import write_page
 from avatar.files.names import RUN_FOLDER, typed
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
-from avatar.pipeline.cached_tracking import can_track, progress_bar
+from avatar.pipeline.cached_tracking import progress_bar, tracking_lacks
 from avatar.pipeline.open_inputs import open_driver
 from avatar.pipeline.reenact import reenact
 from avatar.pipeline.train_refined import continue_or_begin, is_begun
@@ -39,12 +39,14 @@ def run_demo(arguments: Namespace) -> int:
     """The whole program; what an interrupted one has done is not done again."""
     out: Path = arguments.out
     actor, driver, run = out / ACTOR.name, out / DRIVER.name, out / RUN_FOLDER
-    check_folder_output(out)
-    check_outputs([out, run], [])
+    check_folder_output(out, [])
     if is_begun(run) and read_run_info(run).source.folder.resolve() != actor.resolve():
         raise UserError(f"{run} is a run of another video; choose another folder for the demo")
     missing = [person for person in (ACTOR, DRIVER) if not (out / person.name).is_dir()]
-    make = film_and_track if missing and can_track(print_missing) else make_tracked
+    lacking = tracking_lacks() if missing else []
+    if lacking:
+        print(f"The two people are made with their tracking, not filmed and tracked: {'; '.join(lacking)}")
+    make = make_tracked if lacking else film_and_track
     for person in missing:
         make(person, out)
     status = continue_or_begin(Source(actor, find_subject_head(actor)), RECIPE, run)
@@ -85,7 +87,3 @@ def find_subject_head(folder: Path) -> Path:
     """The head model in a subject's folder, where it has one, or the one of all that were filmed."""
     own = folder / "head_model"
     return own if own.is_dir() else folder.with_name("head_model")
-
-
-def print_missing(missing: str) -> None:
-    print(f"The two people are made with their tracking, not filmed and tracked: {missing}")

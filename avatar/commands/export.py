@@ -27,7 +27,7 @@ from avatar.pipeline.backdrop import TRANSPARENT, parse_backdrop
 from avatar.pipeline.open_inputs import DRIVE_SUFFIXES, open_drive_file
 from avatar.runs.avatar_file import read_avatar_file, write_avatar_file
 from avatar.runs.model_registry import refuse_features
-from avatar.runs.motion_clip import OWN, Clip, Own, driven_clip, own_clip
+from avatar.runs.motion_clip import OWN, Clip, driven_clip, own_clip
 from avatar.runs.run import open_trained
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera, HeadParams
@@ -111,11 +111,11 @@ def write_splats(trained: TrainedAvatar, out: Path, arguments: Namespace) -> Non
     def encode(params: HeadParams, camera: Camera) -> bytes:
         return encode_ply(trained.gaussians(params, camera), licence, arguments.up or "-y")
 
-    clip = chosen_clip(trained, arguments)
-    if clip is None:
+    if not arguments.motion:
         write_atomically(out, encode(*chosen_pose(trained, arguments)))
         print(f"Splats   {out} ({out.stat().st_size / MIB:.1f} MiB)")
     else:
+        clip = chosen_clip(trained, arguments, arguments.motion)
         for number, (params, camera) in enumerate(tqdm(clip.frames, desc="splats", unit="frame", dynamic_ncols=True)):
             write_atomically(numbered(out, number), encode(params, camera))
         remove_longer(out, len(clip), print)
@@ -133,8 +133,7 @@ def write_mesh(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
 
 
 def write_clip(trained: TrainedAvatar, out: Path, arguments: Namespace) -> None:
-    clip = chosen_clip(trained, arguments, "test")
-    assert clip is not None
+    clip = chosen_clip(trained, arguments, arguments.motion or "test")
     path = arguments.camera or "recorded"
     backdrop = None if arguments.background is None else parse_backdrop(arguments.background)
     write_movie(trained, clip, out, path, arguments.size, backdrop)
@@ -151,11 +150,8 @@ def chosen_pose(trained: TrainedAvatar, arguments: Namespace) -> tuple[HeadParam
     return trained.recording.params(arguments.frame), trained.recording.camera(arguments.frame)
 
 
-def chosen_clip(trained: TrainedAvatar, arguments: Namespace, otherwise: Own | None = None) -> Clip | None:
+def chosen_clip(trained: TrainedAvatar, arguments: Namespace, motion: str) -> Clip:
     """What --motion names: frames of the avatar's own video, or a drive file."""
-    motion: str | None = arguments.motion or otherwise
-    if motion is None:
-        return None
     if arguments.frame is not None:
         raise UserError("--frame is one frame and --motion are many: give one of the two")
     if (size := arguments.size) is not None and not 16 <= size <= MAX_SIZE:

@@ -24,17 +24,17 @@ def check_file(output: Path, suffixes: Sequence[str], what: str) -> None:
         raise UserError(f"{output} is a folder; name a file with --out")
 
 
-def check_folder_output(output: Path) -> None:
-    """Raise UserError where a folder is to be written and a file has its name."""
+def check_folder_output(output: Path, inputs: Iterable[Path | None]) -> None:
+    """Raise UserError where a folder is to be written and a file has its name, and as `check_outputs`."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output} is a file; name a folder with --out")
+    check_outputs([output], inputs)
 
 
 def check_run_folder(run: Path, inputs: Iterable[Path | None]) -> None:
     """Raise UserError when a new run would be, or would write over, what it is trained on."""
     read = [path for path in inputs if path is not None]
-    check_folder_output(run)
-    check_outputs([run], read)
+    check_folder_output(run, read)
     for path in read:
         inside = path.resolve().relative_to(run.resolve()).parts if _lies_in(path, run) else ("",)
         if inside[0] in (*RUN_FOLDERS, *RUN_FILES):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import OK
@@ -15,8 +15,7 @@ from data_prep.prepare.prepare import prepare
 def run_prepare(arguments: Namespace) -> int:
     source = source_of(arguments)
     if arguments.out is not None:
-        check_folder_output(arguments.out)
-        check_outputs([arguments.out], [source.folder, source.head, source.tracking])
+        check_folder_output(arguments.out, [source.folder, source.head, source.tracking])
     prepared = prepare(source, load_head_assets(source.head), out=arguments.out)
     subject = Subject.open(prepared)
     print(

@@ -67,10 +67,9 @@ def sweep_folder(spec: Path | None, out: Path | None) -> Path:
 
 def check_sweep_folder(folder: Path, file: Path, spec: Spec) -> None:
     """Raise UserError where a sweep would write over its file, or into what its jobs train on."""
-    check_folder_output(folder)
     keys = ("folder", "head", "tracking")
     inputs = {Path(job.source[key]) for job in spec.jobs for key in keys if key in job.source}
-    check_outputs([folder], sorted(inputs))
+    check_folder_output(folder, sorted(inputs))
     check_outputs([folder / SWEEP_FILE], [file])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from avatar.commands.outputs import check_folder_output, check_outputs
+from avatar.commands.outputs import check_folder_output
 from avatar.errors import UserError
 from avatar.files.names import typed
 from avatar.head.assets import load_head_assets
@@ -18,8 +18,7 @@ from data_prep.track.track import Choices, track
 
 
 def run_track(arguments: Namespace) -> int:
-    check_folder_output(arguments.out)
-    check_outputs([arguments.out], [*arguments.videos, arguments.matte, arguments.head])
+    check_folder_output(arguments.out, [*arguments.videos, arguments.matte, arguments.head])
     video: Path = arguments.videos[0]
     head = head_for_video(video, arguments.head)
     span = Span(arguments.start or 0.0, arguments.end)

@@ -84,7 +84,7 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
     check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
     if arguments.refine is None:
         return train_new(tracked_source(arguments), overrides, run, arguments.device)
-    check_rounds(run, arguments.refine, arguments.minutes, overrides)
+    check_rounds(run, arguments.refine, arguments.minutes)
     return begin_rounds(run, arguments.refine, arguments.minutes, tracked_source(arguments), overrides, begin)
 
 
@@ -104,7 +104,6 @@ def dry_run(arguments: Namespace) -> int:
         raise UserError("--minutes sets the time that --dry-run estimates: leave one of them out")
     if arguments.refine is not None:
         check_plan(arguments.refine, None)
-    check_folder(arguments.folder)
     status = estimate_training(source_of(arguments), overrides, arguments.refine or 0, arguments.device)
     print_config(overrides)
     return status
@@ -127,10 +126,9 @@ def assign_paths(arguments: Namespace) -> None:
     arguments.folder = arguments.folder or next(iter(folders), None)
 
 
-def check_rounds(run: Path, rounds: int, minutes: float | None, overrides: list[str]) -> None:
+def check_rounds(run: Path, rounds: int, minutes: float | None) -> None:
     """Before a video is tracked. Raises UserError for a mistake, and where the folder holds a run, or rounds, already."""
     check_plan(rounds, minutes)
-    load_config(overrides)  # a mistake in it before one in the folder
     refuse_trained(run)
     if plan_file(run).exists():
         raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")

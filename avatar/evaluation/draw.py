@@ -14,11 +14,10 @@ from avatar.data.colours import Colour
 from avatar.data.frame import Frame
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import ImageFormat
-from avatar.files.video import error_map, padded, side_by_side
+from avatar.files.video import ERROR_SCALE, error_map, padded, side_by_side
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
 
-ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 SHEET_COLUMNS = 2
 SHEET_WIDTH = 1600  # pixels at most
 
@@ -44,7 +43,7 @@ def panel(
 ) -> UInt8[np.ndarray, "H_panel W_panel 3"]:
     """Truth, render and error map side by side under captions, of at least `rows` pixels' height."""
     render, truth = (image.cpu() / 255.0 if image.dtype == torch.uint8 else image.cpu() for image in pair)
-    images = (truth, render, error_map(render, truth, ERROR_SCALE))
+    images = (truth, render, error_map(render, truth))
     return side_by_side(images, (*captions, f"error, 0 to {ERROR_SCALE:g}"), rows)
 
 

@@ -31,7 +31,7 @@ from avatar.evaluation.frame_curves import curves
 from avatar.evaluation.held_out import views
 from avatar.evaluation.jitter import JitterMeter
 from avatar.evaluation.measure import FrameMeasurer
-from avatar.evaluation.pictures import clear_pictures, encode_pictures, write_pictures
+from avatar.evaluation.pictures import clear_pictures, write_pictures
 from avatar.evaluation.previous_results import in_order, protocol_of, read_earlier, read_frames, remove_others
 from avatar.evaluation.protocol import HELD_OUT, SHARED_CHOICES, Protocol, choose_protocols
 from avatar.evaluation.regions import OF_EYES, has_eyeballs, region_masks
@@ -201,8 +201,8 @@ def measure(
                         add_to_film(panel(pair, rows=SHARP))
                     if write_frames:
                         regions = {region: masks[region] for region in masks if region in ("head", *protocol.regions)}
-                        pictures = encode_pictures(pair, regions, renders_of(drive, subject))
-                        write_pictures(run.path / "eval" / protocol.name, frame.index, pictures)
+                        folder, renders = run.path / "eval" / protocol.name, renders_of(drive, subject)
+                        write_pictures(folder, frame.index, pair, regions, renders)
     for drive, found in results.items():
         for protocol in protocols:
             add_jitter(found[protocol.name], jitter[drive, protocol.image_format], run)

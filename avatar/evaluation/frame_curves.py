@@ -27,11 +27,9 @@ def curves(
     """
     check_installed("curves.png", "plots", "matplotlib")
     results, *refined = by_drive.values()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # takes half a second
 
     figure = Figure(figsize=(12, 12), layout="constrained")
-    FigureCanvasAgg(figure)
     by_psnr, by_ssim, by_region, by_jitter, by_condition = figure.subplots(5, 1, sharex=True)
     for number, protocol in enumerate(protocols):
         width = 1.0 + 0.6 * (len(protocols) - 1 - number)  # a line that lies on an earlier one leaves its rim

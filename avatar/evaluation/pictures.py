@@ -21,22 +21,19 @@ MASK_FOLDERS: dict[Region, str] = {region: "masks" if region == "head" else f"{r
 FOLDERS = (RENDERS, TRACKED_RENDERS, "gt", *MASK_FOLDERS.values())
 
 
-def encode_pictures(
-    pair: Pair, masks: Mapping[Region, UInt8[Tensor, "H W"]], renders: str = RENDERS
-) -> dict[str, bytes]:
-    """PNG files by the name of their folder, `renders` for the render. A pair of floats is rounded to 8 bits: for looking,
-    not what was measured."""
+def write_pictures(
+    folder: Path, index: int, pair: Pair, masks: Mapping[Region, UInt8[Tensor, "H W"]], renders: str
+) -> None:
+    """folder/{gt,masks,...}/<index>.png, and the render in `renders`; UserError when the disk refuses.
+
+    A pair of floats is rounded to 8 bits: for looking, not what was measured.
+    """
     images = {renders: pair.render, "gt": pair.truth} | {MASK_FOLDERS[region]: mask for region, mask in masks.items()}
-    return {folder: _png(image) for folder, image in images.items()}
-
-
-def write_pictures(folder: Path, index: int, encoded: Mapping[str, bytes]) -> None:
-    """folder/{renders,gt,masks,...}/<index>.png; UserError when the disk refuses."""
-    for name, data in encoded.items():
+    for name, image in images.items():
         path = folder / name / f"{index:05d}.png"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+            path.write_bytes(_png(image))
         except OSError as error:
             raise UserError(f"{path} cannot be written ({error.strerror})") from error
 

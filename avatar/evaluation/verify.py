@@ -35,7 +35,6 @@ TOLERANCE = 2e-6  # frames.csv is rounded to 5e-7; both sides compute in float64
 _LEVELS = 255
 _RADIUS = 5  # of SSIM's window of 11 x 11: a window whose centre is nearer to the border does not count
 
-Row = Mapping[str, str]  # of frames.csv
 Figures = dict[str, float]  # by column of frames.csv
 
 

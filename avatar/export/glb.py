@@ -16,7 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from avatar.export.bake_texture import bake_texture
-from avatar.motion.controls import expression_controls, joint_ranges, joint_values, posed
+from avatar.motion.controls import joint_ranges, joint_values, posed
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
 
@@ -80,19 +80,16 @@ def add_accessor(buffer_items: Any, tree: dict[str, Any], name: str, values: Flo
 
 def offsets(trained: TrainedAvatar, params: HeadParams) -> dict[str, Float[Tensor, "V 3"]]:
     """How the mesh moves when one control or joint goes as far as the training video shows, and the others stay."""
-    train = list(trained.recording.split.train)
     head, found = trained.avatar.head, {}
     start = head.vertices(params)
-    for control in expression_controls(
-        trained.recording.tracks["expression"][trained.recording.times(train)], trained.neutral.expression, head
-    ):
+    for control in trained.expression_controls():
         far, ending = _end(control.low, control.high)
         own_share = float((params.expression - trained.neutral.expression) @ control.direction)
         moved = replace(params, expression=params.expression + (far - own_share) * control.direction)
         found[f"{control.part}: {control.name}{ending}"] = head.vertices(moved) - start
     own = {joint: float(value) for joint, value in joint_values([params]).items()}
     start = head.vertices(posed(params, None, own))
-    for joint, (low, high) in joint_ranges(trained.recording.motion(train)).items():
+    for joint, (low, high) in joint_ranges(trained.recording.motion(trained.recording.split.train)).items():
         far, ending = _end(low, high)
         moved = posed(params, None, {**own, joint: far})
         found[joint.replace("_", " ") + ending] = head.vertices(moved) - start

@@ -11,7 +11,7 @@ from typing import Literal
 from tqdm import tqdm
 
 from avatar.files.video import write_video
-from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
+from avatar.motion.orbit import OrbitLimits, orbited
 from avatar.pipeline.backdrop import Backdrop
 from avatar.runs.motion_clip import Clip
 from avatar.runs.trained_avatar import TrainedAvatar
@@ -22,15 +22,9 @@ CameraPath = Literal["recorded", "still", "swing", "orbit"]
 PERIOD = 6.0  # seconds of one round
 
 
-def limits_of(trained: TrainedAvatar) -> OrbitLimits:
-    """How far the camera may turn from its place at rest."""
-    recording = trained.recording
-    return orbit_limits(trained.rest_camera(), [recording.camera(i) for i in recording.split.train])
-
-
-def path_camera(rest: Camera, limits: OrbitLimits, path: CameraPath, seconds: float, period: float = PERIOD) -> Camera:
+def path_camera(rest: Camera, limits: OrbitLimits, path: CameraPath, seconds: float) -> Camera:
     """Where the camera of a path is: swing from side to side, orbit around an ellipse; both within `limits`."""
-    phase = 2 * math.pi * seconds / period
+    phase = 2 * math.pi * seconds / PERIOD
     middle_yaw, middle_pitch = ((high + low) / 2 for low, high in limits)
     reach_yaw, reach_pitch = ((high - low) / 2 for low, high in limits)
     if path == "swing":
@@ -48,7 +42,7 @@ def along_path(
     if path == "recorded":
         yield from clip.frames
         return
-    rest, limits = trained.rest_camera(size), limits_of(trained)
+    rest, limits = trained.rest_camera(size), trained.orbit_limits(trained.rest_camera())
     neck = trained.rest_params().neck
     for number, (params, _) in enumerate(clip.frames):
         yield replace(params, neck=neck), path_camera(rest, limits, path, number / clip.fps)

@@ -25,8 +25,7 @@ from avatar.export.face_map import face_map
 from avatar.export.licence import SKINNING, licence_of
 from avatar.export.web_arrays import ARRAYS, WebArrays, reduce_avatar
 from avatar.gaussians.head_rotation import LIMIT
-from avatar.motion.controls import expression_controls, joint_ranges
-from avatar.motion.orbit import orbit_limits
+from avatar.motion.controls import joint_ranges
 from avatar.runs.trained_avatar import TrainedAvatar
 
 FORMAT = "AVW4"
@@ -126,11 +125,8 @@ def motion_arrays(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, np.nd
 def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
     """What the page says, and how far things can be moved there."""
     recording, kept = trained.recording, list(drawing.kept)
-    train = list(recording.split.train)
-    expressions = recording.tracks["expression"][recording.times(train)]
     rest, camera = trained.rest_params(), front_camera(trained)
     names, turning = trained.assets.names.names, trained.avatar.turning
-    controls = expression_controls(expressions, rest.expression, trained.avatar.head)
     return {
         "name": recording.name,
         "licence": licence_of(SKINNING),
@@ -148,11 +144,11 @@ def describe(trained: TrainedAvatar, drawing: WebArrays) -> dict[str, Any]:
                 "values": [round(value, 6) for value in control.direction[kept].tolist()],
                 "range": [control.low, control.high],
             }
-            for control in controls
+            for control in trained.expression_controls()
         ],
         "drive": face_map(trained, kept),
-        "joints": joint_ranges(recording.motion(train)),
-        "orbit": orbit_limits(camera, [recording.camera(i) for i in train])._asdict(),
+        "joints": joint_ranges(recording.motion(recording.split.train)),
+        "orbit": trained.orbit_limits(camera)._asdict(),
         "rest": torch.cat((rest.expression[kept], rest.jaw, rest.eyes, rest.eyelids, rest.neck)).tolist(),
         "camera": {
             "rotation": camera.R_cam_world.flatten().tolist(),

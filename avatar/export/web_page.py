@@ -56,14 +56,12 @@ def write_page(trained: TrainedAvatar, out: Path, precision: Precision = "small"
     data = page.encode()
     write_atomically(out, data)
     nodes = encoded.drawing.sizes["nodes"]
-    note = (
-        ""
-        if nodes <= SLOW_NODES
-        else (
+    note = ""
+    if nodes > SLOW_NODES:
+        note = (
             f"its network is evaluated at {nodes:,} places for every picture, which is slow in a browser; models with a "
             "latent grid are not"
         )
-    )
     return WebPage(out, len(data), len(encoded.data), note)
 
 

@@ -14,13 +14,14 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.atomic import write_atomically
 from avatar.files.data_unpickler import DataUnpickler
 from avatar.files.pickled_data import Budget, Refused, is_unicode, plain
 from avatar.files.read import open_file, read_bytes
@@ -77,6 +78,13 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
             return {info.filename.removesuffix(".npy"): _parse_npy(archive.read(info), path) for info in members}
     except (*_MALFORMED, *_BAD_ZIP, zlib.error, lzma.LZMAError) as error:
         raise UserError(f"{path} is damaged or not a .npz file ({_short(error)})") from error
+
+
+def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a .npz file, whole or not at all. Raises UserError when the disk refuses."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_atomically(path, buffer.getvalue())
 
 
 def load_npy(path: Path) -> np.ndarray:

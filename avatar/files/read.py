@@ -23,7 +23,7 @@ _KINDS: Mapping[int, str] = {
     stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder",
 }
-_NO_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+_NO_WAITING = os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class MissingFile(UserError):

@@ -27,6 +27,7 @@ SHARP = 720  # rows of a picture that is shown large
 CAPTION_SHARE = 0.08  # of the height of the pictures
 MIN_CAPTION = 16  # pixels
 INK, PAPER = (40, 40, 40), 245
+ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 
 
 class Sound(NamedTuple):
@@ -178,11 +179,9 @@ def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[
     return np.pad(panel, ((0, rows), (0, columns), (0, 0)), constant_values=255)
 
 
-def error_map(
-    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], full_scale: float
-) -> Float[Tensor, "H W 3"]:
-    """Mean absolute error of the channels as a heat map: black at 0, light yellow from `full_scale` up."""
-    error = (image - target).abs().mean(dim=-1) / full_scale
+def error_map(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Mean absolute error of the channels as a heat map: black at 0, light yellow from `ERROR_SCALE` up."""
+    error = (image - target).abs().mean(dim=-1) / ERROR_SCALE
     levels = to_8_bit(error).cpu().numpy()
     colours = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     return image.new_tensor(colours) / 255.0

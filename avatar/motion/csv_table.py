@@ -61,6 +61,11 @@ class Table:
             return math.nan
 
 
+def own_name(column: str) -> str:
+    """Plain, without what programs put before it: blendShapes.JawOpen."""
+    return plain(column.rpartition(".")[2])
+
+
 def parse_table(path: Path, data: bytes) -> Table:
     """The table of a file's content. Raises UserError, naming file and line, for what is none.
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.read import read_bytes
-from avatar.head.expression_names import JAW_TARGETS, NAMES_FILE, ExpressionNames, plain
-from avatar.motion.csv_table import Table, parse_table
+from avatar.head.expression_names import JAW_TARGETS, NAMES_FILE, ExpressionNames
+from avatar.motion.csv_table import Table, own_name, parse_table
 from avatar.motion.drive_times import Rate, find_rate, is_time
 
 EYE_COLUMNS = tuple(f"{side}_eye_{axis}" for side in ("left", "right") for axis in "xyz")
@@ -35,7 +35,7 @@ def read_drive_csv(
 ) -> dict[str, np.ndarray]:
     """A CSV's columns as the arrays of an .npz drive file. Raises UserError with the file, the line and the column."""
     table = parse_table(path, read_bytes(path, MAX_BYTES))
-    shapes = [_shape_name(name) for name in table.header]
+    shapes = [own_name(name) for name in table.header]
     is_arkit = "jawopen" in shapes or (shapes[0] == "timecode" and not any(map(_NUMBERED.fullmatch, table.header)))
     read = _from_arkit if is_arkit else _from_columns
     arrays, unread = read(table, num_expressions, names, say)
@@ -92,7 +92,7 @@ def _from_arkit(
     """ARKit's blendshapes: blinks become eyelids, the eyes' directions gaze, the rest coefficients of their names."""
     path, own, unread = table.path, dict[str, str](), []
     for name in table.header:
-        shape = _shape_name(name)
+        shape = own_name(name)
         if is_time(name) or shape in _COUNTERS:
             continue
         if not (_SHAPE.fullmatch(shape) or _POSE.fullmatch(shape) or names.targets(shape)):
@@ -176,11 +176,6 @@ def _gaze(values: Mapping[str, np.ndarray], frames: int) -> np.ndarray:
         to_left = outwards * (look("out", side) - look("in", side))
         columns += [GAZE_RADIANS * down, GAZE_RADIANS * to_left, np.zeros(frames)]
     return np.stack(columns, axis=1)
-
-
-def _shape_name(name: str) -> str:
-    """Plain, without what programs put before it: blendShapes.JawOpen."""
-    return plain(name.rpartition(".")[2])
 
 
 def _some(names: Sequence[str]) -> str:

@@ -7,7 +7,6 @@ Nothing in a drive file can execute code.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,8 +17,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.files.atomic import write_atomically
-from avatar.files.pickles import load_npz
+from avatar.files.pickles import load_npz, save_npz
 from avatar.head.assets import HeadAssets
 from avatar.motion.drive import Drive
 from avatar.motion.drive_csv import DEFAULT_FPS, LARGEST, read_drive_csv
@@ -113,9 +111,7 @@ def write_drive(path: Path, drive: Drive, fingerprint: str) -> None:
         arrays["t"] = torch.stack([camera.t_cam_world for camera in drive.cameras]).numpy()
         arrays["K"] = np.array([[first.fx, 0, first.cx], [0, first.fy, first.cy], [0, 0, 1]])
         arrays["size"] = np.array([first.width, first.height])
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
-    write_atomically(path, content.getvalue())
+    save_npz(path, arrays)
 
 
 def _renamed(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from avatar.errors import UserError
-from avatar.head.expression_names import plain
-from avatar.motion.csv_table import Table
+from avatar.motion.csv_table import Table, own_name
 
 _TIMECODE = re.compile(r"(\d{1,4}):(\d{1,2}):(\d{1,2})[:;](\d{1,3}(?:[.,]\d{1,9})?)")  # hours, minutes, seconds, frames
 _CLOCK = re.compile(r"(?:(\d{1,4}):)?(\d{1,6}):(\d{1,2}[.,]\d{1,9})")  # hours, minutes, seconds with a fraction
@@ -47,7 +46,7 @@ class _Times(NamedTuple):
 
 def is_time(name: str) -> bool:
     """Whether a column of this name holds times."""
-    match = _NAME.fullmatch(_plain(name))
+    match = _NAME.fullmatch(own_name(name))
     return match is not None and (not match["unit"] or _unit(match["unit"]) is not None)
 
 
@@ -81,7 +80,7 @@ def _read(table: Table, name: str) -> _Times:
         wrong = next((i for i, cell in enumerate(cells) if not _TIMECODE.fullmatch(cell)), 0)
         raise table.wrong(wrong, name, "not a time such as 10:00:00:24 (with frames) or 10:00:00.960")
     values = table.column(name, LATEST)
-    match = _NAME.fullmatch(_plain(name))
+    match = _NAME.fullmatch(own_name(name))
     named = _unit(match["unit"] or match["alone"] or "") if match else None
     unit = named or _told_unit(table, name, values)
     bounds = BOUNDS if named else PLAUSIBLE
@@ -167,8 +166,3 @@ def _unwrapped(seconds: list[float]) -> np.ndarray:
 
 def _unit(word: str) -> str | None:
     return next((unit for words, (unit, _) in _WORDS.items() if re.fullmatch(words, word)), None)
-
-
-def _plain(name: str) -> str:
-    """Without what programs put before it: blendShapes.jawOpen."""
-    return plain(name.rpartition(".")[2])

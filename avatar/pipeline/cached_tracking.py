@@ -73,14 +73,6 @@ def tracking_lacks(*others: Callable[[], object]) -> list[str]:
     return missing
 
 
-def can_track(say: Callable[[str], object]) -> bool:
-    """Whether this machine has what tracking a video needs; says what is missing where it has not."""
-    missing = tracking_lacks()
-    if missing:
-        say("; ".join(missing))
-    return not missing
-
-
 def progress_bar(items: Iterable[Item], total: int | None, title: str, unit: str = "frames") -> Iterable[Item]:
     """A progress bar with a rate, which leaves its line."""
     return tqdm(items, total=total, desc=title, unit=f" {unit}")

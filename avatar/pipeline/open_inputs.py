@@ -104,7 +104,6 @@ def check_division(path: Path, split: object, subject: Subject) -> None:
 
 def open_driver(folder: Path, trained: TrainedAvatar, arguments: Namespace | None = None) -> Subject:
     """A tracked folder as driver: with its own head model where it has one, so that another one is noticed."""
-    check_folder(folder)
     own = folder / "head_model"
     options = {} if arguments is None else source_options(arguments, arguments.driver_tracking)
     if not own.is_dir() or (arguments is not None and arguments.head is not None):

@@ -6,7 +6,6 @@ import json
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
@@ -32,13 +31,6 @@ LEAST_STEPS = 500  # fewer make no avatar
 # takes as many: an avatar that is still blurred refines badly, however many passes a few frames get.
 FIRST_PASSES, FIRST_SHARE, FIRST_STEPS = 5, 0.25, 1000
 PLANNED_SHARE = 0.97  # of the minutes: the rest is for opening and closing the run itself, which nothing before shows
-
-
-class RoundTimes(NamedTuple):
-    """What a round took, in seconds, with all that belongs to it."""
-
-    step: float
-    refinement: float
 
 
 @dataclass(frozen=True)
@@ -70,15 +62,15 @@ class Plan:
             raise UserError(f"{path} is damaged: {error}; start a new run") from None
         return plan
 
-    def replanned(self, times: RoundTimes, rounds: int, frames: int) -> Plan:
-        """With as many steps as the rest of the minutes allows, by what a round on so many training frames took, where so
-        many rounds are still to come; never fewer than make an avatar."""
+    def replanned(self, step: float, refinement: float, rounds: int, frames: int) -> Plan:
+        """With as many steps as the rest of the minutes allows, by the seconds that a step and a refinement took in a round
+        on so many training frames, where so many rounds are still to come; never fewer than make an avatar."""
         assert self.minutes is not None
         asked = within_epochs(load_config(self.overrides).trainer, frames).iterations
-        able = affordable_iterations(plannable(self.minutes) - self.spent, times.step, times.refinement, rounds, frames)
+        able = affordable_iterations(plannable(self.minutes) - self.spent, step, refinement, rounds, frames)
         chosen = min(asked, max(able, LEAST_STEPS))
         print(
-            f"Time         {self.spent:.0f} s of {self.minutes:g} minutes are gone, and a step takes {times.step:.3f} s: "
+            f"Time         {self.spent:.0f} s of {self.minutes:g} minutes are gone, and a step takes {step:.3f} s: "
             f"{chosen:,} steps are taken" + (", which is more than there is time for" if chosen > able else "")
         )
         return replace(self, iterations=chosen, round_iterations=round_steps(chosen, frames))

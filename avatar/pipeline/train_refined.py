@@ -17,7 +17,7 @@ from avatar.files.lock import locked
 from avatar.files.names import ROUNDS_FOLDER, RUN_FOLDER, safe_name
 from avatar.pipeline import OK
 from avatar.pipeline.open_inputs import open_run
-from avatar.pipeline.refine_plan import Plan, RoundTimes, steps_in_time
+from avatar.pipeline.refine_plan import Plan, steps_in_time
 from avatar.pipeline.refine_run import refine_run
 from avatar.pipeline.train import resume_run, train_new
 from avatar.runs.checkpoint import list_checkpoints
@@ -72,8 +72,8 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
     refined = time.monotonic()
     plan = replace(plan, spent=refined - begin)
     if status == OK and at_once and plan.minutes is not None:
-        times = RoundTimes((trained - started) / plan.round_iterations, refined - trained)
-        plan = plan.replanned(times, to_come, len(run.subject.split.train))
+        step = (trained - started) / plan.round_iterations
+        plan = plan.replanned(step, refined - trained, to_come, len(run.subject.split.train))
     return status, plan
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from avatar.data.recording import Recording
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
-from avatar.files.video import error_map, padded, side_by_side
+from avatar.files.video import ERROR_SCALE, error_map, padded, side_by_side
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.fitted_pictures import fitted_pictures
 from avatar.pose_refinement.refine_subject import Refined
@@ -24,7 +24,6 @@ from avatar.render import Renderer
 from avatar.splat import checked_drawings
 
 COLUMNS = ("frame", "name", "part", "psnr_before", "psnr_after", "turn_degrees", "shift_mm")
-ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 SHEET_FRAMES = 4  # evenly spread over the held-out ones, besides those that gained most and least
 
 
@@ -95,7 +94,7 @@ def sheet(
                 renderer.render(recording.params(index), recording.camera(index, size)).image.cpu()
                 for recording in (subject.recording, after)
             ]
-        errors = [error_map(render * weight, truth * weight, ERROR_SCALE) for render in renders]
+        errors = [error_map(render * weight, truth * weight) for render in renders]
         captions = (
             f"truth of {frame.name}",
             f"before, {refined.before[row]:.2f} dB{of}",

@@ -30,7 +30,7 @@ CHECKPOINT_FORMAT = 3
 KEPT = 3  # checkpoints of a run, the newest
 _MAX_BYTES = 2**34  # an avatar and the optimizer's two moments of it
 _MODEL = "model."  # begins the names of parameters
-_NAME = re.compile(r"step_(\d{8})\.safetensors")
+_NAME = re.compile(r"step_\d{8}\.safetensors")
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,7 @@ def newest_checkpoint(run: Path) -> Checkpoint:
 
 def newest_step(run: Path) -> int | None:
     """Of the last checkpoint of a run, without reading it; None when there is none."""
-    names = [_NAME.fullmatch(path.name) for path in list_checkpoints(run / "checkpoints")[-1:]]
-    return next((int(name[1]) for name in names if name), None)
+    return max((int(path.stem.removeprefix("step_")) for path in list_checkpoints(run / "checkpoints")), default=None)
 
 
 def module_tensors(module: torch.nn.Module) -> dict[str, Tensor]:

@@ -18,9 +18,9 @@ from avatar.files.environment import named_path
 from avatar.files.third_party import HEAD_VARIABLE
 from avatar.gaussians.base_model import Avatar
 from avatar.head.assets import HeadAssets, load_head_assets
-from avatar.motion.controls import expression_controls, fixed_controls, posed_by_name
+from avatar.motion.controls import ExpressionControl, expression_controls, fixed_controls, posed_by_name
 from avatar.motion.neutral_pose import RestPose
-from avatar.motion.orbit import orbited
+from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_avatar_file
@@ -87,6 +87,17 @@ class TrainedAvatar:
         jaw = self.neutral.jaw[:2].reshape(6)
         return HeadParams(self.neutral.expression, jaw, rest.repeat(2), torch.zeros(2), rest)
 
+    def expression_controls(self) -> list[ExpressionControl]:
+        """What moves the neutral face by hand, as far as the training frames do."""
+        train = self.recording.times(self.recording.split.train)
+        return expression_controls(
+            self.recording.tracks["expression"][train], self.neutral.expression, self.avatar.head
+        )
+
+    def orbit_limits(self, rest: Camera) -> OrbitLimits:
+        """How far the camera may turn from its place at rest."""
+        return orbit_limits(rest, [self.recording.camera(i) for i in self.recording.split.train])
+
     def gaussians(self, params: HeadParams, camera: Camera | None = None) -> Gaussians:
         """The Gaussians of one frame, activated, world space (metres), as `camera` sees the head; by default turned as on
         average in training. To avatars without `model.head_rotation` it is the same. Raises UserError as `render`."""
@@ -115,11 +126,8 @@ class TrainedAvatar:
         model; for values that are no numbers; for a size or zoom of no picture; and as `render`.
         """
         check_pose(zoom, yaw=yaw, pitch=pitch, **values)
-        train = self.recording.times(self.recording.split.train)
-        rest = self.rest_params()
-        expressions = self.recording.tracks["expression"][train]
-        controls = expression_controls(expressions, rest.expression, self.avatar.head)
-        params = posed_by_name(values, controls, rest, fixed_controls(self.assets.fixed_joints))
+        fixed = fixed_controls(self.assets.fixed_joints)
+        params = posed_by_name(values, self.expression_controls(), self.rest_params(), fixed)
         return self.render(params, orbited(self.rest_camera(size), yaw, pitch, zoom))
 
     def _repr_png_(self) -> bytes:

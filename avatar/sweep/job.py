@@ -8,6 +8,7 @@ one goes on.
 from __future__ import annotations
 
 import os
+import platform
 import threading
 import time
 import traceback
@@ -18,9 +19,9 @@ from pathlib import Path
 
 from avatar.files.lock import locked
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.sweep.output import BoundedLog, end_of, old_of
+from avatar.sweep.output import BoundedLog, end_of, last_line, old_of
 from avatar.sweep.spec import Job
-from avatar.sweep.state import HEARTBEAT_SECONDS, State, read_job, read_state, worker_name, write_heartbeat, write_state
+from avatar.sweep.state import HEARTBEAT_SECONDS, State, read_job, read_state, write_heartbeat, write_state
 
 OPTIONS = ("head", "tracking", "frame_offset", "data_format", "fps")  # of a source, as `avatar train` calls them
 OK, EXIT_ERROR, EXIT_INTERRUPTED = 0, 1, 130
@@ -38,14 +39,15 @@ def run_job(folder: Path, command: Command) -> State:
         if before.status == "done" or before.is_final:
             return before
         begin = time.monotonic()
-        running = State("running", before.attempts + 1, worker_name(), seconds=before.seconds)
+        worker = f"{platform.node()}:{os.getpid()}"
+        running = State("running", before.attempts + 1, worker, seconds=before.seconds)
         write_state(folder, running)
         with heartbeat(folder):
             outcome = work(job, folder, command)
         seconds = before.seconds + time.monotonic() - begin
         # A worker that was wanted back has not failed; the attempt does not count.
         attempts = before.attempts if outcome.status == "waiting" else running.attempts
-        state = replace(outcome, attempts=attempts, worker=running.worker, seconds=seconds)
+        state = replace(outcome, attempts=attempts, worker=worker, seconds=seconds)
         write_state(folder, state)
         return state
 
@@ -85,13 +87,7 @@ def logged(command: Command, words: list[str], log: Path) -> tuple[int, str]:
             except Exception:
                 traceback.print_exc()
                 status = -1
-    return status, last_line(log)
-
-
-def last_line(log: Path) -> str:
-    newest = end_of(old_of(log)) + end_of(log)
-    lines = newest.decode(errors="replace").replace("\r", "\n").strip().splitlines()
-    return lines[-1].removeprefix("avatar: ") if lines else ""
+    return status, last_line(end_of(old_of(log)) + end_of(log))
 
 
 def computed() -> int:

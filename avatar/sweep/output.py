@@ -50,3 +50,9 @@ def end_of(path: Path, size: int = 4096) -> bytes:
             return file.read(size)
     except (UserError, OSError):
         return b""
+
+
+def last_line(said: bytes) -> str:
+    """Of what a command said, without the program's name; empty where it said nothing."""
+    lines = said.decode(errors="replace").strip().splitlines()
+    return lines[-1].removeprefix("avatar: ") if lines else ""

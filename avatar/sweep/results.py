@@ -23,8 +23,6 @@ from avatar.evaluation.compare import (
 from avatar.evaluation.tracking_source import Drive, is_marked, legend
 from avatar.sweep.spec import Job, Spec
 
-Figures = Mapping[tuple[str, int], float]  # (subject, seed) -> a figure
-
 
 def fold_results(folder: Path, spec: Spec) -> Comparison:
     """Means of each variant, and paired differences, over the (subject, seed) pairs that all variants have.

@@ -58,12 +58,9 @@ class Job:
     overrides: tuple[str, ...]
     protocols: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        return {**self.__dict__, "overrides": list(self.overrides), "protocols": list(self.protocols)}
-
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Job:
-        """What `to_dict` gave. Raises KeyError, TypeError or ValueError for anything else: each value becomes a word of a
+        """What `asdict` gave. Raises KeyError, TypeError or ValueError for anything else: each value becomes a word of a
         command, and no word may be read as an option."""
         job = cls(**{**raw, "overrides": tuple(raw["overrides"]), "protocols": tuple(raw["protocols"])})
         source, texts = job.source, (job.name, job.subject, job.variant)
@@ -99,7 +96,9 @@ def read_spec(path: Path) -> Spec:
 
     Raises UserError naming the key that is unknown, missing or wrong, and for overrides that `avatar train` would refuse.
     """
-    raw = _read_yaml(path)
+    raw = read_yaml(path, MAX_BYTES)
+    if not isinstance(raw, dict):
+        raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
     if unknown := sorted(map(str, raw.keys() - KEYS)):
         raise UserError(f"{path}: there is no key '{unknown[0]}'; a sweep has {', '.join(sorted(KEYS))}")
     subjects = [_subject(path, entry, raw.get("head")) for entry in _list(path, raw, "subjects")]
@@ -138,13 +137,6 @@ def read_spec(path: Path) -> Spec:
         gpus=_number(path, raw, "gpus", 0, 0, 64) if "gpus" in raw else None,
     )
     return Spec(tuple(jobs), resources, int(_number(path, raw, "retries", 2, 0, 100)))
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    raw = read_yaml(path, MAX_BYTES)
-    if not isinstance(raw, dict):
-        raise UserError(f"{path} holds no keys; a sweep has {', '.join(sorted(KEYS))}")
-    return raw
 
 
 def _protocols(path: Path, words: list[str]) -> tuple[str, ...]:

@@ -11,8 +11,6 @@ SWEEP/jobs/NAME/run/           the run
 from __future__ import annotations
 
 import json
-import os
-import platform
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -56,7 +54,7 @@ def write_sweep(folder: Path, spec: Spec) -> None:
             )
         if job.name not in known:
             write_atomically(
-                folder / "jobs" / job.name / "job.json", json.dumps(job.to_dict(), indent=1, allow_nan=False).encode()
+                folder / "jobs" / job.name / "job.json", json.dumps(asdict(job), indent=1, allow_nan=False).encode()
             )
     names = list(dict.fromkeys([*known, *(job.name for job in spec.jobs)]))
     content = {
@@ -132,10 +130,6 @@ def heartbeat_age(folder: Path) -> float:
         return time.time() - (folder / "heartbeat").stat().st_mtime
     except FileNotFoundError:
         return float("inf")
-
-
-def worker_name() -> str:
-    return f"{platform.node()}:{os.getpid()}"
 
 
 def _read_json(path: Path, absent: str) -> Mapping[str, Any]:

@@ -9,7 +9,7 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from avatar.sweep.output import BoundedLog
+from avatar.sweep.output import BoundedLog, last_line
 
 OUTPUT_FILE = "output.txt"
 GRACE_SECONDS = 60.0  # between asking a worker to save its state and ending it
@@ -90,5 +90,4 @@ def reason_of_end(status: int, said: bytes) -> str:
         return ""
     if status < 0:
         return f"the worker was killed by signal {-status}"
-    lines = said.decode(errors="replace").strip().splitlines()
-    return lines[-1].removeprefix("avatar: ") if lines else f"the worker ended with status {status}"
+    return last_line(said) or f"the worker ended with status {status}"

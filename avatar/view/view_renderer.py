@@ -15,15 +15,8 @@ from torch import Tensor
 
 from avatar.files.video import error_map
 from avatar.head.rasterize import rasterize_mesh
-from avatar.motion.controls import (
-    JOINT_FIELD,
-    ExpressionControl,
-    expression_controls,
-    joint_ranges,
-    joint_values,
-    posed,
-)
-from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
+from avatar.motion.controls import JOINT_FIELD, joint_ranges, joint_values, posed
+from avatar.motion.orbit import orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import checked_drawings
 from avatar.tensors import to_8_bit
@@ -31,7 +24,6 @@ from avatar.types import Camera, HeadParams, Rendering
 
 Overlay = Literal["none", "mesh", "error"]
 OVERLAYS: tuple[Overlay, ...] = ("none", "mesh", "error")
-ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 MARGIN = 10.0  # degrees by which the camera may leave what the training video shows
 ZOOM = (0.5, 4.0)
 LINES = (30, 200, 120)  # RGB of the mesh
@@ -65,15 +57,9 @@ class ViewRenderer:
     ) -> None:
         """`truth(index, width)` is the picture of a frame of the avatar's own video."""
         self.trained, self.truth = trained, truth
-        recording = trained.recording
-        train = list(recording.split.train)
-        rest = trained.rest_params()
-        self.controls: list[ExpressionControl] = expression_controls(
-            recording.tracks["expression"][recording.times(train)], rest.expression, trained.avatar.head
-        )
-        self.joints = joint_ranges(recording.motion(train))
-        cameras = [recording.camera(i) for i in train]
-        self.limits: OrbitLimits = orbit_limits(trained.rest_camera(), cameras)
+        self.controls = trained.expression_controls()
+        self.joints = joint_ranges(trained.recording.motion(trained.recording.split.train))
+        self.limits = trained.orbit_limits(trained.rest_camera())
 
     def of(self, newer: TrainedAvatar) -> ViewRenderer:
         """The same for the avatar after more training on the same video, which is moved to where this one computes."""
@@ -140,7 +126,7 @@ class ViewRenderer:
             if setting.overlay == "error":  # of the recorded view, whatever the camera
                 with checked_drawings():
                     drawn = self.rendered(frame[0], own).image.cpu()
-                beside.append(to_8_bit(error_map(drawn, truth, ERROR_SCALE)).numpy())
+                beside.append(to_8_bit(error_map(drawn, truth)).numpy())
         return np.concatenate(beside, axis=1)
 
     @torch.no_grad()

@@ -18,13 +18,14 @@ from data_prep.check.findings import Finding, Severity, frames_phrase, from_sent
 from data_prep.formats.detect import open_tracked_folder
 from data_prep.formats.frame_files import IMAGE, TRACKING, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients
-from data_prep.formats.tracked_folder import Shot, TrackedFolder
+from data_prep.formats.tracked_folder import TrackedFolder
 from data_prep.prepare.camera_rig import find_rig
 from data_prep.prepare.check_alignment import refuse_misplaced_cameras
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import MIN_FRAMES, detect_offset
 from data_prep.prepare.inspect_images import inspect_images
 from data_prep.prepare.mask_values import with_labels
+from data_prep.prepare.pairing import grouped
 from data_prep.prepare.prepare import check_sizes
 
 LEAVE_OUT = "leave it out with --cameras"
@@ -47,7 +48,8 @@ def check_cameras(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list
     try:
         tracking = source.read(assets, size, lambda _: None)
         findings += _unusable(source, tracking, clip)
-        others = _of_other_cameras(files, clip)
+        own = set(clip.files.images.values())  # whose findings are made elsewhere
+        others = _with_files(files, {number: number for number, path in files.images.items() if path not in own})
         if others.images:
             seen = inspect_images(others, source.shots)
             bad = _lacking(files, clip) | seen.bad
@@ -68,12 +70,6 @@ def check_cameras(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list
         *_poses(source, tracks, head, given.ignore_misfit),
         *_clocks(source, tracks, head),
     ]
-
-
-def _of_other_cameras(files: FrameFiles, clip: Clip) -> FrameFiles:
-    """Those of all cameras but the clip's, whose own findings are made elsewhere."""
-    own = set(clip.files.images.values())
-    return _with_files(files, {number: number for number, path in files.images.items() if path not in own})
 
 
 def _lacking(files: FrameFiles, clip: Clip) -> dict[int, str]:
@@ -106,11 +102,8 @@ def _by_camera(
     source: TrackedFolder, reasons: Mapping[int, str], severity: Severity, check: str, what: str
 ) -> Iterator[Finding]:
     """A finding for each camera of which something cannot be used, with the first of the reasons."""
-    of_camera: dict[str, list[int]] = {}
-    for number in reasons:
-        of_camera.setdefault(source.shots[number].camera, []).append(number)
     names = source.files.frame_names()
-    for camera, numbers in of_camera.items():
+    for camera, numbers in grouped({number: source.shots[number].camera for number in reasons}).items():
         yield Finding(
             severity,
             check,
@@ -153,7 +146,7 @@ def _clocks(source: TrackedFolder, tracks: dict[int, FrameTrack], head: HeadMode
         own = {number: source.shots[number] for number in tracks if source.shots[number].camera == camera}
         if len(own) < MIN_FRAMES:
             continue
-        files = _by_time(source.files, own)
+        files = _with_files(source.files, {number: shot.time for number, shot in own.items()})
         try:
             found = detect_offset(head, {own[n].time: tracks[n] for n in own}, files, ignore_misfit=True)
         except UserError:
@@ -167,10 +160,6 @@ def _clocks(source: TrackedFolder, tracks: dict[int, FrameTrack], head: HeadMode
                 f"{found.sentence()}",
                 "synchronise the cameras again, or leave this one out with --cameras",
             )
-
-
-def _by_time(files: FrameFiles, shots: dict[int, Shot]) -> FrameFiles:
-    return _with_files(files, {number: shot.time for number, shot in shots.items()})
 
 
 def _with_files(files: FrameFiles, numbers: Mapping[int, int]) -> FrameFiles:

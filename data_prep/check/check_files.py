@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 from avatar.data.images import IMAGE_SUFFIXES
 from data_prep.check.clip import Clip
@@ -168,7 +166,7 @@ def _extra(clip: Clip) -> Iterator[Finding]:
     strangers = [
         path.relative_to(clip.files.folder).as_posix()
         for name, suffixes in (("imgs", IMAGE_SUFFIXES), ("alpha", IMAGE_SUFFIXES), ("checkpoint", (".frame",)))
-        for path in _entries(clip.files.folder / name)
+        for path in sorted((clip.files.folder / name).glob("[!.]*"))
         if not clip.source.is_paired  # a listing names its files, whatever lies beside them
         if path.suffix.lower() not in suffixes
     ]
@@ -181,13 +179,6 @@ def _extra(clip: Clip) -> Iterator[Finding]:
             "nothing, unless a frame was meant: they are not read",
             tuple(strangers),
         )
-
-
-def _entries(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    with os.scandir(folder) as entries:
-        return sorted(Path(entry.path) for entry in entries if not entry.name.startswith("."))
 
 
 def lost_frames(clip: Clip) -> Iterator[Finding]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -72,30 +71,22 @@ def _composited(clip: Clip) -> Iterator[Finding]:
     )
 
 
-class _MatteLimit(NamedTuple):
-    check: str
-    measure: str
-    limit: float
-    problem: str
-    advice: str
-
-
-_MATTE_LIMITS = (
-    _MatteLimit(
+_MATTE_LIMITS = (  # check, measure of `Matte`, limit, problem, advice
+    (
         "background-leak",
         "haze",
         MAX_HAZE,
         "the background shines through far from the person (mean weight up to {worst:.0%})",
         "make the matte again, or add head masks where the format has them: they cut the background off",
     ),
-    _MatteLimit(
+    (
         "background-leak",
         "specks",
         MAX_SPECKS,
         "pieces apart from the person count as head (up to {worst:.0%} of its area)",
         "remove all but the largest piece from the masks, or make them again",
     ),
-    _MatteLimit(
+    (
         "matte-holes",
         "holes",
         MAX_HOLES,

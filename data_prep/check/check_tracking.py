@@ -11,10 +11,10 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
 from data_prep.check.clip import NOT_SOUGHT, Clip
-from data_prep.check.findings import Finding, from_sentence, grouped
+from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.head_angles import measure_jumps
 from data_prep.formats.frame_files import TRACKING
-from data_prep.prepare.pairing import BEHIND_CAMERA, REPEATS
+from data_prep.prepare.pairing import BEHIND_CAMERA, REPEATS, grouped
 
 # A head that turns as fast as people can (about 3,700 degrees/s^2 at its peak) lies 3 degrees from half-way between its
 # neighbours at 25 frames per second; 10 mm is the same motion of a point 20 cm from the axis.

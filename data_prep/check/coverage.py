@@ -35,10 +35,10 @@ class Coverage:
     far_expression: tuple[int, ...]
 
 
-def measure_coverage(clip: Clip, usable: list[int], test_frames: int | None) -> Coverage | Finding:
+def measure_coverage(clip: Clip, usable: list[int]) -> Coverage | Finding:
     """`usable` are image numbers. A Finding where they cannot be split."""
     try:
-        split, _ = split_frames_of(clip.source, usable, test_frames)
+        split, _ = split_frames_of(clip.source, usable)
         check_divided(split)
     except UserError as error:
         return from_sentence("too-few-frames", str(error))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 from data_prep.formats.frame_files import describe_numbers
 
@@ -20,9 +20,6 @@ class Finding:
     problem: str  # one sentence, with the names of files and frames
     advice: str  # one sentence
     frames: tuple[str, ...] = ()  # all that are concerned, where the sentence has to cut the list
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def exit_status(findings: Iterable[Finding]) -> int:
@@ -52,11 +49,3 @@ def frames_phrase(numbers: Sequence[int], name: Callable[[int], str]) -> str:
     """`frame 00003` or `5 frames (00003-00006, 00009)`, each called by `name`."""
     listed = describe_numbers(list(numbers), name=name)
     return f"frame {listed}" if len(numbers) == 1 else f"{len(numbers)} frames ({listed})"
-
-
-def grouped(reasons: Mapping[int, str]) -> dict[str, list[int]]:
-    """Reason -> numbers."""
-    groups: dict[str, list[int]] = {}
-    for number, reason in reasons.items():
-        groups.setdefault(reason, []).append(number)
-    return groups

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,7 @@ class Check:
             "exit_status": self.status,
             "summary": self.summary(),
             "facts": {} if self.clip is None else facts(self.clip, self.coverage),
-            "findings": [finding.to_dict() for finding in self.findings],
+            "findings": [asdict(finding) for finding in self.findings],
         }
 
 
@@ -59,7 +59,6 @@ def check_tracked_folder(
     folder: Path,
     load_head: Callable[[], HeadAssets],
     *,
-    test_frames: int | None = None,
     progress: Progress = silent,
     **options: Any,
 ) -> Check:
@@ -94,7 +93,7 @@ def check_tracked_folder(
     usable = [image for image, _ in clip.tracked() if image not in clip.left_out]
     coverage = None
     if clip.offset is not None:
-        measured = measure_coverage(clip, usable, test_frames)
+        measured = measure_coverage(clip, usable)
         if isinstance(measured, Finding):
             findings.append(measured)
         else:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -20,12 +18,6 @@ DRAWN_WIDTH = 560  # pixels; the mesh needs room for its lines
 MESH, MASK, LIPS, MOUTH = (79, 179, 255), (63, 208, 122), (255, 95, 168), (255, 210, 63)  # as in html/style.css
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 _SUBPIXEL = 4  # bits of the fixed-point coordinates of cv2's lines
-
-
-@dataclass(frozen=True)
-class Overlay:
-    image: np.ndarray  # uint8 [h, w, 3]
-    caption: str
 
 
 def choose_frames(clip: Clip) -> list[int]:
@@ -50,8 +42,9 @@ def choose_frames(clip: Clip) -> list[int]:
     return sorted([*spread, *apart[: SHOWN - len(spread)]])
 
 
-def draw_overlays(clip: Clip) -> list[Overlay]:
-    """The chosen frames with mesh, head mask, lips and mouth mask. Empty where nothing can be projected."""
+def draw_overlays(clip: Clip) -> list[tuple[np.ndarray, str]]:
+    """The chosen frames with mesh, head mask, lips and mouth mask, uint8 [h, w, 3], each with its caption. Empty where
+    nothing can be projected."""
     tracks = dict(clip.tracked())
     if clip.head is None or not tracks:
         return []
@@ -74,7 +67,7 @@ def draw_overlays(clip: Clip) -> list[Overlay]:
             outline(canvas, cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR) > 127, colour)
         if len(mesh.lip_faces):
             outline(canvas, filled_lips(mesh.screen, mesh.lip_faces, width, height), LIPS)
-        overlays.append(Overlay(canvas, _caption(clip, number)))
+        overlays.append((canvas, _caption(clip, number)))
     return overlays
 
 

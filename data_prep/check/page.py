@@ -122,7 +122,7 @@ def _pictures(clip: Clip, main_figures: Mapping[str, str]) -> list[Markup]:
             ("mouth", "mouth mask"),
         )
     )
-    images = [picture(overlay.image, overlay.caption) for overlay in overlays]
+    images = [picture(image, caption) for image, caption in overlays]
     text = "Half of the frames are spread over the clip, half are those that fit worst."
     gallery = element("div", *images, class_="gallery")
     words = element("p", text, key, class_="soft")

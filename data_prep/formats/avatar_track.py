@@ -13,7 +13,6 @@ Picture, masks and tracking of a frame have the same number, so no offset is loo
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -25,7 +24,7 @@ import numpy as np
 from avatar.data.json_values import parse_number, parse_object, parse_value
 from avatar.errors import UserError, refuse
 from avatar.files.atomic import write_atomically
-from avatar.files.pickles import load_npz
+from avatar.files.pickles import load_npz, save_npz
 from avatar.files.read import is_there
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_files import FrameFiles, KindNames, find_numbered
@@ -123,9 +122,7 @@ def write_tracking(folder: Path, info: TrackingInfo, tracks: Mapping[int, FrameT
     rows = [tracks[number] for number in sorted(tracks)]
     arrays = {name: np.stack([getattr(row, name) for row in rows]).astype(np.float32) for name in ARRAYS}
     arrays |= {"number": np.array(sorted(tracks), np.int64), "shape": rows[0].shape.astype(np.float32)}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_atomically(folder / TRACKS_FILE, buffer.getvalue())
+    save_npz(folder / TRACKS_FILE, arrays)
     content = {"format": NAME, "version": VERSION} | asdict(info)
     write_atomically(folder / INFO_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 

@@ -234,9 +234,7 @@ def find_numbered(
 
 def _others(folder: Path, tag: str = "") -> list[Path]:
     """Pictures of formats that are not read."""
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in OTHER_PICTURES and p.stem.lower().endswith(tag))
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in OTHER_PICTURES and p.stem.lower().endswith(tag))
 
 
 def describe_numbers(numbers: list[int], limit: int = 12, name: Callable[[int], str] = "{:05d}".format) -> str:

@@ -26,7 +26,7 @@ from avatar.head.assets import HeadAssets
 from avatar.head.model import NECK
 from data_prep.formats.frame_files import FrameFiles, KindNames
 from data_prep.formats.frame_track import FrameTrack, Tracking, read_frames
-from data_prep.formats.nersemble_cameras import CALIBRATION, CalibratedCamera, read_cameras
+from data_prep.formats.nersemble_cameras import CALIBRATION, read_cameras
 from data_prep.formats.nersemble_tracking import FILES, SequenceTracking, find_tracking, read_tracking
 from data_prep.formats.root_pose import Joint
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
@@ -80,8 +80,16 @@ def open_folder(folder: Path, cameras: str = ALL) -> TrackedFolder:
     if is_rig:
         _refuse_scales(sequences)
 
+    shape, cameras_of = sequences[0].tracking.shape, {number: shot.camera for number, shot in shots.items()}
+
     def read(head: HeadAssets, _size: tuple[int, int], complain: Callable[[str], object]) -> Tracking:
-        return _read_frames(sequences, rows, shots, calibrated, files.tracking, Joint(head, NECK), complain)
+        neck = Joint(head, NECK)
+
+        def read_picture(number: int) -> FrameTrack:
+            sequence, row = rows[number]
+            return sequences[sequence].tracking.frame(row, shape, neck, calibrated[cameras_of[number]])
+
+        return read_frames({number: number for number in rows}, read_picture, files.tracking, complain, cameras_of)
 
     return TrackedFolder(
         NAME,
@@ -250,24 +258,6 @@ def _refuse_scales(sequences: list[Sequence]) -> None:
                 f"{other.tracking.path} has the scale {other.tracking.scale:g} and {first.tracking.path} "
                 f"{first.tracking.scale:g}, so that their cameras do not agree; choose one camera with --cameras"
             )
-
-
-def _read_frames(
-    sequences: list[Sequence],
-    rows: dict[int, Row],
-    shots: dict[int, Shot],
-    calibrated: dict[str, CalibratedCamera],
-    paths: dict[int, Path],
-    neck: Joint,
-    complain: Callable[[str], object],
-) -> Tracking:
-    shape, cameras = sequences[0].tracking.shape, {number: shot.camera for number, shot in shots.items()}
-
-    def read(number: int) -> FrameTrack:
-        sequence, row = rows[number]
-        return sequences[sequence].tracking.frame(row, shape, neck, calibrated[cameras[number]])
-
-    return read_frames({number: number for number in rows}, read, paths, complain, cameras)
 
 
 def _rate(videos: Wanted) -> float | None:

@@ -43,16 +43,13 @@ class ListedFrame:
     split: str | None  # "train", "val", "test"; None where the folder has no such division
     root: Path  # the folder that was given
 
-    def get(self, key: str) -> Any:
-        """The frame's own value, else the shared one. Raises BadFrame when there is neither."""
+    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
+        """The frame's own value, else the shared one, as a float64 vector [count]; BadFrame when there is neither, or not
+        that many finite numbers."""
         value = self.values.get(key, self.shared.get(key))
         if value is None:
             raise BadFrame(f"{key} is missing in {self.listing.name}")
-        return value
-
-    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
-        """The value as a float64 vector [count]; BadFrame when it is not that many finite numbers."""
-        return vector(self.get(key), key, count)
+        return vector(value, key, count)
 
     @property
     def image(self) -> Path:

@@ -145,9 +145,7 @@ def _pictures(video: WantedVideo) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _png(video: WantedVideo, pixels: np.ndarray) -> bytes:
-    done, data = cv2.imencode(".png", pixels[..., 0] if video.is_matte else pixels[..., ::-1])
-    assert done
-    return data.tobytes()
+    return cv2.imencode(".png", pixels[..., 0] if video.is_matte else pixels[..., ::-1])[1].tobytes()
 
 
 def _identity(path: Path) -> list[int | str]:

@@ -65,8 +65,6 @@ def check_sample(
     head: HeadModel, tracks: Mapping[int, FrameTrack], files: FrameFiles, pairs: Sequence[tuple[int, int]]
 ) -> Alignment:
     """The alignment in a few frames spread over `pairs` of image number and tracking number, all of which can be read."""
-    if not pairs:
-        return measure_alignment([], files)
     project = MeshProjector(head)
     chosen = evenly_spread(pairs, SAMPLED_FRAMES)
     fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in chosen]
@@ -81,12 +79,9 @@ def refuse_misplaced_cameras(
     shots: Mapping[int, Shot],
 ) -> None:
     """Raise UserError for a camera of several in whose pictures the head is not where its pose puts it."""
-    project = MeshProjector(head)
     for camera in dict.fromkeys(shot.camera for shot in shots.values()):
         seen = [pair for pair in pairs if shots[pair[0]].camera == camera]
-        own = evenly_spread(seen, SAMPLED_OF_A_CAMERA)
-        fits = [fit_of_masks(project, tracks[number], *read_masks(files, image)) for image, number in own]
-        problem = measure_alignment([fit for fit in fits if fit is not None], files).problem
+        problem = check_sample(head, tracks, files, evenly_spread(seen, SAMPLED_OF_A_CAMERA)).problem
         if problem is not None:
             raise UserError(
                 f"camera {camera}: {problem}; is its calibration right? Leave it out with --cameras, or say "

@@ -45,12 +45,17 @@ def refuse_if_many(bad: Mapping[int, str], total: int, what: str, share: float) 
 
 def describe_reasons(bad: Mapping[int, str], name: Callable[[int], str] = "{:05d}".format) -> str:
     """`00002-00004 (all zero: ...), 00007 (...)`, grouped by reason."""
-    by_reason: dict[str, list[int]] = {}
-    for number, reason in bad.items():
-        by_reason.setdefault(reason, []).append(number)
-    shown = [f"{describe_numbers(numbers, name=name)} ({reason})" for reason, numbers in by_reason.items()]
+    shown = [f"{describe_numbers(numbers, name=name)} ({reason})" for reason, numbers in grouped(bad).items()]
     rest = len(shown) - _REASONS_SHOWN
     return ", ".join(shown[:_REASONS_SHOWN]) + (f" and {rest} more reasons" if rest > 0 else "")
+
+
+def grouped(words: Mapping[int, str]) -> dict[str, list[int]]:
+    """The numbers that have each of the words."""
+    groups: dict[str, list[int]] = {}
+    for number, word in words.items():
+        groups.setdefault(word, []).append(number)
+    return groups
 
 
 def pair_frames(

@@ -22,9 +22,8 @@ from splat_file import read_splats
 
 from avatar.export.bake_texture import bake_texture
 from avatar.export.glb import _end, encode_glb, offsets
-from avatar.export.movie import limits_of, path_camera
+from avatar.export.movie import path_camera
 from avatar.export.ply import FIELDS, encode_ply
-from avatar.motion.controls import expression_controls
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera
@@ -170,8 +169,7 @@ def test_a_meshs_target_moves_one_joint_and_leaves_the_others(trained: TrainedAv
 def test_a_target_goes_where_its_name_says_and_as_far_from_every_frame(trained: TrainedAvatar) -> None:
     assert _end(-2.4, 1.3) == (1.3, "") and _end(-0.8, 0.1) == (-0.8, " (reversed)") and _end(-0.16, 0.14) == (0.14, "")
     rest, head = trained.rest_params(), trained.avatar.head
-    train = trained.recording.times(trained.recording.split.train)
-    control = expression_controls(trained.recording.tracks["expression"][train], rest.expression, head)[0]
+    control = trained.expression_controls()[0]
     frame = replace(rest, expression=rest.expression + 0.5 * control.high * control.direction)
     name = f"{control.part}: {control.name}"
     of_frame, of_rest = (head.vertices(one) + offsets(trained, one)[name] for one in (frame, rest))
@@ -232,8 +230,8 @@ def lively_copy(trained: TrainedAvatar) -> TrainedAvatar:
 
 
 def test_paths_stay_where_the_training_video_was(trained: TrainedAvatar) -> None:
-    limits = limits_of(trained)
     rest = trained.rest_camera()
+    limits = trained.orbit_limits(rest)
     own = seen_from(rest)
     turns = [seen_from(path_camera(rest, limits, "swing", s / 10)).yaw - own.yaw for s in range(60)]
     assert min(turns) == pytest.approx(-limits.yaw[1], abs=0.2) and max(turns) == pytest.approx(-limits.yaw[0], abs=0.2)

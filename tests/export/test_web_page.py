@@ -17,7 +17,7 @@ from pages import shown, until
 
 from avatar.export.default_view import front_camera, with_faded_neck
 from avatar.export.web_page import bundle, script_text, write_page, write_web_avatar
-from avatar.motion.controls import expression_controls, joint_ranges, posed
+from avatar.motion.controls import joint_ranges, posed
 from avatar.motion.orbit import orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 
@@ -89,11 +89,7 @@ def test_the_page_shows_what_the_program_draws(opened: Any, trained: TrainedAvat
 @pytest.mark.chromium
 def test_a_slider_moves_the_face_as_in_the_program(opened: Any, trained: TrainedAvatar, drawn: TrainedAvatar) -> None:
     before = shown(opened)
-    control = expression_controls(
-        trained.recording.tracks["expression"][list(trained.recording.split.train)],
-        trained.rest_params().expression,
-        trained.avatar.head,
-    )[0]
+    control = trained.expression_controls()[0]
     opened.evaluate("document.querySelectorAll('details').forEach(box => (box.open = true))")
     slider = opened.locator(f'input[name="{control.part}: {control.name}"]')
     slider.fill(str(control.high))

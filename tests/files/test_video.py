@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from avatar.errors import UserError
-from avatar.files.video import error_map, side_by_side, write_video
+from avatar.files.video import ERROR_SCALE, error_map, side_by_side, write_video
 
 
 def gradients(count: int, height: int, width: int) -> Iterator[np.ndarray]:
@@ -143,8 +143,8 @@ def test_error_map_grows_with_the_error() -> None:
     image[0, 0] += 0.05
     image[0, 1] += 0.1
     image[0, 2] -= 0.4
-    image[0, 3] -= 0.2
-    heat = error_map(image, target, full_scale=0.2)
+    image[0, 3] -= ERROR_SCALE
+    heat = error_map(image, target)
     light = heat.sum(dim=-1)
     assert light[1:].max() < 0.05  # no error: black
     assert light[1, 0] < light[0, 0] < light[0, 1] < light[0, 2]

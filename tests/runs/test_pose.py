@@ -12,7 +12,7 @@ import torch
 from lively import lively_avatar
 
 from avatar.errors import UserError
-from avatar.motion.controls import expression_controls, posed
+from avatar.motion.controls import posed
 from avatar.motion.orbit import orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Rendering
@@ -25,10 +25,7 @@ def trained(tracked_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> T
 
 def test_a_pose_is_named(trained: TrainedAvatar) -> None:
     rest = trained.rest_params()
-    train = trained.recording.times(trained.recording.split.train)
-    control = expression_controls(trained.recording.tracks["expression"][train], rest.expression, trained.avatar.head)[
-        0
-    ]
+    control = trained.expression_controls()[0]
     name = control.name.replace(" ", "_")
     picture = trained.pose(**{name: 0.5}, jaw=0.2, left_lid=1, yaw=8, pitch=-3, zoom=1.2, size=32)
     expected = posed(rest, {control: 0.5}, {"jaw": 0.2, "left_lid": 1.0})

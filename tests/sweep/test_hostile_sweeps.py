@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def test_a_value_of_a_subject_cannot_be_an_option(key: str, tmp_path: Path) -> N
         read_spec(path)
 
 
-JOB = Job("j-abc-seed0", "s", "v", 0, {"folder": "/f", "frame_offset": -1}, ("trainer.seed=0",), ("strict",)).to_dict()
+JOB = asdict(Job("j-abc-seed0", "s", "v", 0, {"folder": "/f", "frame_offset": -1}, ("trainer.seed=0",), ("strict",)))
 HOSTILE_JOBS: dict[str, dict[str, Any]] = {
     "another folder's name": {"name": "other"},
     "a name that leaves the sweep": {"name": "../../elsewhere"},

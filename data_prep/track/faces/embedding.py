@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avatar.errors import UserError
-from avatar.files.atomic import write_atomically
-from avatar.files.pickles import load_npz
+from avatar.files.pickles import load_npz, save_npz
 from avatar.files.read import is_there
 from avatar.head.assets import HeadAssets
 from avatar.head.find import find_model_file
@@ -109,9 +107,7 @@ def iris_embedding(assets: HeadAssets) -> LandmarkEmbedding:
 
 
 def save_embedding(path: Path, embedding: LandmarkEmbedding) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, landmarks=embedding.landmarks, corners=embedding.corners, barycentric=embedding.barycentric)
-    write_atomically(path, buffer.getvalue())
+    save_npz(path, {name: getattr(embedding, name) for name in ("landmarks", "corners", "barycentric")})
 
 
 def load_embedding(path: Path, assets: HeadAssets) -> LandmarkEmbedding | None:

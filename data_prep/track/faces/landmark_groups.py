@@ -26,4 +26,3 @@ LEFT_LID_PAIRS = ((386, 374), (385, 380), (387, 373), (384, 381), (388, 390))
 RIGHT_LID_PAIRS = ((159, 145), (158, 153), (160, 144), (157, 154), (161, 163))
 LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (310, 318))
 MOUTH_WIDTH = (61, 291)
-EYE_CORNERS = ((263, 362), (133, 33))  # outer and inner of the left eye, inner and outer of the right one

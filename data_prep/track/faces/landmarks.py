@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from avatar.errors import UserError
-from avatar.files.atomic import write_atomically
-from avatar.files.pickles import load_npz
+from avatar.files.pickles import load_npz, save_npz
 
 NUM_POINTS = 478  # 468 of the face mesh, then five of each iris
 BLENDSHAPES = (
@@ -56,16 +54,14 @@ class Landmarks:
 
 def save_landmarks(path: Path, landmarks: Landmarks) -> None:
     """Write a .npz of plain arrays, whole or not at all. Raises UserError when the disk refuses."""
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        points=landmarks.points.astype(np.float32),
-        scores=landmarks.scores.astype(np.float32),
-        detected=landmarks.detected.astype(bool),
-        size=np.array(landmarks.size, np.int64),
-        fps=np.float64(landmarks.fps),
-    )
-    write_atomically(path, buffer.getvalue())
+    arrays = {
+        "points": landmarks.points.astype(np.float32),
+        "scores": landmarks.scores.astype(np.float32),
+        "detected": landmarks.detected.astype(bool),
+        "size": np.array(landmarks.size, np.int64),
+        "fps": np.array(landmarks.fps, np.float64),
+    }
+    save_npz(path, arrays)
 
 
 def load_landmarks(path: Path) -> Landmarks:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from avatar.files.atomic import write_atomically
-from avatar.files.pickles import load_npz
+from avatar.files.pickles import load_npz, save_npz
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_track import FrameTrack
@@ -43,9 +41,7 @@ class Fit:
     def save(self, path: Path) -> None:
         arrays = {name: np.stack([getattr(track, name) for track in self.tracks.values()]) for name in _FIELDS}
         arrays |= {"number": np.array(list(self.tracks)), "shape": next(iter(self.tracks.values())).shape}
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)  # type: ignore[arg-type]
-        write_atomically(path, buffer.getvalue())
+        save_npz(path, arrays)
 
     @classmethod
     def load(

@@ -29,7 +29,7 @@ def clip(yaws: list[float], expressions: np.ndarray) -> dict[int, FrameTrack]:
 
 def covered(tracks: dict[int, FrameTrack]) -> Coverage:
     read: Any = SimpleNamespace(source=SimpleNamespace(division={}, shots={}), tracked=lambda: iter(tracks.items()))
-    found = measure_coverage(read, list(tracks), TEST)
+    found = measure_coverage(read, list(tracks))
     assert isinstance(found, Coverage) and len(found.split.train) == TRAIN
     return found
 
