@@ -6,7 +6,8 @@ JSON, one object a line: `expression` (a list of coefficients, or an object of n
 OSC over UDP: /VMC/Ext/Blend/Val NAME VALUE and /VMC/Ext/Blend/Apply (the VMC protocol), or an address that ends in the name
 of one of ARKit's blendshapes, with its value. What is not sent keeps its value.
 
-Live Link Face over UDP (version 6): device and subject, a frame's time, and 61 values in ARKit's order.
+Live Link Face over UDP (version 6): device and subject, a frame's time, and 61 values in the order of Unreal's
+EARFaceBlendShape. The app's CSV files, whose columns have names, put right before left of jaw and mouth.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ SIDED_EYE = ("EyeBlink", "EyeLookDown", "EyeLookIn", "EyeLookOut", "EyeLookUp", 
 LIVE_LINK = (
     *(f"{name}Left" for name in SIDED_EYE),
     *(f"{name}Right" for name in SIDED_EYE),
-    *("JawForward", "JawRight", "JawLeft", "JawOpen", "MouthClose", "MouthFunnel", "MouthPucker", "MouthRight"),
-    *("MouthLeft", "MouthSmileLeft", "MouthSmileRight", "MouthFrownLeft", "MouthFrownRight", "MouthDimpleLeft"),
+    *("JawForward", "JawLeft", "JawRight", "JawOpen", "MouthClose", "MouthFunnel", "MouthPucker", "MouthLeft"),
+    *("MouthRight", "MouthSmileLeft", "MouthSmileRight", "MouthFrownLeft", "MouthFrownRight", "MouthDimpleLeft"),
     *("MouthDimpleRight", "MouthStretchLeft", "MouthStretchRight", "MouthRollLower", "MouthRollUpper"),
     *("MouthShrugLower", "MouthShrugUpper", "MouthPressLeft", "MouthPressRight", "MouthLowerDownLeft"),
     *("MouthLowerDownRight", "MouthUpperUpLeft", "MouthUpperUpRight", "BrowDownLeft", "BrowDownRight"),

@@ -57,6 +57,8 @@ def test_live_link_face(named_avatar: TrainedAvatar) -> None:
     params = reader.datagram(live_link({"MouthSmileRight": 0.75, "EyeBlinkLeft": 0.5, "HeadYaw": 0.3}))
     assert params is not None and params.expression[1] == 0.75 and params.eyelids.tolist() == [0.5, 0]
     assert len(LIVE_LINK) == len(set(LIVE_LINK)) == 61
+    order = {"JawLeft": 15, "JawRight": 16, "MouthLeft": 21, "MouthRight": 22, "BrowInnerUp": 43}
+    assert {name: LIVE_LINK.index(name) for name in order} == order
     whole = live_link({})
     for damaged in (whole[:-1], whole + b"\0", whole[:20], whole[:1], live_link({"JawOpen": float("nan")})):
         with pytest.raises(PacketError):
