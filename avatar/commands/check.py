@@ -8,8 +8,9 @@ from argparse import Namespace
 
 from tqdm import tqdm
 
+from avatar.commands.main import failed
 from avatar.commands.outputs import check_folder_output
-from avatar.errors import check_installed
+from avatar.errors import UserError, check_installed
 from avatar.head.assets import load_head_assets
 from avatar.pipeline.open_inputs import source_options
 from data_prep.check.folder import as_text, check_tracked_folder
@@ -17,7 +18,15 @@ from data_prep.prepare.open_subject import find_head
 
 
 def run_check(arguments: Namespace) -> int:
-    """Exit status 0: fine, 1: warnings, 2: errors."""
+    """Exit status 0: fine, 1: warnings, 2: errors, or the folder could not be checked."""
+    try:
+        return check(arguments)
+    except UserError as error:
+        failed(str(error))
+        return 2
+
+
+def check(arguments: Namespace) -> int:
     if arguments.out is not None:
         check_folder_output(arguments.out, [arguments.folder, arguments.head, arguments.tracking])
         check_installed("the page of --out", "plots", "matplotlib")

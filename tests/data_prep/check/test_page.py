@@ -62,7 +62,7 @@ def test_a_file_of_somebody_else_stays(
 ) -> None:
     other = tmp_path / name
     other.write_text("mine")
-    assert main(["check", str(tracked_folder), "--out", str(tmp_path)]) == 1
+    assert main(["check", str(tracked_folder), "--out", str(tmp_path)]) == 2
     assert f"{other} is not of avatar check" in capsys.readouterr().err
     assert other.read_text() == "mine" and [*tmp_path.iterdir()] == [other]
 
