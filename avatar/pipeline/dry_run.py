@@ -39,8 +39,8 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     frames = len(subject.split.train)
     perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
     needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual.name)
-    free = free_bytes(chosen)
-    check_memory("training", needs, free)
+    available = free_bytes(chosen) or available_bytes()  # before the steps, whose memory stays
+    check_memory("training", needs, available)
     frame = subject.frame(subject.split.train[0], config.data.size)
     cost = measure_cost(frame, subject, assets, config)
     seconds = cost.start_seconds * (1 + rounds)
@@ -54,7 +54,7 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     print(f"Subject      {subject.name}: {frames:,} frames to train on, {len(subject.split.test):,} held out")
     print(f"Avatar       {cost.gaussians:,} Gaussians ({config.model.name}), {size[0]}x{size[1]} pixels")
     print(f"Time         {estimate}{cost.iterations:,} steps{step}")
-    print(f"Memory       about {in_words(sum(need.size for need in needs))} of {in_words(free or available_bytes())}")
+    print(f"Memory       about {in_words(sum(need.size for need in needs))} of {in_words(available)}")
     print(f"Disk         about {in_words(4.0 * DISK_COPIES * cost.parameters * (1 + rounds))}")
     return OK
 

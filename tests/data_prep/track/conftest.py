@@ -1,10 +1,13 @@
-"""Tracking without MediaPipe and without a fit, for what comes before it."""
+"""Tracking without MediaPipe and without a fit, for what comes before it; recordings by several cameras."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from marked_face import MarkDetector
+from rig_recording import write_plain_gha, write_plain_raw
 
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.track import track as tracking
@@ -29,3 +32,15 @@ def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tracking.TrackingStages, "torso", lambda _, fit: fit)
     monkeypatch.setattr(tracking.TrackingStages, "overlay", lambda *_: None)
     monkeypatch.setattr(tracking, "grade_tracking", lambda *_: Quality((), (), ""))
+
+
+@pytest.fixture(scope="session")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in NeRSemble's layout; do not write into it."""
+    return write_plain_raw(tmp_path_factory.mktemp("raw"))
+
+
+@pytest.fixture(scope="session")
+def gha(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same in GaussianHeadAvatar's layout; do not write into it."""
+    return write_plain_gha(tmp_path_factory.mktemp("gha") / "someone")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_recording import FILMED, write_plain_gha, write_plain_raw
+from rig_recording import FILMED
 
 from avatar.cli import main
 from avatar.errors import UserError
@@ -17,16 +17,6 @@ from data_prep.track.camera_rig.camera_pictures import Times
 from data_prep.track.footage.source import Span, whole
 
 SERIALS = list(FILMED)
-
-
-@pytest.fixture(scope="module")
-def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_plain_raw(tmp_path_factory.mktemp("raw"))
-
-
-@pytest.fixture(scope="module")
-def gha(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_plain_gha(tmp_path_factory.mktemp("gha") / "someone")
 
 
 def sequences(raw: Path, tmp_path: Path) -> tuple[Path, Path]:

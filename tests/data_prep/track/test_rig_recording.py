@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rig_recording import FILMED, write_plain_gha, write_plain_raw
+from rig_recording import FILMED, write_plain_raw
 
 from avatar.cli import main
 from avatar.errors import UserError
@@ -23,16 +23,6 @@ from data_prep.track.footage.picture_folder import PictureFolder
 from data_prep.track.footage.source import Span, stride, whole
 
 SERIALS = list(FILMED)
-
-
-@pytest.fixture(scope="module")
-def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_plain_raw(tmp_path_factory.mktemp("raw"))
-
-
-@pytest.fixture(scope="module")
-def gha(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_plain_gha(tmp_path_factory.mktemp("gha") / "someone")
 
 
 def same(opened: Recording) -> None:
