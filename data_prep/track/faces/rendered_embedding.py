@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from avatar.errors import UserError
 from avatar.files.environment import cache_folder
@@ -87,44 +87,50 @@ def locate(
     usable = np.zeros(len(is_eyeball), bool)
     usable[candidates] = True
     triangles = faces[usable[faces].all(1)]
+    places = np.ascontiguousarray(screens[:, candidates].T)  # [2, C, P]
     corners, weights = [], []
-    for k in range(landmarks.shape[1]):
-        distance = np.linalg.norm(screens[:, candidates] - landmarks[:, k, None], axis=-1)  # [P, C]
-        nearest = candidates[np.argsort(np.median(distance, axis=0))[:_NEIGHBOURS]]
+    for landmark in np.moveaxis(landmarks, 1, 0):  # [P, 2]
+        distance = np.hypot(*(places - landmark.T[:, None]))
+        nearest = candidates[np.argsort(np.median(distance, axis=1))[:_NEIGHBOURS]]
         around = triangles[np.isin(triangles, nearest).any(1)]
-        own = [_fitted(screens[:, triangle].astype(np.float64), landmarks[:, k]) for triangle in around]
-        if not own:  # a vertex of no usable triangle: the vertex itself
+        if not len(around):  # a vertex of no usable triangle: the vertex itself
             corners.append([nearest[0]] * 3)
             weights.append(np.array([1.0, 0.0, 0.0]))
             continue
-        best = int(np.argmin([error for _, error in own]))
+        fitted, error = _fitted(screens[:, around].swapaxes(0, 1).astype(np.float64), landmark)
+        best = int(np.argmin(error))
         corners.append(around[best])
-        weights.append(own[best][0])
-    return LandmarkEmbedding(
-        np.arange(landmarks.shape[1]), np.asarray(corners, np.int64), np.asarray(weights, np.float64)
-    )
+        weights.append(fitted[best])
+    return LandmarkEmbedding(np.arange(len(corners)), np.asarray(corners, np.int64), np.asarray(weights, np.float64))
 
 
-def _fitted(corners: np.ndarray, landmark: np.ndarray) -> tuple[np.ndarray, float]:
-    """Barycentric weights [3] >= 0 that bring corners [P, 3, 2] nearest to a landmark [P, 2], and their median distance.
+def _fitted(
+    corners: Float64[np.ndarray, "K P 3 2"], landmark: Float32[np.ndarray, "P 2"]
+) -> tuple[Float64[np.ndarray, "K 3"], Float64[np.ndarray, " K"]]:
+    """For each of K triangles barycentric weights >= 0 that bring its corners nearest to the landmark, and their median
+    distance.
 
     Reweighted least squares for the sum of distances, which outliers do not decide.
     """
-    edges = corners[:, 1:] - corners[:, :1]  # [P, 2, 2]
-    offset = landmark - corners[:, 0]
-    weight = np.ones(len(corners))
-    inner = np.full(2, 1 / 3)
+    edges = corners[:, :, 1:] - corners[:, :, :1]  # [K, P, 2, 2]
+    offset = landmark - corners[:, :, 0]
+    products = np.einsum("kpac,kpbc->kpab", edges, edges)
+    sides = np.einsum("kpac,kpc->kpa", edges, offset)
+    weight = np.ones(offset.shape[:2])
     for _ in range(_ITERATIONS):
-        A = np.einsum("p,pac,pbc->ab", weight, edges, edges)
-        b = np.einsum("p,pac,pc->a", weight, edges, offset)
-        inner = np.linalg.lstsq(A, b, rcond=1e-9)[0]
-        inner = _on_triangle(inner)
-        distance = np.linalg.norm(offset - np.einsum("a,pac->pc", inner, edges), axis=-1)
+        A = np.einsum("kp,kpab->kab", weight, products)
+        b = np.einsum("kp,kpa->ka", weight, sides)
+        inner = _on_triangle(np.einsum("kab,kb->ka", np.linalg.pinv(A, 1e-9, hermitian=True), b))
+        distance = np.linalg.norm(offset - np.einsum("ka,kpac->kpc", inner, edges), axis=-1)
         weight = 1.0 / np.maximum(distance, 1e-2)
-    return np.array([1.0 - inner.sum(), *inner]), float(np.median(distance))
+    return _with_first(inner), np.median(distance, axis=1)
 
 
-def _on_triangle(inner: np.ndarray) -> np.ndarray:
+def _on_triangle(inner: Float64[np.ndarray, "K 2"]) -> Float64[np.ndarray, "K 2"]:
     """The second and third barycentric weight, brought into the triangle."""
-    weights = np.clip(np.array([1.0 - inner.sum(), *inner]), 0.0, None)
-    return (weights / weights.sum())[1:]
+    weights = np.clip(_with_first(inner), 0.0, None)
+    return (weights / weights.sum(axis=1, keepdims=True))[:, 1:]
+
+
+def _with_first(inner: Float64[np.ndarray, "K 2"]) -> Float64[np.ndarray, "K 3"]:
+    return np.concatenate((1.0 - inner.sum(axis=1, keepdims=True), inner), axis=1)
