@@ -79,6 +79,7 @@ def grade_tracking(
     seen = float(landmarks.detected.mean())
     figures = [
         Figure("frames with a face", 100 * seen, "%", 99, 90, "light the face, and keep it in the picture", True),
+        Figure("face inside the picture", 100 * own["inside"], "%", 99, 95, "leave more room around the head", True),
         Figure("landmark error", shots.pop("all"), "% eyes", 1.0, 2.0, "is the head model's landmark embedding right?"),
         *(Figure(f"  of the {name}", value, "% eyes", 1.0, 2.0) for name, value in shots.items()),
         Figure("  the same in all frames, besides", own["constant"], "% eyes"),
@@ -146,7 +147,7 @@ def coverage(fit: Fit, landmarks: Landmarks) -> list[Figure]:
 
 
 def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding: LandmarkEmbedding) -> dict[str, Any]:
-    """Errors of the landmarks of every group, jitter and the worst frames, as JSON.
+    """Errors of the landmarks of every group, their share inside the picture, jitter and the worst frames, as JSON.
 
     Errors are mean distances between the embedded and the detected landmarks, in per cent of the distance between the
     irises in the picture (its 90th percentile over the clip, since turned heads show it shorter). What is the same in all
@@ -167,8 +168,10 @@ def landmark_figures(head: HeadAssets, fit: Fit, landmarks: Landmarks, embedding
     errors = {"all": float(per_frame.mean())}
     errors |= {name: float(error[:, members].mean()) for name, members in groups.items() if members.any()}
     worst = [rows[i] for i in np.argsort(-per_frame)[:_WORST]]
+    is_inside = ((placed >= 0) & (placed < landmarks.size)).all(axis=2)
     return {
         "errors": errors,
+        "inside": float(is_inside.mean()),
         "irises": _iris_distance(np.linalg.norm(residual, axis=2), embedding.landmarks, landmarks.open_shares()[rows]),
         "constant": float(np.linalg.norm(constant[features], axis=1).mean()),
         "jitter": _jitter(placed[:, features], rows) / max(_jitter(observed[:, features], rows), 1e-9),

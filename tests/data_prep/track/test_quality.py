@@ -62,6 +62,19 @@ def test_errors_are_what_changes_from_frame_to_frame(monkeypatch: pytest.MonkeyP
     assert landmark_figures(grid_head(), Fit(tracks, {}), seen, embedding)["jitter"] == 0.0
 
 
+def test_the_share_of_the_face_inside_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.zeros((4, NUM_POINTS, 3), np.float32)
+    points[:, LEFT_IRIS, 0] = 50.0
+    seen = Landmarks(points, np.zeros((4, len(BLENDSHAPES)), np.float32), np.ones(4, bool), (64, 48), 25.0)
+    placed = np.zeros((4, len(NOSE), 2))
+    placed[0, 0], placed[1, 0], placed[2, 0] = (64.0, 0.0), (0.0, 48.0), (-0.1, 3.0)  # beyond three of the edges
+    placed[3, 0] = 63.9, 47.9
+    monkeypatch.setattr(quality, "_placed", lambda *_: placed)
+    embedding = LandmarkEmbedding(np.array(NOSE), np.zeros((len(NOSE), 3), int), np.zeros((len(NOSE), 3)))
+    found = landmark_figures(grid_head(), Fit({n: track() for n in range(4)}, {}), seen, embedding)
+    assert found["inside"] == pytest.approx(1 - 3 / (4 * len(NOSE)))
+
+
 def test_where_a_face_comes_back_is_no_jitter(monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit that trembles twice as much as the landmarks does so whether the face was away or not."""
     T, rng = 40, np.random.default_rng(0)
