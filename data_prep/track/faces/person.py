@@ -89,13 +89,13 @@ def _notes(chosen: Sequence[Face | None], others: Sequence[_Chain], returns: int
     pictures = {n for chain in others for n in chain.pictures}
     beside = sum(chosen[n] is not None for n in pictures)
     if beside:
-        notes.append(f"{beside} pictures show another face beside: the largest one is followed")
+        notes.append(f"another face is beside it in {beside} of {len(chosen)} pictures: the largest one is followed")
     alone = sorted(n for n in pictures if chosen[n] is None)
     if alone:
         notes.append(
-            f"the face changes: {len(alone)} pictures, from number {alone[0]} on, show another person's only and are "
-            "left out"
+            f"the face changes: {len(alone)} of {len(chosen)} pictures, from number {alone[0]} on, show another person's "
+            "only; left out"
         )
     if returns:
-        notes.append(f"the face is away {returns} times and taken as the same person's when it comes back")
+        notes.append(f"the face comes back after a while ({returns}x) and is taken as the same person's")
     return notes

@@ -34,6 +34,7 @@ _TRANSPARENT = re.compile(r"rgba|bgra|argb|abgr|yuva|gbrap|ya8|ya16|pal8")
 _LISTS = {"concat", "hls", "dash", "sdp", "rtsp", "imf"}  # demuxers that open other files
 _TEXT = {"tty", "srt", "webvtt", "ass", "lrc", "microdvd"}  # that take any text
 _MAX_LISTED_ERRORS = 3
+_NEARLY_SQUARE = 0.005  # of a pixel's side: converters round, and to stretch pictures by so little would only blur them
 _BESIDE_THE_POINT = ("Error opening input file", "Input #", "ffmpeg version", "Consider increasing")
 
 
@@ -209,7 +210,7 @@ def _area(rest: str) -> int:
 
 def _square_size(first: Shown) -> tuple[int, int]:
     across, down = first.aspect
-    if across == down or across == 0 or not 1 / 4 <= across / down <= 4:
+    if abs(across - down) < _NEARLY_SQUARE * down or not 1 / 4 <= across / down <= 4:
         return first.width, first.height
     if across > down:
         return round(first.width * across / down), first.height

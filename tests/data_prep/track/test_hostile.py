@@ -166,7 +166,7 @@ LARGE = ("-vf", "scale=4320:4320,pad=7680:4320:1680:0", "-c:v", "libx264", "-pre
 TAKEN = {
     "two faces": Taken(
         lambda f: encode(f / "v.mp4", [beside(a, b) for a, b in zip(person(), person(2), strict=True)]),
-        ("show another face beside: the largest one is followed",),
+        ("another face is beside it in",),
         size=(260, 160),
     ),
     "two shots": Taken(

@@ -24,21 +24,21 @@ def test_the_largest_is_followed_also_where_the_order_changes() -> None:
     found = [[face(300 + n, 100), face(600, 60)] if n % 2 else [face(600, 60), face(300 + n, 100)] for n in range(20)]
     chosen, notes = follow_one(found)
     assert places(chosen) == [300 + n for n in range(20)]
-    assert notes == ["20 pictures show another face beside: the largest one is followed"]
+    assert notes == ["another face is beside it in 20 of 20 pictures: the largest one is followed"]
 
 
 def test_another_person_never_stands_in() -> None:
     found = [[face(300)]] * 20 + [[]] * 5 + [[face(900, 100)]] * 8
     chosen, notes = follow_one(found)
     assert places(chosen) == [300] * 20 + [None] * 13
-    assert notes == ["the face changes: 8 pictures, from number 25 on, show another person's only and are left out"]
+    assert notes == ["the face changes: 8 of 33 pictures, from number 25 on, show another person's only; left out"]
 
 
 def test_a_face_that_was_away_is_the_same_at_its_place() -> None:
     found = [[face(300)]] * 20 + [[]] * 30 + [[face(380)]] * 10
     chosen, notes = follow_one(found)
     assert places(chosen) == [300] * 20 + [None] * 30 + [380] * 10
-    assert notes == ["the face is away 1 times and taken as the same person's when it comes back"]
+    assert notes == ["the face comes back after a while (1x) and is taken as the same person's"]
 
 
 def test_a_face_of_another_size_is_not() -> None:

@@ -84,6 +84,13 @@ def test_pixels_become_square(tmp_path: Path) -> None:
     assert centre_of(pictures[0].image) == pytest.approx((1.5 * AT[0] - 64, AT[1] - 2), abs=2 * SUBPIXEL)
 
 
+def test_nearly_square_pixels_are_left_alone(tmp_path: Path) -> None:
+    """As a converter's rounding makes them: to stretch every picture by a pixel would only blur it."""
+    encode(tmp_path / "a.mp4", still(), options=("-vf", "setsar=300/301", *X264))
+    video = open_video(tmp_path / "a.mp4")
+    assert (video.width, video.height, video.notes) == (WIDTH, HEIGHT, ())
+
+
 def test_odd_sizes(tmp_path: Path) -> None:
     encode(tmp_path / "a.mkv", still(3, 151, 97), options=("-c:v", "ffv1", "-pix_fmt", "bgr0"))
     video = open_video(tmp_path / "a.mkv")
