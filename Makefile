@@ -57,7 +57,7 @@ arm64: ## compile the core for 64-bit ARM with a cross compiler (Debian: g++-aar
 	scripts/check_arm64.sh
 
 gpu-check: setup-dev ## verify the GPU's kernels without a GPU (installs Triton, 700 MB)
-	PIP_FLAGS="$(PIP_FLAGS)" scripts/check_gpu_kernels.sh
+	PIP_FLAGS="$(PIP_FLAGS)" GPU_TARGETS="$(GPU_TARGETS)" scripts/check_gpu_kernels.sh
 
 paper-smoke: setup-dev ## run scripts/paper, which makes the paper's tables and figures, tiny
 	scripts/paper/smoke.sh

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Verify the GPU's kernels where there is no GPU: Triton's interpreter against the compiled core and the float64 reference,
 # deliberate mistakes that the tests have to catch, launches counted on torch's meta device, and every kernel compiled for
-# six GPUs. Installs Triton into .venv; where that cannot be had, says so and is done.
+# six GPUs, or for those in GPU_TARGETS. Installs Triton into .venv; where that cannot be had, says so and is done.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=.venv/bin/python
@@ -17,16 +17,14 @@ part() { echo "gpu-check: $1 ($SECONDS s)"; }
 
 export OMP_NUM_THREADS=1 TRITON_CACHE_DIR=$work/triton # compiled anew, each time
 part "the kernels in the interpreter"
-for tests in "tests/gpu" "tests/splat -k gpu"; do # the interpreter has one thread
-  # shellcheck disable=SC2086
-  TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider -n "$jobs" --dist worksteal --durations=15 $tests
-done
+TRITON_INTERPRET=1 "$python" -m pytest -q -p no:cacheprovider -n "$jobs" --dist worksteal --durations=15 -k gpu tests/gpu tests/splat
 part "mistakes in the kernels"
 TRITON_INTERPRET=1 "$python" scripts/mutate_kernels.py --jobs "$jobs" --changed-only
 part "launches, and compiling"
 "$python" scripts/count_launches.py >"$work/launches" & # beside the compilers' own rehearsal, which has one thread
 launches=$!
-"$python" scripts/compile_kernels.py --jobs "$jobs"
+# shellcheck disable=SC2086
+"$python" scripts/compile_kernels.py --jobs "$jobs" ${GPU_TARGETS:+--targets $GPU_TARGETS}
 wait "$launches"
 grep launches "$work/launches"
 part "done"
