@@ -226,9 +226,10 @@ def check_sizes(files: FrameFiles, tracks: Tracking, inspection: Inspection, is_
             seen = (
                 f"{files.images[number]} is" if is_rig else f"those in {next(iter(files.images.values())).parent} are"
             )
+            of_rig = "give each listed frame the w and h of its camera's images, " if is_rig else ""
             raise UserError(
-                f"the tracking was made on {track.size[0]}x{track.size[1]} images, but {seen} {size[0]}x{size[1]}; resize "
-                "the images or track them again"
+                f"the tracking was made on {track.size[0]}x{track.size[1]} images, but {seen} {size[0]}x{size[1]}; "
+                f"{of_rig}resize the images or track them again"
             )
 
 

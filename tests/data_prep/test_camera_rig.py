@@ -268,6 +268,10 @@ def test_each_camera_has_its_own_size(single: Path, tmp_path: Path) -> None:
     assert subject.image_size() == (64, 56)
     assert subject.frame(index, 48).image.shape == (42, 48, 3)
 
+    without = edited(folder, tmp_path / "without", lambda entry: entry.pop("w") and entry.pop("h") and None)
+    with pytest.raises(UserError, match=r"made on 64x56 .*_12.png is 32x28; give each listed frame the w and h of its"):
+        opened(without, tmp_path / "refused")
+
 
 def test_the_reference_is_where_the_head_is_seen_from_the_front() -> None:
     assert min(AZIMUTHS, key=lambda name: abs(AZIMUTHS[name])) == "08"
