@@ -39,7 +39,7 @@ def check_cameras(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list
     source = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
     if not source.shots:
         return []
-    files, _ = with_labels(source.files)
+    files, _ = with_labels(source.files, source.shots)
     source = replace(source, files=files)
     unread = {path for number, path in clip.files.images.items() if not clip.is_whole(number)}
     bad: dict[int, str] = {}

@@ -46,7 +46,7 @@ class _Seen:
 
 def inspect_images(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -> Inspection:
     """Decode everything once. Raises UserError when sizes differ within a camera or masks are not 0 to 255, naming both."""
-    refuse_colours(files)
+    refuse_colours(files, shots)
     images = _look_at(files, IMAGE, files.images)
     bad = {n: seen.problem for n, seen in images.items() if seen.problem is not None}
     sizes = {n: seen.size for n, seen in images.items() if seen.problem is None}

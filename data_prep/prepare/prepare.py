@@ -77,7 +77,7 @@ def prepare(
         return target
 
     say(f"format: {tracked.format}")
-    files, label_notes = with_labels(files)
+    files, label_notes = with_labels(files, tracked.shots)
     inspection = inspect_images(files, tracked.shots)
     refuse_if_many(inspection.bad, len(files.images), "images", source.max_left_out)
     tracks = tracked.read(head, (inspection.width, inspection.height), refuse)
@@ -91,7 +91,8 @@ def prepare(
     check_sizes(files, tracks, inspection, bool(tracked.shots))
     model = HeadModel(head, torch.from_numpy(first.shape))
     if not source.ignore_misfit:
-        for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, inspection.bad):
+        shots, unread = tracked.shots, inspection.bad
+        for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, unread, shots):
             refuse(problem)
     offset, evidence = _find_offset(replace(tracked, files=files), model, tracks, inspection, source, say)
     centre = model.neutral_vertices().mean(0).numpy()
