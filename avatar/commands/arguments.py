@@ -15,7 +15,7 @@ from avatar.commands.parser import build_parser
 from avatar.errors import UserError
 from avatar.files.read import is_there
 
-INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver")  # paths that are read
+INPUTS = ("run", "runs", "folder", "videos", "paths", "inputs", "driver", "spec")  # paths that are read
 LISTS_MISTAKES = ("check", "create")  # these commands say everything that is wrong at once
 KEY = re.compile(r"[+~]*[A-Za-z_][\w.]*")  # Hydra's own signs are no part of our keys, and refused as such
 
@@ -51,13 +51,18 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def refuse_missing(arguments: argparse.Namespace) -> None:
-    """Raises UserError for an input that nothing has the name of: before the command is imported, which takes seconds."""
+    """Raises UserError for an input that nothing has the name of, and for an override of no key or a wrong value: before
+    the command is imported, which takes seconds."""
     if arguments.command in LISTS_MISTAKES:
         return
     for value in (getattr(arguments, name, None) for name in INPUTS):
         for path in value if isinstance(value, list) else [value]:
             if isinstance(path, Path) and not is_there(path):
                 raise UserError(f"{path} does not exist")
+    if getattr(arguments, "overrides", None):
+        from avatar.config import load_config  # imports hydra
+
+        load_config(arguments.overrides)
 
 
 def nearest(word: str, known: Iterable[str] | Mapping[str, object]) -> str:

@@ -28,7 +28,11 @@ def run_sweep(arguments: Namespace) -> int:
     if arguments.spec is not None and not arguments.status:
         asked = read_spec(arguments.spec)
         check_sweep_folder(folder, arguments.spec, asked)
-        write_sweep(folder, asked)
+        if left := write_sweep(folder, asked):
+            print(
+                f"Note: {len(left)} jobs in {folder / 'jobs'}, such as {left[0]}, are not in {arguments.spec}: they are "
+                "neither run nor compared, and their files stay"
+            )
     spec = read_sweep(folder)
     if arguments.status:
         return show_status(folder, spec)

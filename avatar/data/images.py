@@ -6,6 +6,7 @@ The foreground matte of an image is a mask file, or the image itself: then its t
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from avatar.files.read import read_bytes as read_bounded
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 OTHER_PICTURES = (".webp", ".bmp", ".tif", ".tiff", ".gif", ".heic", ".avif", ".jp2", ".ppm", ".exr", ".tga", ".jxl")
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8\xff", 0xDA, b"\xff\xd9"
+_JPEG_START, _JPEG_TABLES, _JPEG_SCAN, _JPEG_END = b"\xff\xd8\xff", 0xC4, 0xDA, b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _PNG_COLOUR_TYPE = 25  # its place in the header; 4 is grey and 6 is colour, with an alpha channel each
 _PALETTE = 3  # the colour type of a PNG that holds indices into a palette
@@ -29,6 +30,7 @@ _STARTS = {  # of pictures that are not read: where, what, the format
     "WebP": (8, b"WEBP"), "BMP": (0, b"BM"), "TIFF": (0, b"II*\0"), "big-endian TIFF": (0, b"MM\0*"), "GIF": (0, b"GIF8"),
     "HEIC": (4, b"ftyphei"), "AVIF": (4, b"ftypavi"),
 }  # fmt: skip
+_LEAST_ZEROS = 256  # bytes; a few blocks may hold some
 _TAIL = 4096  # some writers pad after the end marker
 
 
@@ -151,7 +153,8 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     if not data:
         raise UserError(f"{path} is empty; write or copy it again")
     if data.startswith(_JPEG_START):
-        complete = _has_end(data)
+        begin, end = _image_data(data)
+        complete = end >= 0
     elif data.startswith(_PNG_START):
         complete = _PNG_END in data[-_TAIL:]
     else:
@@ -164,6 +167,8 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     width, height = _declared_size(data)
     if width * height > MAX_PIXELS:
         raise UserError(f"{path} claims to have {width}x{height} pixels; images of more than {MAX_PIXELS} are not read")
+    if data.startswith(_JPEG_START) and data.find(bytes(_most_zeros(data, width, height) + 1), begin, end) >= 0:
+        raise UserError(f"{path} is damaged: a part of its image data is zero; write or copy it again")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:  # absurd dimensions in the header
@@ -185,10 +190,33 @@ def _declared_size(data: bytes) -> tuple[int, int]:
     return largest
 
 
-def _has_end(data: bytes) -> bool:
-    """Whether a JPEG's image data end. Not all of the file need: phones append a short video, and some writers pad."""
+def _image_data(data: bytes) -> tuple[int, int]:
+    """Where a JPEG's image data begin and end; -1 where they do not end. Not all of the file need: phones append a short
+    video, and some writers pad."""
     begin = next((at for marker, at in _segments(data) if marker == _JPEG_SCAN), 0)  # decoders refuse what has none
-    return data.find(_JPEG_END, begin) >= 0
+    return begin, data.find(_JPEG_END, begin)
+
+
+def _most_zeros(data: bytes, width: int, height: int) -> int:
+    """How many zero bytes may follow each other in a JPEG's image data; a hole in a file has more, and decodes to grey.
+
+    Zero bits are each Huffman table's first symbol. Where it is the end of a block for the brightness, a flat block may be
+    zeros alone, of a byte at most; so may one in a scan of a part of the picture.
+    """
+    first: dict[int, int] = {}  # symbol of each table of coefficients
+    is_sequential, components = False, 0
+    for marker, at in _segments(data):
+        if marker == _JPEG_TABLES:
+            place, stop = at + 4, min(at + 2 + int.from_bytes(data[at + 2 : at + 4], "big"), len(data))
+            while place + 17 < stop:
+                if data[place] >> 4:
+                    first[data[place] & 15] = data[place + 17]
+                place += 17 + sum(data[place + 1 : place + 17])
+        elif marker in (0xC0, 0xC1):
+            is_sequential, components = True, int.from_bytes(data[at + 9 : at + 10], "big")
+        elif marker == _JPEG_SCAN and is_sequential and data[at + 4] == components and first.get(data[at + 6] & 15):
+            return _LEAST_ZEROS
+    return max(_LEAST_ZEROS, 12 * math.ceil(width / 16) * math.ceil(height / 16))  # blocks of 8 x 8, three channels
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int]]:

@@ -128,11 +128,12 @@ def steps_in_time(
     avatar = new_avatar(assets, subject, config, term.name, CPU)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)
-    step = measure_cost(frame, subject, assets, config).step_seconds
-    able = affordable_iterations(plannable(minutes) - spent, step, refinement, rounds, frames)
+    cost = measure_cost(frame, subject, assets, config)
+    step, starts = cost.step_seconds, cost.start_seconds * (1 + rounds)
+    able = affordable_iterations(plannable(minutes) - spent - starts, step, refinement, rounds, frames)
     fewest = min(LEAST_STEPS, asked)
     if able < fewest:
-        least = spent + rounds * refinement + step * (fewest + rounds * round_steps(fewest, frames))
+        least = spent + starts + rounds * refinement + step * (fewest + rounds * round_steps(fewest, frames))
         raise UserError(
             f"--minutes {minutes:g} is too little for --refine {rounds} of {len(subject)} frames on this machine: "
             f"{spent:.0f} s are gone, it takes about {refinement:.0f} s to refine them and {step:.3f} s a step, so give at "

@@ -24,7 +24,7 @@ from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.open_inputs import check_data, check_division, moved_source
 from avatar.runs.avatar_file import check_head
-from avatar.runs.checkpoint import Checkpoint, newest_checkpoint
+from avatar.runs.checkpoint import Checkpoint, newest_checkpoint, newest_step
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.model_registry import keys_without_effect, make_avatar
 from avatar.runs.run import RunInfo, read_run_info, refuse_trained, start_run
@@ -138,7 +138,13 @@ def finish_training(
     if config.trainer.checkpoint_every < config.trainer.iterations:
         print(f"Watch        avatar view {typed(run)} (from step {config.trainer.checkpoint_every} on)")
     begin = time.monotonic()
-    done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
+    try:
+        done = train(avatar, subject, config, run, perceptual, resume=checkpoint, device=device)
+    except KeyboardInterrupt:
+        if (saved := newest_step(run)) is None:
+            raise
+        print(f"\nInterrupted at once; the last checkpoint in {run} is of step {saved}.")
+        return INTERRUPTED
     first = checkpoint.step if checkpoint else 0
     seconds = time.monotonic() - begin
     rate = f"{seconds / max(done - first, 1):.3f} s per step"

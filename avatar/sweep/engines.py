@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +17,7 @@ from avatar.errors import UserError, check_installed
 from avatar.sweep.spec import Resources, Spec
 from avatar.sweep.worker import Worker, work_until_done
 
+RAY_NAMES = {"num_cpus": "CPU", "memory": "memory", "num_gpus": "GPU"}  # what a task asks for -> of a machine
 LONGEST_MINUTES = 24 * 60  # of a SLURM job; training goes on in the next one
 
 
@@ -161,6 +162,10 @@ class RayCluster:
             needs["memory"] = int(resources.memory_gb * 2**30)
         if gpus:
             needs["num_gpus"] = gpus  # Ray shows a worker its own, and no others
+        if shortage := too_small([node["Resources"] for node in ray.nodes() if node["Alive"]], needs):
+            print(
+                f"Note: no machine of the Ray cluster has {shortage}, which a job takes: jobs wait until one joins it"
+            )
         # What is tried again is decided in one place, from the job's files.
         self._work = ray.remote(max_retries=0, **needs)(work_until_done)
         self._threads = resources.threads
@@ -183,6 +188,15 @@ class RayCluster:
 
     def close(self) -> None:
         self._ray.shutdown()
+
+
+def too_small(machines: Sequence[Mapping[str, float]], needs: Mapping[str, float]) -> str:
+    """What a job takes, in words, where none of a Ray cluster's machines has it; else nothing."""
+    if any(all(has.get(RAY_NAMES[key], 0.0) >= value for key, value in needs.items()) for has in machines):
+        return ""
+    memory = [f"{needs['memory'] / 2**30:.3g} GB of memory"] if "memory" in needs else []
+    gpus = [f"{needs['num_gpus']:g} GPUs"] if "num_gpus" in needs else []
+    return " and ".join([f"{needs['num_cpus']} processors", *memory, *gpus])
 
 
 class SlurmCluster:

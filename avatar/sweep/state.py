@@ -44,19 +44,22 @@ class State:
     is_final: bool = False  # a failure that another attempt would repeat
 
 
-def write_sweep(folder: Path, spec: Spec) -> None:
-    """Write the jobs that are not there yet. Raises UserError for a folder that holds another sweep's jobs."""
-    known = {job.name: job for job in read_sweep(folder).jobs} if (folder / SWEEP_FILE).is_file() else {}
+def write_sweep(folder: Path, spec: Spec) -> list[str]:
+    """Write the sweep, with the jobs that are not there yet. Returns the names of those that it had before and that `spec`
+    does not have: their files stay.
+
+    Raises UserError for a folder that holds another sweep's jobs.
+    """
+    before = [job.name for job in read_sweep(folder).jobs] if (folder / SWEEP_FILE).is_file() else []
     for job in spec.jobs:
-        if job.name in known and known[job.name] != job:
+        place = folder / "jobs" / job.name
+        if not (place / "job.json").is_file():
+            write_atomically(place / "job.json", json.dumps(asdict(job), indent=1, allow_nan=False).encode())
+        elif read_job(place) != job:
             raise UserError(
                 f"{folder} holds a sweep in which {job.name} is something else; choose another --out, or delete it"
             )
-        if job.name not in known:
-            write_atomically(
-                folder / "jobs" / job.name / "job.json", json.dumps(asdict(job), indent=1, allow_nan=False).encode()
-            )
-    names = list(dict.fromkeys([*known, *(job.name for job in spec.jobs)]))
+    names = [job.name for job in spec.jobs]
     content = {
         "format": SWEEP_FORMAT,
         "jobs": names,
@@ -64,6 +67,7 @@ def write_sweep(folder: Path, spec: Spec) -> None:
         "retries": spec.retries,
     }
     write_atomically(folder / SWEEP_FILE, json.dumps(content, indent=1, allow_nan=False).encode())
+    return sorted({*before} - {*names})
 
 
 def read_sweep(folder: Path) -> Spec:

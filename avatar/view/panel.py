@@ -52,7 +52,10 @@ class Panel:
         player = self._viewer.player
         self._play.label = "Pause" if player.is_playing else "Play"
         if player.is_playing:
-            self._scrub.value = round(player.seconds, 2)
+            self._show_time()
+
+    def _show_time(self) -> None:
+        self._scrub.value = round(self._viewer.player.seconds, 2)
 
     def draw_curves(self, curves: Float64[np.ndarray, "N 6"], is_open: bool) -> None:
         """Loss and PSNR of the training, of `read_curves`; `is_open` unfolds them where they are new."""
@@ -120,6 +123,7 @@ class Panel:
                 return
             with viewer.lock:
                 (player.pause if player.is_playing else player.play)()
+                self._show_time()
             viewer.touch()
 
         def seek(event: Any) -> None:

@@ -23,10 +23,9 @@ from data_prep.prepare.camera_rig import find_rig
 from data_prep.prepare.check_alignment import refuse_misplaced_cameras
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import MIN_FRAMES, detect_offset
-from data_prep.prepare.inspect_images import inspect_images
+from data_prep.prepare.inspect_images import check_sizes, inspect_images
 from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.pairing import grouped
-from data_prep.prepare.prepare import check_sizes
 
 LEAVE_OUT = "leave it out with --cameras"
 
@@ -40,7 +39,7 @@ def check_cameras(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list
     source = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
     if not source.shots:
         return []
-    files, _ = with_labels(source.files)
+    files, _ = with_labels(source.files, source.shots)
     source = replace(source, files=files)
     unread = {path for number, path in clip.files.images.items() if not clip.is_whole(number)}
     bad: dict[int, str] = {}

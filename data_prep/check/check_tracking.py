@@ -10,7 +10,7 @@ import numpy as np
 
 from avatar.errors import UserError
 from avatar.files.pickles import load_torch_pickle
-from data_prep.check.clip import NOT_SOUGHT, Clip
+from data_prep.check.clip import GIVEN, NOT_SOUGHT, Clip
 from data_prep.check.findings import Finding, from_sentence
 from data_prep.check.head_angles import measure_jumps
 from data_prep.formats.frame_files import TRACKING
@@ -99,6 +99,9 @@ def _left_out(clip: Clip) -> Iterator[Finding]:
 def _offset(clip: Clip) -> Iterator[Finding]:
     if clip.offset is None and clip.offset_evidence != NOT_SOUGHT:
         yield from_sentence("frame-offset", clip.offset_evidence)
+    is_given = clip.given.frame_offset is not None and not clip.source.is_paired
+    if is_given and clip.offset_evidence != GIVEN:
+        yield Finding("warning", "frame-offset", clip.offset_evidence, "leave --frame-offset out to use that one")
     if clip.part_offsets is not None and clip.part_offsets[0] != clip.part_offsets[1]:
         first, last = clip.part_offsets
         yield Finding(

@@ -259,9 +259,10 @@ def _with_offset(clip: Clip, head: HeadModel) -> Clip:
         first, last = (_estimate(clip, head, part) for part in (numbers[:third], numbers[-third:]))
         if isinstance(first, OffsetEstimate) and isinstance(last, OffsetEstimate):
             parts = first.offset, last.offset
-    if clip.given.frame_offset is not None:
-        return replace(clip, part_offsets=parts)
-    estimate = _estimate(clip, head, numbers)
+    estimate, given = _estimate(clip, head, numbers), clip.given.frame_offset
+    if given is not None:
+        against = estimate.against(given) if isinstance(estimate, OffsetEstimate) else ""
+        return replace(clip, offset_evidence=against or GIVEN, part_offsets=parts)
     if isinstance(estimate, OffsetEstimate):
         return replace(clip, offset=estimate.offset, offset_evidence=estimate.sentence(), part_offsets=parts)
     return replace(clip, offset=None, offset_evidence=estimate, part_offsets=parts)

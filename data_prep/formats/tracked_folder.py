@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from avatar.data.refinement import Refinement
+from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from data_prep.formats.frame_files import FrameFiles
@@ -49,6 +51,15 @@ class TrackedFolder:
                 f"--frame-offset {given}: {self.files.pairing} itself says which image belongs to which "
                 "tracking; leave it out"
             )
+
+
+def spread_by_camera(numbers: Iterable[int], count: int, shots: Mapping[int, Shot] | None) -> list[int]:
+    """About `count` of the images, as many of each camera, and one at least."""
+    of_camera: dict[str, list[int]] = {}
+    for number in numbers:
+        of_camera.setdefault(shots[number].camera if shots else "", []).append(number)
+    each = math.ceil(count / max(len(of_camera), 1))
+    return [number for own in of_camera.values() for number in evenly_spread(own, each)]
 
 
 def matte_notes(files: FrameFiles) -> tuple[str, ...]:

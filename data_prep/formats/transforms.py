@@ -221,12 +221,19 @@ def camera_pose(frame: ListedFrame) -> tuple[np.ndarray, np.ndarray]:
 def pinhole(frame: ListedFrame, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
     """fx, fy, cx, cy in pixels [4] and the (width, height) that they are for; `size` is that of the images.
 
-    From `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`; without focal lengths from `camera_angle_x`, without a centre the middle.
+    From `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`; without focal lengths from `camera_angle_x` and `camera_angle_y`, without a
+    centre the middle.
     """
 
     def optional(key: str) -> float | None:
         is_given = frame.values.get(key, frame.shared.get(key)) is not None
         return float(frame.numbers(key, 1)[0]) if is_given else None
+
+    def focal_by_angle(key: str, side: float) -> float:
+        angle = float(frame.numbers(key, 1)[0])
+        if not 0 < angle < math.pi:
+            raise BadFrame(f"{key} is {angle:g}, not between 0 and pi")
+        return side / (2 * math.tan(angle / 2))
 
     w, h = optional("w"), optional("h")
     width, height = size[0] if w is None else w, size[1] if h is None else h
@@ -234,10 +241,9 @@ def pinhole(frame: ListedFrame, size: tuple[int, int]) -> tuple[np.ndarray, tupl
         raise BadFrame(f"w and h are {width:g} and {height:g}, which no image is")
     fx, fy = optional("fl_x"), optional("fl_y")
     if fx is None:
-        angle = float(frame.numbers("camera_angle_x", 1)[0])
-        if not 0 < angle < math.pi:
-            raise BadFrame(f"camera_angle_x is {angle:g}, not between 0 and pi")
-        fx = width / (2 * math.tan(angle / 2))
+        fx = focal_by_angle("camera_angle_x", width)
+        if fy is None and optional("camera_angle_y") is not None:
+            fy = focal_by_angle("camera_angle_y", height)
     fy = fx if fy is None else fy
     cx, cy = optional("cx"), optional("cy")
     if fx <= 0 or fy <= 0:

@@ -6,11 +6,11 @@
     FOLDER/flame_param/00000.npz              `flame_param_path`: one timestep's FLAME parameters
 
 An entry has `transform_matrix` (the camera in the world, OpenGL axes) and intrinsics, its own or shared (`fl_x`, `fl_y`,
-`cx`, `cy`, `w`, `h`, or `camera_angle_x`); `cy` is counted from the bottom of the picture. `camera_id` or `camera_index`
-says which camera. A parameter file has `translation`, `rotation`, `neck_pose`, `jaw_pose` [3], `eyes_pose` [6] as rotation
-vectors, `expr`, `shape` and perhaps `static_offset` [V, 3], whatever further axes of length 1. There are no eyelids: they
-are zero, except where `avatar track` adds `eyelids` [2]. The static offset moves the root joint; else it is not used: the
-Gaussians learn where they belong.
+`cx`, `cy`, `w`, `h`, or `camera_angle_x`, `camera_angle_y`); `cy` is counted from the bottom of the picture. `camera_id` or
+`camera_index` says which camera. A parameter file has `translation`, `rotation`, `neck_pose`, `jaw_pose` [3], `eyes_pose`
+[6] as rotation vectors, `expr`, `shape` and perhaps `static_offset` [V, 3], whatever further axes of length 1. There are no
+eyelids: they are zero, except where `avatar track` adds `eyelids` [2]. The static offset moves the root joint; else it is
+not used: the Gaussians learn where they belong.
 
 A UNION folder holds listings alone, of frames in the sequences' folders beside it (`../SEQUENCE/images/...`). Each of these
 has a world of its own and may have an identity of its own; that of the first frame is used for all.

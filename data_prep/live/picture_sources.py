@@ -87,9 +87,10 @@ class Camera:
             raise UserError(_no_camera(number))
         self.size = first.shape[1], first.shape[0]
         check_size(Path(self.name), *self.size)
-        self._is_open = True
+        self._is_open, self._is_read = True, False
 
     def pictures(self) -> Iterator[LivePicture]:
+        self._is_read = True
         try:
             while self._is_open:
                 is_there, image = self._capture.read()
@@ -102,6 +103,8 @@ class Camera:
 
     def close(self) -> None:
         self._is_open = False
+        if not self._is_read:  # else its reader releases it, after the picture that is being read
+            self._capture.release()
 
 
 def _no_camera(number: int) -> str:

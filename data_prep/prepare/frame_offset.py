@@ -56,6 +56,10 @@ class OffsetEstimate:
             f"better than offset {self.runner_up} by {self.t:.1f} standard errors over {self.frames} frames"
         )
 
+    def against(self, given: int) -> str:
+        """A sentence where another offset is given; empty where it is this one."""
+        return "" if given == self.offset else f"--frame-offset {given} is used, but the frames fit {self.sentence()}"
+
 
 def detect_offset(
     head: HeadModel,

@@ -13,6 +13,7 @@ import numpy as np
 from avatar.data.images import read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
+from data_prep.formats.frame_track import Tracking
 from data_prep.formats.tracked_folder import Shot
 from data_prep.prepare.mask_values import judge_values, mask_kinds, refuse_colours
 
@@ -45,7 +46,7 @@ class _Seen:
 
 def inspect_images(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -> Inspection:
     """Decode everything once. Raises UserError when sizes differ within a camera or masks are not 0 to 255, naming both."""
-    refuse_colours(files)
+    refuse_colours(files, shots)
     images = _look_at(files, IMAGE, files.images)
     bad = {n: seen.problem for n, seen in images.items() if seen.problem is not None}
     sizes = {n: seen.size for n, seen in images.items() if seen.problem is None}
@@ -99,6 +100,21 @@ def inspect_images(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -
         bad=dict(sorted(bad.items())),
         notes=tuple(notes),
     )
+
+
+def check_sizes(files: FrameFiles, tracks: Tracking, inspection: Inspection, is_rig: bool) -> None:
+    """Raise UserError where the tracking is not of the images' size."""
+    for number, track in tracks.frames.items():
+        size = inspection.sizes.get(number) if is_rig else (inspection.width, inspection.height)
+        if size not in (None, track.size):
+            seen = (
+                f"{files.images[number]} is" if is_rig else f"those in {next(iter(files.images.values())).parent} are"
+            )
+            of_rig = "give each listed frame the w and h of its camera's images, " if is_rig else ""
+            raise UserError(
+                f"the tracking was made on {track.size[0]}x{track.size[1]} images, but {seen} {size[0]}x{size[1]}; "
+                f"{of_rig}resize the images or track them again"
+            )
 
 
 def composited_background(files: FrameFiles, bad: Mapping[int, str]) -> str | None:

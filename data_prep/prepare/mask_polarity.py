@@ -12,10 +12,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from avatar.data.split import evenly_spread
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles, describe_numbers
 from data_prep.formats.frame_track import FrameTrack
+from data_prep.formats.tracked_folder import Shot, spread_by_camera
 from data_prep.prepare.check_alignment import SAMPLED_FRAMES
 from data_prep.prepare.mask_overlap import MeshProjector, measured_size
 from data_prep.prepare.mask_values import WHAT, place_of
@@ -43,10 +43,11 @@ def polarity_problems(
     files: FrameFiles,
     max_left_out: float,
     without: Collection[int] = (),
+    shots: Mapping[int, Shot] | None = None,
 ) -> list[str]:
     """Sentences on masks that are inverted, and on mattes that are transparent on the head, where more than a share of some
     frames are so. Frames `without` cannot be read."""
-    frames = list(_frames(head, tracks, files, without))
+    frames = list(_frames(head, tracks, files, without, shots))
     judges: tuple[tuple[str, _Judge], ...] = (
         (HEAD, _inverted),
         (ALPHA, _inverted),
@@ -93,7 +94,11 @@ def _transparent(frame: _Frame, matte: np.ndarray) -> str | None:
 
 
 def _frames(
-    head: HeadModel, tracks: Mapping[int, FrameTrack], files: FrameFiles, without: Collection[int]
+    head: HeadModel,
+    tracks: Mapping[int, FrameTrack],
+    files: FrameFiles,
+    without: Collection[int],
+    shots: Mapping[int, Shot] | None,
 ) -> Iterator[_Frame]:
     usable = [number for number in files.images if number not in without]
     if not usable or not tracks:
@@ -101,7 +106,8 @@ def _frames(
     tracked = list(tracks.values())
     project = MeshProjector(head)
     places = np.linspace(0, len(tracked) - 1, len(usable)).round().astype(int).tolist()
-    for number, place in evenly_spread(list(zip(usable, places, strict=True)), SAMPLED_FRAMES):
+    place_of_track = dict(zip(usable, places, strict=True))
+    for number in spread_by_camera(usable, SAMPLED_FRAMES, shots):
         masks, size = {}, None
         for kind in (ALPHA, HEAD, MOUTH):
             if (pixels := files.read(kind, number)) is not None:
@@ -109,5 +115,5 @@ def _frames(
                 masks[kind] = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         if size is not None:
             own = tracks.get(number) if files.pairing else None  # the folder pairs them; else a head hardly moves
-            mesh = project(own or tracked[place], *size)
+            mesh = project(own or tracked[place_of_track[number]], *size)
             yield _Frame(number, masks, silhouette(mesh.screen, mesh.skin_faces, *size) > 0)

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from avatar.data.images import decode_image, decode_values, read_bytes
-from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
+from data_prep.formats.tracked_folder import Shot, spread_by_camera
 
 SAMPLES = 16  # files of each kind
 LEAST_BRIGHT, FULL = 200, 250  # the largest value of a mask: below, it is none; below, it is said
@@ -29,12 +29,12 @@ _SHOWN = 6  # values in a sentence
 WHAT = {ALPHA: "mattes", HEAD: "head masks", MOUTH: "mouth masks"}
 
 
-def with_labels(files: FrameFiles) -> tuple[FrameFiles, list[str]]:
+def with_labels(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -> tuple[FrameFiles, list[str]]:
     """The files with the labels that stand for 255 in each kind of mask, and a sentence about each that the layout does not
     tell."""
     labels, notes = dict(files.labels), []
     for kind, paths in mask_kinds(files).items():
-        label = None if kind in labels else only_label(_values_of_some(paths))
+        label = None if kind in labels else only_label(_values_of_some(paths, shots))
         if label is not None:
             labels[kind] = label
             notes.append(f"the {WHAT[kind]} in {place_of(paths)} are label images: {label} is read as 255")
@@ -47,12 +47,12 @@ def mask_kinds(files: FrameFiles) -> dict[str, dict[int, Path]]:
     return {kind: paths for kind, paths in kinds.items() if paths}
 
 
-def refuse_colours(files: FrameFiles) -> None:
+def refuse_colours(files: FrameFiles, shots: Mapping[int, Shot] | None = None) -> None:
     """Raises UserError where pictures in colour stand in for masks, as cut-outs on a plain background do."""
     for kind, paths in mask_kinds(files).items():
-        for path in evenly_spread(list(paths.values()), SAMPLES):
-            if kind not in files.labels and _is_coloured(path):
-                raise UserError(coloured_sentence(str(path), WHAT[kind]))
+        for number in spread_by_camera(paths, SAMPLES, shots):
+            if kind not in files.labels and _is_coloured(paths[number]):
+                raise UserError(coloured_sentence(str(paths[number]), WHAT[kind]))
 
 
 def coloured_sentence(place: str, masks: str) -> str:
@@ -98,9 +98,9 @@ def only_label(values: Iterable[set[int]]) -> int | None:
     return others.pop() if 0 in found and len(others) == 1 and max(others) < 255 else None
 
 
-def _values_of_some(paths: Mapping[int, Path]) -> list[set[int]]:
+def _values_of_some(paths: Mapping[int, Path], shots: Mapping[int, Shot] | None = None) -> list[set[int]]:
     found = []
-    for path in evenly_spread(list(paths.values()), SAMPLES):
+    for path in (paths[number] for number in spread_by_camera(paths, SAMPLES, shots)):
         try:
             found.append(set(np.unique(decode_values(read_bytes(path), path)).tolist()))
         except UserError:

@@ -28,7 +28,7 @@ from data_prep.prepare.check_alignment import check_sample, refuse_misplaced_cam
 from data_prep.prepare.constant_parameters import constant_parameters
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
 from data_prep.prepare.frame_offset import detect_offset
-from data_prep.prepare.inspect_images import Inspection, composited_background, inspect_images
+from data_prep.prepare.inspect_images import Inspection, check_sizes, composited_background, inspect_images
 from data_prep.prepare.mask_polarity import polarity_problems
 from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.masks import derive_masks
@@ -77,7 +77,7 @@ def prepare(
         return target
 
     say(f"format: {tracked.format}")
-    files, label_notes = with_labels(files)
+    files, label_notes = with_labels(files, tracked.shots)
     inspection = inspect_images(files, tracked.shots)
     refuse_if_many(inspection.bad, len(files.images), "images", source.max_left_out)
     tracks = tracked.read(head, (inspection.width, inspection.height), refuse)
@@ -91,9 +91,10 @@ def prepare(
     check_sizes(files, tracks, inspection, bool(tracked.shots))
     model = HeadModel(head, torch.from_numpy(first.shape))
     if not source.ignore_misfit:
-        for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, inspection.bad):
+        shots, unread = tracked.shots, inspection.bad
+        for problem in polarity_problems(model, tracks.frames, files, source.max_left_out, unread, shots):
             refuse(problem)
-    offset, evidence = _find_offset(replace(tracked, files=files), model, tracks, inspection, source)
+    offset, evidence = _find_offset(replace(tracked, files=files), model, tracks, inspection, source, say)
     centre = model.neutral_vertices().mean(0).numpy()
     pairing = pair_frames(files, inspection, tracks, offset, centre, source.max_left_out, tracked.shots)
     alignment = check_sample(model, tracks.frames, files, pairing.pairs)
@@ -184,17 +185,28 @@ def prepare(
 
 
 def _find_offset(
-    tracked: TrackedFolder, model: HeadModel, tracks: Tracking, inspection: Inspection, source: Source
+    tracked: TrackedFolder,
+    model: HeadModel,
+    tracks: Tracking,
+    inspection: Inspection,
+    source: Source,
+    say: Callable[[str], object],
 ) -> tuple[int, str]:
     """The offset (image number - tracking number) and a sentence on how it was found."""
     files, given = tracked.files, source.frame_offset
     tracked.refuse_offset(given)
     if tracked.is_paired:
         return 0, f"images and tracking are paired by {files.pairing}"
-    if given is not None:
-        return given, f"image offset {given}, given with --frame-offset"
-    estimate = detect_offset(model, tracks.frames, files, inspection.bad, source.ignore_misfit)
-    return estimate.offset, estimate.sentence()
+    try:
+        estimate = detect_offset(model, tracks.frames, files, inspection.bad, source.ignore_misfit)
+        if given is None:
+            return estimate.offset, estimate.sentence()
+        if contradiction := estimate.against(given):
+            say(f"warning: {contradiction}; leave it out to use that one")
+    except UserError:  # the frames do not say
+        if given is None:
+            raise
+    return given, f"image offset {given}, given with --frame-offset"
 
 
 def _assumptions(files: FrameFiles, inspection: Inspection, has_lips: bool) -> list[str]:
@@ -216,20 +228,6 @@ def _assumptions(files: FrameFiles, inspection: Inspection, has_lips: bool) -> l
             "the edges"
         )
     return notes
-
-
-def check_sizes(files: FrameFiles, tracks: Tracking, inspection: Inspection, is_rig: bool) -> None:
-    """Raise UserError where the tracking is not of the images' size."""
-    for number, track in tracks.frames.items():
-        size = inspection.sizes.get(number) if is_rig else (inspection.width, inspection.height)
-        if size not in (None, track.size):
-            seen = (
-                f"{files.images[number]} is" if is_rig else f"those in {next(iter(files.images.values())).parent} are"
-            )
-            raise UserError(
-                f"the tracking was made on {track.size[0]}x{track.size[1]} images, but {seen} {size[0]}x{size[1]}; resize "
-                "the images or track them again"
-            )
 
 
 def _stack_tracks(used: Sequence[FrameTrack], heads: Sequence[Pose] | None = None) -> dict[str, np.ndarray]:

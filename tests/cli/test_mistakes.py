@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 import urllib.error
 from pathlib import Path
 
@@ -118,6 +120,22 @@ def test_a_mistake_gets_one_sentence_and_a_status(
     output = avatar(*(a.format(**places) for a in arguments), status=1)
     assert sentence.format(**places) in output
     assert output.strip().splitlines()[-1].startswith("avatar: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["train", "."], ""),
+        (["train", "nothing"], "nothing does not exist"),
+        (["train", ".", "trainer.iteration=5"], "the nearest is 'trainer.iterations'"),
+        (["train", ".", "trainer.iterations=0"], "trainer.iterations=0 is out of range"),
+        (["sweep", "x.yaml"], "x.yaml does not exist"),
+    ],
+)
+def test_a_wrong_word_is_said_before_pytorch_is_imported(words: list[str], sentence: str, tmp_path: Path) -> None:
+    program = f"import sys; from avatar.commands.main import main; main({words}); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert sentence in done.stderr and done.stdout.endswith(f"{not sentence}\n")
 
 
 def test_a_run_without_a_checkpoint_is_not_evaluated(trained: Path, tmp_path: Path) -> None:

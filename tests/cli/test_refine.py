@@ -178,7 +178,7 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     # Tracking and opening take 1 s, the round's training 10 and its refinement 20: of the 58.2 that are planned
     # of 60 seconds 27.2 are left, for steps that took 10 seconds for 10.
     monkeypatch.setattr(refine_plan, "estimated_seconds", lambda *_: 3.8)
-    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=2.5))
+    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(start_seconds=0.0, step_seconds=2.5))
     monkeypatch.setattr(refine_plan, "LEAST_STEPS", 5)
     ticks = iter((0.0, 0.0, 1.0, 1.0, 11.0, 31.0, 57.0))
     for module in (train, train_refined):
@@ -206,17 +206,17 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(train, "tracked_source", tracked)
     monkeypatch.setattr(refine_plan, "estimated_seconds", lambda *_: 10.0)
-    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(step_seconds=0.05))
+    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(start_seconds=5.0, step_seconds=0.05))
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
     monkeypatch.setattr(train_refined, "train_round", lambda plan, *_: (0, plan))
     monkeypatch.setattr(train_refined, "continue_or_begin", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
-    # 0.97 of 300 seconds less 90 and 10, by a twentieth of a second for a step, less the 1,000 steps of the round
+    # 0.97 of 300 seconds less 90, 10 and two starts of 5, by a twentieth of a second a step, less the round's 1,000
     assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output
-    assert "allow 2,820 steps; 1,000 are taken" in output
+    assert "allow 2,620 steps; 1,000 are taken" in output
     refused = avatar(*words[:3], tmp_path / "other", *words[4:], "--refine", 1, "--minutes", 2, status=1)
-    assert "90 s are gone" in refused and "give at least 2.6" in refused
+    assert "90 s are gone" in refused and "give at least 2.7" in refused
 
 
 def first(run: Path) -> Path:

@@ -13,14 +13,19 @@ from pathlib import Path
 import pytest
 from command_line import avatar
 from small_runs import SMALL, train_small
+from torch import Tensor
 from tracked_folder import write_tracked_folder
 
+from avatar.data.loader import FrameLoader
+from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.lock import locked
+from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
 from avatar.runs.checkpoint import Checkpoint, list_checkpoints, newest_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info
+from avatar.train import trainer
 
 OPTIONS = ("--frame-offset", "1", *SMALL)
 
@@ -81,6 +86,27 @@ def test_a_run_begun_with_weights_does_not_go_on_without_them(
     output = avatar("train", own_folder, "--out", run, "--resume", status=1)
     assert "the run began with LPIPS and cannot go on without it" in output
     assert newest_checkpoint(run).step == 8
+
+
+def test_a_run_that_is_stopped_at_once_says_what_is_saved(
+    own_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, draw = tmp_path / "run", trainer.render_held_out
+
+    def ctrl_c_twice(
+        avatar: Avatar, loader: FrameLoader, subject: Subject, background: Tensor, step: int
+    ) -> tuple[Tensor, Tensor]:
+        if step == 8:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        return draw(avatar, loader, subject, background, step)
+
+    monkeypatch.setattr(trainer, "render_held_out", ctrl_c_twice)
+    output = avatar("train", own_folder, "--out", run, *OPTIONS, status=130)
+    assert f"Interrupted at once; the last checkpoint in {run} is of step 4." in output
+    assert output.endswith("Add --resume to the same command to go on.\n")
+    monkeypatch.undo()
+    assert "at step 4 of 12" in avatar("train", own_folder, "--out", run, *OPTIONS, "--resume")
 
 
 CHANGES = {

@@ -114,3 +114,31 @@ def test_a_jpegs_image_data_must_end_and_the_file_may_go_on(progressive: int, tm
         path.write_bytes(data[:kept])
         with pytest.raises(UserError, match="is cut short; write or copy it again"):
             read_image(path)
+
+
+HUFFMAN = ((), (cv2.IMWRITE_JPEG_OPTIMIZE, 1), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))
+
+
+@pytest.mark.parametrize("options", HUFFMAN)
+def test_a_jpeg_with_a_hole_is_refused(options: tuple[int, ...], tmp_path: Path) -> None:
+    """Decoders take the zeros of a damaged download for grey, and raise nothing."""
+    picture, path = np.random.default_rng(0).integers(0, 256, (160, 240, 3), np.uint8), tmp_path / "x.jpg"
+    data = cv2.imencode(".jpg", picture, options)[1].tobytes()
+    path.write_bytes(data)
+    read_image(path)
+    at, hole = len(data) // 2, 2000
+    path.write_bytes(data[:at] + bytes(hole) + data[at + hole :])
+    with pytest.raises(UserError, match=r"x\.jpg is damaged: a part of its image data is zero; write or copy it again"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("options", HUFFMAN)
+@pytest.mark.parametrize("shape", [(1, 1, 3), (500, 900), (500, 900, 3)])
+def test_a_flat_jpeg_has_no_hole(shape: tuple[int, ...], options: tuple[int, ...], tmp_path: Path) -> None:
+    """The codes of a flat picture are zeros, for a kilobyte and more."""
+    picture = np.zeros(shape, np.uint8)
+    for value in (0, 255):
+        (tmp_path / "x.jpg").write_bytes(cv2.imencode(".jpg", picture + np.uint8(value), options)[1].tobytes())
+        assert (read_image(tmp_path / "x.jpg") == value).all()
+    if shape == (500, 900, 3) and cv2.IMWRITE_JPEG_OPTIMIZE in options:
+        assert bytes(1000) in (tmp_path / "x.jpg").read_bytes()

@@ -28,6 +28,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
+from data_prep.prepare import mask_polarity, mask_values
 
 
 @pytest.fixture(scope="module")
@@ -231,6 +232,23 @@ def test_a_black_camera_is_refused(single: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("value", "sentence"), [("inverted", "are inverted"), ("colours", "is a picture in colour")])
+def test_masks_of_every_camera_are_looked_at(
+    value: str, sentence: str, single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two samples of all pictures would leave a camera out."""
+    monkeypatch.setattr(mask_polarity, "SAMPLED_FRAMES", 2)
+    monkeypatch.setattr(mask_values, "SAMPLES", 2)
+    folder = edited(single, tmp_path / "copy", lambda _: None)
+    for path in folder.glob("fg_masks/*_08.png"):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
+        other = 255 - mask if value == "inverted" else cv2.merge((mask // 4, mask // 2, mask))
+        assert cv2.imwrite(str(path), other)
+    with pytest.raises(UserError, match=sentence):
+        opened(folder, tmp_path / "out")
+
+
 def test_ten_thousand_listed_pictures_that_are_not_there_are_refused(single: Path, tmp_path: Path) -> None:
     folder = edited(single, tmp_path / "copy", lambda _: None)
     content = json.loads((folder / "transforms_train.json").read_text())
@@ -267,6 +285,10 @@ def test_each_camera_has_its_own_size(single: Path, tmp_path: Path) -> None:
     assert subject.image_size(index=index) == (32, 28)
     assert subject.image_size() == (64, 56)
     assert subject.frame(index, 48).image.shape == (42, 48, 3)
+
+    without = edited(folder, tmp_path / "without", lambda entry: entry.pop("w") and entry.pop("h") and None)
+    with pytest.raises(UserError, match=r"made on 64x56 .*_12.png is 32x28; give each listed frame the w and h of its"):
+        opened(without, tmp_path / "refused")
 
 
 def test_the_reference_is_where_the_head_is_seen_from_the_front() -> None:

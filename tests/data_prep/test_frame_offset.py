@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from preparing import prepare_folder
 from tracked_folder import write_tracked_folder
 
 from avatar.data.images import read_mask
@@ -127,6 +128,15 @@ def test_too_few_frames_are_called_that(frames: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.shared
+def test_a_given_offset_that_the_frames_contradict_is_said(tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=16, offset=1)
+    subject, said = prepare_folder(folder, tmp_path / "out", frame_offset=2, ignore_misfit=True)
+    warning = "--frame-offset 2 is used, but the frames fit image offset 1 (image number = tracking number +1), better"
+    assert subject.manifest.frame_offset == 2 and [line for line in said if warning in line]
+    _, said = prepare_folder(folder, tmp_path / "right", frame_offset=1)
+    assert not [line for line in said if "--frame-offset 1 is used" in line]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", [{"mouth": False}, {"mouth": False, "head": False}])
 def test_the_images_decide_where_masks_cannot(kinds: dict[str, bool], shared_dir: Path) -> None:

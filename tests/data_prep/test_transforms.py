@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from avatar.errors import UserError
+from data_prep.formats.frame_track import BadFrame
 from data_prep.formats.root_pose import rotation_matrix
 from data_prep.formats.transforms import ListedFrame, camera_pose, numbered, pinhole, read_listings
 
@@ -72,8 +73,13 @@ def test_a_camera_in_the_world_becomes_the_way_from_the_world_to_it() -> None:
     np.testing.assert_allclose(R @ ahead[:3] + t, (0.0, 0.0, -1.0), atol=1e-12)
 
 
-def test_a_lens_by_its_angle_is_that_of_the_width() -> None:
+def test_a_lens_by_its_angles() -> None:
     intrinsics, size = pinhole(listed(camera_angle_x=np.pi / 2), (64, 48))
     assert size == (64, 48) and intrinsics.tolist() == pytest.approx([32.0, 32.0, 32.0, 24.0])
+    angles = {"camera_angle_x": 2 * np.arctan(0.5 * 64 / 50), "camera_angle_y": 2 * np.arctan(0.5 * 48 / 60)}
+    intrinsics, _ = pinhole(listed(**angles), (64, 48))
+    assert intrinsics.tolist() == pytest.approx([50.0, 60.0, 32.0, 24.0])
+    with pytest.raises(BadFrame, match="camera_angle_y is 4, not between 0 and pi"):
+        pinhole(listed(**{**angles, "camera_angle_y": 4.0}), (64, 48))
     intrinsics, size = pinhole(listed(fl_x=50.0, fl_y=60.0, cx=10.0, cy=20.0, w=128, h=96), (64, 48))
     assert size == (128, 96) and intrinsics.tolist() == [50.0, 60.0, 10.0, 20.0]

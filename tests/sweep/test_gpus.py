@@ -112,7 +112,7 @@ def test_ray_is_asked_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
         asked.append(needs)
         return lambda function: function
 
-    fake = SimpleNamespace(init=lambda **_: None, remote=remote, shutdown=lambda: None, __spec__="")
+    fake = SimpleNamespace(init=lambda **_: None, nodes=list, remote=remote, __spec__="")
     monkeypatch.setitem(sys.modules, "ray", fake)  # type: ignore[arg-type]
     make_engine("ray", spec_of("cuda"), Path(), EngineOptions())
     make_engine("ray", spec_of(""), Path(), EngineOptions())
@@ -128,7 +128,10 @@ def test_rays_own_cluster_has_the_processors_of_its_jobs(monkeypatch: pytest.Mon
         asked.append(needs)
         return lambda function: function
 
-    fake = SimpleNamespace(init=lambda **options: begun.append(options.get("num_cpus")), remote=remote, __spec__="")
+    def init(**options: Any) -> None:
+        begun.append(options.get("num_cpus"))
+
+    fake = SimpleNamespace(init=init, nodes=list, remote=remote, __spec__="")
     monkeypatch.setitem(sys.modules, "ray", fake)  # type: ignore[arg-type]
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(engines, "workers_that_fit", lambda _: 1)
@@ -137,6 +140,26 @@ def test_rays_own_cluster_has_the_processors_of_its_jobs(monkeypatch: pytest.Mon
         make_engine("ray", replace(spec_of(""), resources=resources), Path(), EngineOptions(workers, address))
     assert begun == [4, 12, 4, None]
     assert ["memory" in needs for needs in asked] == [False, False, False, True]
+
+
+def test_a_ray_cluster_that_no_job_fits_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ray waits for another machine, and says nothing."""
+    has = [{"CPU": 8.0, "memory": 2.0**30}, {"CPU": 1.0, "memory": 2.0**35, "GPU": 1.0}]
+    nodes = [{"Alive": True, "Resources": one} for one in has] + [{"Alive": False, "Resources": {"CPU": 9.0}}]
+    fake = SimpleNamespace(init=lambda **_: None, nodes=lambda: nodes, remote=lambda **_: lambda f: f, __spec__="")
+    monkeypatch.setitem(sys.modules, "ray", fake)  # type: ignore[arg-type]
+
+    def said(threads: int, memory_gb: float, gpus: float) -> str:
+        spec = replace(spec_of(""), resources=Resources(threads, memory_gb, gpus))
+        make_engine("ray", spec, Path(), EngineOptions(address="head:6379"))
+        return capsys.readouterr().out
+
+    assert said(8, 1.0, 0) == said(1, 32.0, 1) == ""
+    assert "no machine of the Ray cluster has 8 processors and 2 GB of memory, which a job takes" in said(8, 2.0, 0)
+    assert "has 9 processors and 0.5 GB of memory, which" in said(9, 0.5, 0)
+    assert "has 2 processors and 0.5 GB of memory and 1 GPUs, which" in said(2, 0.5, 1)
 
 
 def test_slurm_is_asked_for_whole_gpus(monkeypatch: pytest.MonkeyPatch) -> None:

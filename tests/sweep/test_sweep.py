@@ -122,6 +122,13 @@ def test_status_and_another_try(place: Path, tmp_path: Path) -> None:
     avatar("sweep", more, "--out", folder, "--workers", 1, status=1)
     assert len(list((folder / "jobs").iterdir())) == 2
 
+    fewer = avatar("sweep", broken, "--out", folder, "--workers", 1, status=1)
+    assert "Note: 1 jobs in" in fewer and "seed7, are not in" in fewer and "\n1 jobs on local" in fewer
+    assert len(list((folder / "jobs").iterdir())) == 2
+    assert "1 jobs: 0 done" in avatar("sweep", "--out", folder, "--status", status=1)
+    assert "holds a sweep in which" in avatar("sweep", another, "--out", folder, status=1)
+    assert "Note:" not in avatar("sweep", more, "--out", folder, "--workers", 1, status=1)
+
 
 def test_a_worker_that_fell_silent_is_replaced(tmp_path: Path) -> None:
     write_state(tmp_path, State("running", 1, "elsewhere:1"))

@@ -23,6 +23,7 @@ from data_prep.track.footage.picture_folder import PictureFolder, open_footage, 
 from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import MIN_SIDE, Footage, Span, TimedPicture, View, whole
 from data_prep.track.footage.timing import DEFAULT_FPS
+from data_prep.track.footage.video import Video
 from data_prep.track.upright import LONGEST, sample_pictures
 
 OPAQUE = 0.5  # of the face: less is not the person's matte
@@ -33,14 +34,18 @@ _SAMPLES = 16  # pictures of a video of mattes
 class OwnMattes:
     footage: Footage
     notes: tuple[str, ...] = ()
+    later: float = (
+        0.0  # seconds by which the video's first picture is later in its file than the first of these in theirs
+    )
 
     def turned(self, degrees: int) -> OwnMattes:
         return replace(self, footage=turned(self.footage, degrees))
 
     def read(self, view: View, span: Span) -> Iterator[TimedPicture]:
-        """The mattes, uint8 [H, W], in the order of their times."""
-        for time, image in self.footage.read(view, span, lambda _: None):
-            yield TimedPicture(time, _grey(image))
+        """The mattes, uint8 [H, W], in the order of the times of the video's pictures."""
+        own = Span(max(0.0, span.start - self.later), None if span.end is None else span.end - self.later)
+        for time, image in self.footage.read(view, own, lambda _: None):
+            yield TimedPicture(time + self.later, _grey(image))
 
 
 def open_mattes(path: Path, video: Footage, span: Span | None = None) -> OwnMattes:
@@ -70,7 +75,13 @@ def open_mattes(path: Path, video: Footage, span: Span | None = None) -> OwnMatt
         duration = len(footage.files) / rate
         as_masks = replace(footage, decode=_mask_reader(label), rate=rate, duration=duration, times=times)
         return OwnMattes(as_masks, tuple(notes))
-    return OwnMattes(footage, tuple(notes))
+    begins, own = (one.first.time or 0.0 if isinstance(one, Video) else 0.0 for one in (video, footage))
+    if abs(begins - own) > 0.5 / (video.rate or DEFAULT_FPS):
+        notes.append(
+            f"the mattes in {path} begin at {own:.2f} s of their file and the video's pictures at {begins:.2f} s: the "
+            "first matte is taken for the first picture's"
+        )
+    return OwnMattes(footage, tuple(notes), begins - own)
 
 
 def _times_of(video: Footage, count: int, end: float | None) -> tuple[float, ...]:

@@ -212,6 +212,8 @@ def test_a_good_folder_has_no_finding(good_folder: Path) -> None:
     assert new_findings(check) == {}
     assert check.status == 0
     assert check.clip is not None and check.clip.offset == 1
+    given = new_findings(checked(good_folder, offset=2))["frame-offset"]
+    assert given.severity == "warning" and "2 is used, but the frames fit image offset 1" in given.problem
 
 
 @pytest.mark.parametrize("defect", DEFECTS)

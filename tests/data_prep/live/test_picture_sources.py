@@ -154,6 +154,18 @@ def test_a_camera_that_dies() -> None:
     assert capture.is_released
 
 
+def test_a_camera_is_released_before_its_first_picture_and_after_one() -> None:
+    for read in (0, 1):
+        capture = Capture(5)
+        newest = Newest(Camera(2, lambda number, of=capture: of))  # type: ignore[arg-type, return-value, misc]
+        pictures = newest.source.pictures()
+        for _ in range(read):
+            next(pictures)
+        newest.close()
+        assert capture.is_released == (read == 0), "a picture may be being read"
+        assert list(pictures) == [] and capture.is_released
+
+
 def test_a_camera_is_set_to_what_it_is_for() -> None:
     for settings in (FOLLOWED, FILMED):
         capture = Capture(3)

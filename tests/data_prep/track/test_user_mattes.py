@@ -14,6 +14,7 @@ from marked_face import HEIGHT, WIDTH, matte, picture
 from PIL import Image
 from videos import LOSSLESS, X264, encode, ffmpeg
 
+from avatar.data.images import read_mask
 from avatar.errors import UserError
 from data_prep.formats.avatar_track import read_info
 from data_prep.track.footage.picture_folder import open_footage
@@ -230,9 +231,15 @@ def test_mattes_of_a_part_are_of_its_own_pictures(kind: str, tmp_path: Path) -> 
     kept = ("-vf", f"setpts='({TIMES[kind]})/TB'", "-fps_mode", "passthrough", "-enc_time_base", "1/24000", *LOSSLESS)
     ffmpeg("-i", plain, *silence, *kept, tmp_path / "v.mov")
     video, view = open_footage(tmp_path / "v.mov"), whole(WIDTH, HEIGHT)
+    as_pictures = [np.dstack([read_mask(folder / f"{n}.png")] * 3) for n in range(count)]
+    as_a_video = encode(tmp_path / "m.mkv", as_pictures, options=LOSSLESS)
     for span in (Span(1.0), Span(1.01, 1.5), Span(0.0, 1.2)):
         pictures = [round(p.image.mean() / 4) for p in video.read(view, span, lambda _: None)]
         assert [int(p.image[0, -1]) // 4 for p in open_mattes(folder, video, span).read(view, span)] == pictures
+        if kind == "later than the sound":
+            mattes = open_mattes(as_a_video, video, span)
+            assert [int(p.image[0, -1]) // 4 for p in mattes.read(view, span)] == pictures
+            assert "begin at 0.00 s of their file and the video's pictures at 0.08 s" in " ".join(mattes.notes)
 
 
 def test_single_mattes_without_the_face_are_named_and_many_refused(video: Path, tmp_path: Path) -> None:
