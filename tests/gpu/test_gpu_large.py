@@ -1,4 +1,4 @@
-"""Parameters of more values than 32 bits count: the heads of a million Gaussians with latents of 200 dimensions."""
+"""More values than 32 bits count: the heads of a million Gaussians with latents of 200 dimensions, 45 million splats."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from avatar.compute.device import interpreted
 from avatar.gaussians.hyper_cpu import packed_shape
 from avatar.kernels.adam import adam
 from avatar.kernels.hyper import first_row
+from avatar.splat import CannotDraw, gpu_draw, splat, splat_features
+from avatar.splat.scenes import head_camera
+from avatar.types import Gaussians
 
 MANY, LANES = 1 << 31, 1024
 
@@ -51,3 +54,27 @@ def test_adam_moves_the_last_of_many_values(tmp_path: Path, monkeypatch: pytest.
     betas = {"BETA1": 0.9, "BETA2": 0.999, "LOG2_BETA1": -0.152, "LOG2_BETA2": -0.00144}
     adam[(1,)](*own, EPSILON=1e-8, BLOCK=LANES, **betas)
     assert torch.allclose(parameter[MANY:], torch.tensor(-0.1), rtol=2e-3)
+
+
+def without_values(count: int, coefficients: int) -> Gaussians:
+    shapes = (count, 3), (count, 4), (count, 3), (count,), (count, coefficients, 3)
+    return Gaussians(*(torch.empty(shape, device="meta") for shape in shapes))
+
+
+@pytest.mark.without_kernels
+@pytest.mark.parametrize(("most", "coefficients"), [(44_739_242, 16), (238_609_294, 1)])
+def test_splats_whose_values_a_gpu_does_not_count_are_refused(most: int, coefficients: int) -> None:
+    view, background = head_camera(64), torch.zeros(3, device="meta")
+    splat(without_values(most, coefficients), view, background)
+    with pytest.raises(CannotDraw, match=rf"^{most + 1} Gaussians have \d+ values in a buffer; .* less than 2\^31$"):
+        splat(without_values(most + 1, coefficients), view, background)
+
+
+@pytest.mark.without_kernels
+def test_so_are_features_of_pictures_that_a_gpu_draws_in_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_draw, "TUNING", gpu_draw.Tuning())
+    gaussians, view, background = without_values(1000, 1), head_camera(26_750), torch.zeros(3, device="meta")
+    splat(gaussians, view, background)
+    features = torch.empty(1000, 3, device="meta")
+    with pytest.raises(CannotDraw, match=r"^67108864 pairs of 11182336 tiles and a splat have 2214\d+ values"):
+        splat_features(*gaussians[:4], features, view, background)
