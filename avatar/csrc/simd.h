@@ -30,10 +30,8 @@ using Longs = decltype(Doubles{} < Doubles{});  // integers as wide as doubles; 
 
 // Of memory that is aligned to the vector.
 inline Floats load(const float* p) { return *reinterpret_cast<const Floats*>(p); }
-inline Ints load(const int* p) { return *reinterpret_cast<const Ints*>(p); }
 inline Doubles load(const double* p) { return *reinterpret_cast<const Doubles*>(p); }
 inline void store(float* p, Floats v) { *reinterpret_cast<Floats*>(p) = v; }
-inline void store(int* p, Ints v) { *reinterpret_cast<Ints*>(p) = v; }
 inline void store(double* p, Doubles v) { *reinterpret_cast<Doubles*>(p) = v; }
 inline Floats broadcast(float x) { return x - Floats{}; }
 inline Ints sign_bits() { return Ints{} - 0x7fffffff - 1; }

@@ -26,8 +26,9 @@ def adam(
 
     The learning rate is `share` times `rate`. share, steps and stop are float32 of one value; `steps` counts this one.
     """
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = i < tl.where(tl.load(stop) == 0.0, values, 0)
+    first, i = tl.program_id(0).to(tl.int64) * BLOCK, tl.arange(0, BLOCK)  # of 2^31 values and more
+    here = i < tl.where(tl.load(stop) == 0.0, values - first, 0)
+    parameter, gradient, mean, square = parameter + first, gradient + first, mean + first, square + first
     t = tl.load(steps).to(tl.float64)
     step_size = rate * tl.load(share) / (1.0 - tl.exp2(t * LOG2_BETA1)).to(tl.float32)
     spread = (1.0 - tl.exp2(t * LOG2_BETA2)).to(tl.float32)

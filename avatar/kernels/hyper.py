@@ -12,8 +12,8 @@ CONSTANTS, DIMENSION = tl.constexpr(32), tl.constexpr(13)
 
 @triton.jit
 def first_row(packed, i, latents):
-    """Where Gaussian i's values begin; they are PACKED apart."""
-    return packed + (i // PACKED) * ((CONSTANTS + DIMENSION * latents) * PACKED) + i % PACKED
+    """Where Gaussian i's values begin; they are PACKED apart. All Gaussians may have more of them than 32 bits count."""
+    return packed + (i // PACKED).to(tl.int64) * ((CONSTANTS + DIMENSION * latents) * PACKED) + i % PACKED
 
 
 @triton.jit

@@ -30,6 +30,7 @@ from avatar.kernels.sh import colour
 REACH_MARGIN = tl.constexpr(1e-4)  # in log2 of alpha; far above float rounding there
 # A count that no capacity holds: a value that is not finite makes the image NaN as too many pairs do.
 POISON = tl.constexpr(1 << 30)
+SIDE, FARTHEST = tl.constexpr(1 << 15), tl.constexpr(1e37)  # pixels of an image; (u, v) below which float32 holds them
 
 
 @triton.jit
@@ -137,6 +138,9 @@ def project(
     a = root * WHITENING / root_det
     b = -xy * WHITENING / (root * root_det)
     c = WHITENING / root
+    # What is farther from its own middle than float32 can say shows nowhere: a splat of 1e-30 pixels, without blur.
+    far_y = tl.abs(y) + SIDE
+    drawn &= (a * (tl.abs(x) + SIDE) + tl.abs(b) * far_y < FARTHEST) & (c * far_y < FARTHEST)
     ratio = tl.where(drawn, opacity, 1.0) / alpha_min  # infinite for an alpha_min of 0
     reach = tl.where(alpha_min > 0.0, tl.log2(ratio) + REACH_MARGIN, tl.full([BLOCK], float("inf"), tl.float32))
     bounded = reach < float("inf")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from avatar.kernels.bin import FEATURE_FIELDS, FIELDS, expand, gather
 from avatar.kernels.composite import composite
+from avatar.kernels.composite_backward import MOMENTS
 from avatar.kernels.composite_features import composite_features
 from avatar.kernels.launch import start
 from avatar.kernels.project import POISON, project
@@ -111,6 +112,7 @@ def draw(
     device, s, o = gaussians.means.device, settings, settings.options
     N, channels, stored = len(gaussians.means), len(background), gaussians[4].shape[1]
     has_features = o.sh_degree is None
+    check_counted(f"{N} Gaussians", N * max(MOMENTS.value, 0 if has_features else 3 * stored))
     tuning = TUNING.for_features if has_features else TUNING
     grid, warps = tile_grid(o.region, tuning.tile), tuning.lanes // 32
 
@@ -136,6 +138,7 @@ def draw(
     capacity = capacity_of(kind, lambda: needed_pairs(gaussians, pose, background, boxes, ends))
 
     stride = programs(programs(capacity, tuning.chunk) * tuning.chunk + grid.tiles * tuning.chunk, ALIGNED) * ALIGNED
+    check_counted(f"{capacity} pairs of {grid.tiles} tiles and a splat", MOMENTS.value * stride)
     key_type = torch.int16 if grid.tiles < 2**15 - 1 else torch.int32
     keys, splats, corners = empty(capacity, dtype=key_type), empty(capacity, dtype=torch.int32), empty(2, capacity)
     fields = FEATURE_FIELDS if has_features else FIELDS
@@ -181,6 +184,12 @@ def draw(
     lists = (order, ends, boxes, begins, records, places)
     drawing = Drawing(tuning, grid, capacity, *lists, transmittances, stops, chunks)
     return Rendering(image, alphas), drawing
+
+
+def check_counted(what: str, values: int) -> None:
+    """Raise CannotDraw where a buffer has more values than the kernels count."""
+    if values >= 2**31:
+        raise CannotDraw(f"{what} have {values} values in a buffer; a GPU draws with less than 2^31")
 
 
 def programs(items: int, each: int) -> int:

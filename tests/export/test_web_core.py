@@ -144,6 +144,12 @@ def test_damaged_files_get_a_sentence(tracked_folder: Path, tmp_path: Path) -> N
     assert found["refused"] > 0.4 * cases and found["drawn"] > 0 and found["refused"] + found["drawn"] == cases
 
 
+def test_sizes_whose_latents_no_memory_holds_are_refused() -> None:
+    usual = [5023, 100, 14_876, 4096, 8, 256, 6, 16, 1, 1, 0, 0]
+    many = [1, 0, 1, 1 << 16, 1 << 16, 1, 1, 1, 1, 1, 0, 0]  # of all nodes 2^32 values, and no array is large
+    assert node(HERE / "measure.mjs", json.dumps([usual, many])) == [1, 0]
+
+
 def test_the_module_is_what_its_sources_compile_to() -> None:
     """scripts/build_wasm.sh records what it read and what it wrote; `make wasm` brings both up to date."""
     root = WEB.parents[1]

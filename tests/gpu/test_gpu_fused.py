@@ -109,6 +109,16 @@ def test_gaussians_and_gradients_are_those_of_the_steps_one_by_one(name: str) ->
         assert error(gradients[field], expected_gradients[field]) < 2e-6, field
 
 
+def test_offsets_that_are_nan_give_nan() -> None:
+    scene = Scene(False, False, 10)
+    values = scene.inputs["values"]
+    assert values is not None
+    values[7] = torch.nan
+    placed, _ = scene.run(scene.found, DEVICE)
+    for name in ("means", "quats", "scales"):
+        assert getattr(placed, name)[7].isnan().all() and getattr(placed, name)[:7].isfinite().all(), name
+
+
 def test_lanes_that_stand_for_no_gaussian_get_no_gradient() -> None:
     scene = Scene(True, True, 8)
     packed = scene.run(scene.found, DEVICE)[1]["packed"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partialmethod
 from types import SimpleNamespace
 from typing import Any
 
@@ -57,6 +57,10 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
         return np.dtype(np.uint64) if kind.scalar.is_ptr() else numpy_type(kind.scalar)
 
     patch.setattr(interpreter, "_get_np_dtype", numpy_type_of)
+    # On a GPU the smaller of a number and NaN is the number.
+    for name, function in (("create_minnumf", np.fmin), ("create_maxnumf", np.fmax)):
+        chosen = partialmethod(interpreter.InterpreterBuilder.binary_op, op=function)
+        patch.setattr(interpreter.InterpreterBuilder, name, chosen)
     # Triton's functions are replaced once, and not at each launch and call.
     replaced = interpreter._patch_lang(SimpleNamespace(__globals__={"tl": tl, "core": tl.core}))
     patch.setattr(interpreter, "_patch_lang", lambda _: interpreter._LangPatchScope())

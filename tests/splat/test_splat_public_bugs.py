@@ -146,6 +146,17 @@ def test_tiny_scales_do_not_underflow_to_nan(scale: float, antialiased: bool, ba
 
 
 @pytest.mark.parametrize("backend", KERNELS)
+@pytest.mark.parametrize(("scale", "x"), [(1e-36, 0.0), (1e-40, 0.0), (1e-44, 0.0), (0.01, 3e38)])
+def test_splats_that_are_too_thin_or_too_far_for_float32_have_no_part(scale: float, x: float, backend: str) -> None:
+    g = random_gaussians(30)
+    g.scales[:5], g.means[:5, 0] = scale, x
+    scene = Scene(g, camera(33, 33, yaw=0.0), options={"alpha_min": 0.0, "blur": 0.0})
+    assert_agrees(scene, backend)
+    grads = gradients(scene, backend, torch.ones(33, 33, 3), torch.ones(33, 33))
+    assert all((grads[name][:5] == 0).all() for name in ("means", "quats", "scales"))
+
+
+@pytest.mark.parametrize("backend", KERNELS)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (15, 16), (17, 1), (1, 50), (31, 33), (64, 7), (65, 95)])
 def test_sizes_that_are_not_a_multiple_of_the_tile(width: int, height: int, backend: str) -> None:
     assert_agrees(Scene(random_gaussians(60), camera(width, height)), backend)

@@ -20,7 +20,7 @@ struct View {
 };
 
 // Why a Gaussian is not drawn, or that it is. Hidden, in the order of the enumeration: opacity below alpha_min, nearer
-// than `near`, no area on the image plane, no pixel of the region where alpha can reach alpha_min.
+// than `near`, no area on the image plane that float32 can measure, no pixel of the region where alpha can reach alpha_min.
 enum class Visibility : unsigned char { kVisible, kTransparent, kNear, kFlat, kOutside, kColourOverflow };
 
 // Tiles next to each other in a row; none where first > last.

@@ -7,7 +7,11 @@ namespace {
 
 constexpr double kReachMargin = 1e-4;  // in log2 of alpha; far above float rounding there
 
+constexpr double kMaxSide = 1 << 15;  // pixels of an image
+constexpr double kFarthest = 1e37;    // (u, v) below which float32 holds them
+
 inline Longs lanes_of(Visibility v) { return Longs{} + static_cast<int>(v); }
+inline Doubles magnitude(Doubles v) { return v < 0.0 ? -v : v; }
 
 // What is said of Gaussians before their colours are known.
 struct alignas(64) Outlines {
@@ -29,11 +33,16 @@ inline void outline(const View& view, const Batch& batch, int at, Outlines& to) 
     store_as_floats(to.opacity + at, settings.antialiased ? given * g.area / root_det : given);
     const Doubles opacity = load_as_doubles(to.opacity + at);
     store(to.depth + at, g.p[2]);
-    store(to.footprints.x + at, camera.fx * g.p[0] / g.p[2] + camera.cx);
-    store(to.footprints.y + at, camera.fy * g.p[1] / g.p[2] + camera.cy);
-    store(to.footprints.a + at, kWhitening * root / root_det);
-    store(to.footprints.b + at, -kWhitening * g.xy / (root * root_det));
-    store(to.footprints.c + at, kWhitening / root);
+    const Doubles x = camera.fx * g.p[0] / g.p[2] + camera.cx, y = camera.fy * g.p[1] / g.p[2] + camera.cy;
+    const Doubles a = kWhitening * root / root_det, b = -kWhitening * g.xy / (root * root_det), c = kWhitening / root;
+    store(to.footprints.x + at, x);
+    store(to.footprints.y + at, y);
+    store(to.footprints.a + at, a);
+    store(to.footprints.b + at, b);
+    store(to.footprints.c + at, c);
+    // What is farther from its own middle than float32 can say shows nowhere: a splat of 1e-30 pixels, without blur.
+    const Doubles far_y = magnitude(y) + kMaxSide, far_u = a * (magnitude(x) + kMaxSide) + magnitude(b) * far_y;
+    const Longs is_held = (far_u < kFarthest) & (c * far_y < kFarthest);
     const double alpha_min = settings.alpha_min;
     store(to.over_cutoff + at, opacity / alpha_min);
     store(to.xx + at, g.xx);
@@ -41,7 +50,7 @@ inline void outline(const View& view, const Batch& batch, int at, Outlines& to) 
     const Longs transparent = lanes_of(Visibility::kTransparent);
     const Longs visibility = given < alpha_min            ? transparent
                              : ~(g.p[2] >= settings.near) ? lanes_of(Visibility::kNear)
-                             : ~g.has_area                ? lanes_of(Visibility::kFlat)
+                             : ~(g.has_area & is_held)    ? lanes_of(Visibility::kFlat)
                              : opacity < alpha_min        ? transparent
                                                           : lanes_of(Visibility::kVisible);
     __builtin_memcpy(to.visibility + at, &visibility, sizeof visibility);

@@ -16,6 +16,7 @@ std::int64_t picture_pixels = 0;
 double camera_values[18];  // rotation 9, translation 3, fx, fy, cx, cy, width, height
 float background[3] = {1, 1, 1};
 constexpr int kMaxSide = 4096;
+constexpr std::int64_t kMaxLatents = 1 << 26;  // of all nodes; a number that 32 bits hold, as they are here
 
 avatar::splat::Camera camera_in_pixels() {
     avatar::splat::Camera camera{};
@@ -41,6 +42,7 @@ EMSCRIPTEN_KEEPALIVE int avatar_measure(int vertices, int expressions, int gauss
     const bool is_square = coefficients == 1 || coefficients == 4 || coefficients == 9 || coefficients == 16;
     if (expressions < 0 || expressions > 4096 || !is_square || (!has_heads && latent != 10)) return 0;
     if (!has_grid && nodes != gaussians) return 0;
+    if (std::int64_t{nodes} * latent > kMaxLatents) return 0;
     measured = {vertices, expressions, gaussians, nodes, latent, width, layers, coefficients,
                 has_grid, has_heads, has_skull_binding, has_head_rotation};
     avatar::web::array_lengths(measured, lengths);

@@ -14,7 +14,9 @@ constexpr int kSteps = 1 << 16;  // between the nearest and the farthest: 5 micr
 void sort_farthest_first(const std::vector<float>& depths, std::vector<std::uint32_t>& order) {
     const auto [near, far] = std::minmax_element(depths.begin(), depths.end());
     const float nearest = *near, scale = *far > *near ? (kSteps - 1) / (*far - *near) : 0.0f;
-    const auto step = [&](float depth) { return kSteps - 1 - static_cast<int>((depth - nearest) * scale); };
+    const auto step = [&](float depth) {  // also where the depths differ by too little or too much for float32
+        return kSteps - 1 - static_cast<int>(std::min<float>(kSteps - 1, (depth - nearest) * scale));
+    };
     std::vector<std::uint32_t> begin(kSteps + 1, 0);
     for (const float depth : depths) ++begin[step(depth) + 1];
     for (int k = 0; k < kSteps; ++k) begin[k + 1] += begin[k];
